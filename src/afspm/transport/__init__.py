@@ -1,0 +1,1 @@
+"""ZeroMQ: publishers, subscribers, requests, heartbeats and keys. Nothing else imports zmq."""

@@ -1,0 +1,101 @@
+"""What a component sees of the network: packets come in, requests and packets go out.
+
+No socket library is named here, so that the in-memory network of `afspm.testing` can stand in for the real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from afspm.clock import Clock
+from afspm.model import Packet, Response
+
+
+@dataclass(frozen=True, slots=True)
+class PacketReceived:
+    """A packet arrived from the publisher at the address `source`; each packet arrives once, replayed or not."""
+
+    packet: Packet
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReplyReceived:
+    """The scheduler answered; `response.id` is the id of the request it answers ("" from a peer of version 1)."""
+
+    response: Response
+
+
+@dataclass(frozen=True, slots=True)
+class CaughtUp:
+    """The publisher at `source` has sent all that it had cached for us; what follows is live.
+
+    Comes again after every reconnection. A publisher of version 1 replays without saying when it is done: no
+    `CaughtUp` comes from it.
+    """
+
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Killed:
+    """The signal KILL came: the experiment has ended, close."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParentGone:
+    """Whoever started this process has gone or wants it to stop: close."""
+
+
+@dataclass(frozen=True, slots=True)
+class ControlConnected:
+    """The scheduler can be asked, for the first time or again. What was asked before and not answered is lost:
+    ask again with the same id."""
+
+
+@dataclass(frozen=True, slots=True)
+class ControlDisconnected:
+    """The scheduler is gone for now; the connection is made again by itself."""
+
+
+Incoming = (
+    PacketReceived | ReplyReceived | CaughtUp | Killed | ParentGone | ControlConnected | ControlDisconnected
+)
+
+
+class Port(Protocol):
+    """One component's access to the network. Used from one thread; only `wake_up` may be called from others."""
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the experiment."""
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        """Ask the scheduler: `frames` are those of `wire.encode_request`. Never blocks; the answer comes by `poll`.
+
+        While the scheduler is not connected the request is dropped: `ControlConnected` says when to ask again.
+        """
+
+    def poll(self, timeout_s: float | None) -> list[Incoming]:
+        """All that has arrived, in order; waits up to `timeout_s` real seconds (None: for ever) for the first.
+
+        Returns early after `wake_up`.
+        """
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        """Publish on the component's own publisher; its time is the experiment's, made strictly increasing.
+
+        Raises:
+            ConfigError: the component was given no address to publish on.
+        """
+
+    def wake_up(self, incoming: Incoming | None = None) -> None:
+        """End the `poll` under way, or the next; it returns `incoming` with whatever else has arrived.
+
+        May be called from any thread: the watch over the parent process says `ParentGone()` this way.
+        """
+
+    def close(self) -> None:
+        """Close all sockets, after what was sent has gone out (at most a fraction of a second). Safe to repeat."""
