@@ -1,0 +1,91 @@
+"""The one clock of a run: experiment time, which in a simulation may begin anywhere and pass faster than real time.
+
+All time that means something in the experiment (timestamps, scan durations, periods) comes from here. Heartbeats,
+request timeouts and whatever else is about processes stays in real time: `monotonic_s`.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any, Protocol
+
+NS_PER_S = 1_000_000_000
+
+
+class Clock(Protocol):
+    """What tells the time."""
+
+    def now_ns(self) -> int:
+        """Experiment time, ns since the Unix epoch."""
+        ...
+
+    def now_s(self) -> float:
+        """Experiment time, s since the Unix epoch."""
+        ...
+
+    def monotonic_s(self) -> float:
+        """Real time in s that never jumps, from an arbitrary zero: for timeouts and heartbeats."""
+        ...
+
+    def real_s(self, experiment_s: float) -> float:
+        """How long `experiment_s` of the experiment last in real time, in s."""
+        ...
+
+
+def _anchor_s() -> float:
+    """Wall-clock time at the zero of time.monotonic(), so that a corrected system clock never jumps a run."""
+    return time.time() - time.monotonic()
+
+
+@dataclass(frozen=True)
+class ExperimentClock:
+    """experiment time = start + (real time - origin) · speed.
+
+    Every process of a run is given the same origin, start and speed, and so the same time.
+
+    Attributes:
+        origin_s: real time, s since the Unix epoch, at which the run began.
+        start_s: experiment time at that moment, s since the Unix epoch.
+        speed: experiment seconds in a real second; 1 on a real microscope.
+    """
+
+    origin_s: float = 0.0
+    start_s: float = 0.0
+    speed: float = 1.0
+    _wall_at_zero_s: float = field(default_factory=_anchor_s, repr=False, compare=False)
+
+    @classmethod
+    def real(cls) -> ExperimentClock:
+        """The clock on the wall."""
+        return cls()
+
+    @classmethod
+    def starting_now(cls, start_s: float | None = None, speed: float = 1.0) -> ExperimentClock:
+        """A clock that shows `start_s` (default: the real time) now and goes at `speed` from here."""
+        origin_s = time.time()
+        return cls(origin_s, origin_s if start_s is None else start_s, speed)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> ExperimentClock:
+        return cls(float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
+
+    def as_dict(self) -> dict[str, float]:
+        values = asdict(self)
+        del values["_wall_at_zero_s"]
+        return values
+
+    def now_s(self) -> float:
+        return self.start_s + (self._wall_at_zero_s + time.monotonic() - self.origin_s) * self.speed
+
+    def now_ns(self) -> int:
+        # float64 would round to a quarter microsecond: whole seconds and the fraction apart
+        real_ns = int(self._wall_at_zero_s * NS_PER_S) + time.monotonic_ns() - int(self.origin_s * NS_PER_S)
+        elapsed_ns = real_ns if self.speed == 1.0 else int(real_ns * self.speed)
+        return int(self.start_s * NS_PER_S) + elapsed_ns
+
+    def monotonic_s(self) -> float:
+        return time.monotonic()
+
+    def real_s(self, experiment_s: float) -> float:
+        return experiment_s / self.speed

@@ -1,0 +1,111 @@
+"""The errors of afspm: each says what happened, where, and what to do about it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class AfspmError(Exception):
+    """Base of all errors that afspm raises on purpose.
+
+    Args:
+        what: what happened, in words a physicist understands.
+        where: the file, component, parameter … that it happened at.
+        hint: what to do about it.
+    """
+
+    code: ClassVar[str] = "error"
+
+    def __init__(self, what: str, *, where: str = "", hint: str = "") -> None:
+        super().__init__(what, where, hint)
+        self.what = what
+        self.where = where
+        self.hint = hint
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        return f"{text} ({self.hint})" if self.hint else text
+
+
+class ConfigError(AfspmError):
+    """The experiment file, or a setting of a component, is wrong."""
+
+    code = "config"
+
+
+class InvalidValue(AfspmError, ValueError):
+    """A value that has no meaning here: NaN, an empty region, a shape that does not fit …"""
+
+    code = "invalid-value"
+
+
+class UnitError(AfspmError, ValueError):
+    """An unknown unit, or one of the wrong dimension."""
+
+    code = "unit"
+
+
+class WireError(AfspmError):
+    """Bytes from a peer that are not what the wire format says.
+
+    Args:
+        response: the number of the ControlResponse to answer a request with, if it was one.
+    """
+
+    code = "wire"
+
+    def __init__(self, what: str, *, where: str = "", hint: str = "", response: int = 1) -> None:
+        super().__init__(what, where=where, hint=hint)
+        self.response = response
+
+
+class TransportError(AfspmError):
+    """An address that can't be used, keys that are missing or don't fit."""
+
+    code = "transport"
+
+
+class FileError(AfspmError):
+    """A file that can't be read or written, or is not what its name says."""
+
+    code = "file"
+
+
+class RequestError(AfspmError):
+    """Base of what may come of a request to the microscope."""
+
+    code = "request"
+
+
+class Refused(RequestError):
+    """A request was answered, and the answer is no.
+
+    Args:
+        response: the number of the ControlResponse.
+        reason: why, in the words of the one who refused.
+    """
+
+    code = "refused"
+
+    def __init__(self, response: int, reason: str, *, where: str = "", hint: str = "") -> None:
+        super().__init__(reason, where=where, hint=hint)
+        self.response = response
+        self.reason = reason
+
+
+class NoResponse(RequestError):
+    """A request was not answered in time: whether it was carried out is not known."""
+
+    code = "no-response"
+
+
+class ControlLost(RequestError):
+    """Control was taken away and the caller asked not to wait for it."""
+
+    code = "control-lost"
+
+
+class ExperimentEnded(AfspmError):
+    """The experiment has ended: nothing more can be asked of the microscope."""
+
+    code = "ended"

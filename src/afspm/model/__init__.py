@@ -1,0 +1,42 @@
+"""What is spoken about: scans, spectra, regions, states, requests. Frozen, in SI units, with numpy alone."""
+
+from __future__ import annotations
+
+from afspm.model.control import Parameter, Request, Response
+from afspm.model.enums import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Problem,
+    ScopeState,
+)
+from afspm.model.geometry import Frame, Region
+from afspm.model.packet import Packet, PacketHeader
+from afspm.model.problems import ProblemNames
+from afspm.model.scan import Scan, ScanParameters, ScanSet
+from afspm.model.spectrum import Spectrum
+from afspm.model.state import ControlState, Feedback, ProbePosition, ScopeStatus
+
+__all__ = [
+    "ControlMode",
+    "ControlRequest",
+    "ControlResponse",
+    "ControlState",
+    "Feedback",
+    "Frame",
+    "Packet",
+    "PacketHeader",
+    "Parameter",
+    "ProbePosition",
+    "Problem",
+    "ProblemNames",
+    "Region",
+    "Request",
+    "Response",
+    "Scan",
+    "ScanParameters",
+    "ScanSet",
+    "ScopeState",
+    "ScopeStatus",
+    "Spectrum",
+]

@@ -1,0 +1,72 @@
+"""The enumerations of the wire, with its numbers. Where peers may send others (problems), plain ints are kept."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ScopeState(IntEnum):
+    """What the microscope is doing."""
+
+    UNDEFINED = 0
+    MOVING = 1
+    SCANNING = 2
+    FREE = 3
+    INTERRUPTED = 4
+    COARSE_MOTOR = 5
+    BUSY_PARAM = 6
+    SPEC = 7
+
+
+class ControlMode(IntEnum):
+    """Whether components may control the microscope (AUTOMATED) or only the person at it (MANUAL)."""
+
+    UNDEFINED = 0
+    MANUAL = 1
+    AUTOMATED = 2
+
+
+class Problem(IntEnum):
+    """What may be wrong with an experiment. Experiment files name more of them, with numbers above these."""
+
+    NONE = 0
+    TIP_SHAPE_CHANGED = 1
+    DEVICE_MALFUNCTION = 2
+    FEEDBACK_NON_OPTIMAL = 3
+    THERMAL_DRIFT = 4
+
+
+class ControlRequest(IntEnum):
+    """What may be asked of scheduler and translator."""
+
+    UNDEFINED = 0
+    ACTION = 1
+    PARAM = 2
+    SET_SCAN_PARAMS = 3
+    SET_ZCTRL_PARAMS = 4
+    SET_PROBE_POS = 5
+    REQUEST_CTRL = 6
+    RELEASE_CTRL = 7
+    ADD_EXP_PRBLM = 8
+    RMV_EXP_PRBLM = 9
+    SET_CONTROL_MODE = 10
+    END_EXPERIMENT = 11
+    ACTION_SUPPORT = 12
+
+
+class ControlResponse(IntEnum):
+    """How a request is answered."""
+
+    SUCCESS = 0
+    FAILURE = 1
+    CMD_NOT_SUPPORTED = 2
+    NO_RESPONSE = 3
+    ALREADY_UNDER_CONTROL = 4
+    WRONG_CONTROL_MODE = 5
+    NOT_IN_CONTROL = 6
+    NOT_FREE = 7
+    PARAM_NOT_SUPPORTED = 8
+    PARAM_ERROR = 9
+    WRONG_EXP_PROBLEM = 10
+    ACTION_NOT_SUPPORTED = 11
+    ACTION_ERROR = 12

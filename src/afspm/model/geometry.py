@@ -1,0 +1,100 @@
+"""One geometry inside: regions are centre, size and angle in SI units in a named frame.
+
+x grows to the right, y upwards; angles are counter-clockwise in radians. Arrays are [y, x], both ascending, and the
+first and last pixel of a row or column lie on the border of the region (wire format, "Geometry").
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+
+XY = tuple[float, float]
+
+
+class Frame(Enum):
+    """Which coordinate system a position is in."""
+
+    TIP = "tip"
+    SAMPLE = "sample"
+
+
+@dataclass(frozen=True)
+class Region:
+    """A rectangle turned about its centre.
+
+    Attributes:
+        center_m: (x, y) in m.
+        size_m: (width, height) in m before it is turned; both above zero.
+        angle_rad: counter-clockwise.
+        frame: tip or sample coordinates.
+
+    Raises:
+        InvalidValue: a value is not finite, or a size not above zero.
+    """
+
+    center_m: XY
+    size_m: XY
+    angle_rad: float = 0.0
+    frame: Frame = Frame.TIP
+
+    def __post_init__(self) -> None:
+        x, y = self.center_m
+        width, height = self.size_m
+        values = (float(x), float(y), float(width), float(height), float(self.angle_rad))
+        if not all(map(math.isfinite, values)):
+            raise InvalidValue(
+                f"a region needs finite numbers, not centre {self.center_m}, size {self.size_m}, angle {self.angle_rad}"
+            )
+        if values[2] <= 0.0 or values[3] <= 0.0:
+            raise InvalidValue(f"a region of {width:g} m x {height:g} m is empty", hint="both sizes are above zero")
+        object.__setattr__(self, "center_m", values[:2])
+        object.__setattr__(self, "size_m", values[2:4])
+        object.__setattr__(self, "angle_rad", values[4])
+
+    @classmethod
+    def from_top_left(cls, top_left_m: XY, size_m: XY, angle_rad: float = 0.0, frame: Frame = Frame.TIP) -> Region:
+        """From the corner of smallest x and y of the unrotated rectangle, as the wire has it."""
+        center_m = (top_left_m[0] + size_m[0] / 2, top_left_m[1] + size_m[1] / 2)
+        return cls(center_m, size_m, angle_rad, frame)
+
+    @property
+    def top_left_m(self) -> XY:
+        """(x, y) of the unrotated rectangle's corner of smallest x and y."""
+        return (self.center_m[0] - self.size_m[0] / 2, self.center_m[1] - self.size_m[1] / 2)
+
+    def corners_m(self) -> NDArray[np.float64]:
+        """The four corners as turned, shape (4, 2), counter-clockwise from that of smallest x and y."""
+        half = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * np.asarray(self.size_m)
+        corners: NDArray[np.float64] = self._turn(half) + np.asarray(self.center_m)
+        return corners
+
+    def contains(self, xy_m: XY) -> bool:
+        """Whether a point, in the same frame, lies inside or on the border."""
+        offset = np.subtract(xy_m, self.center_m)
+        u, v = replace(self, angle_rad=-self.angle_rad)._turn(offset[None, :])[0]
+        return bool(abs(u) <= self.size_m[0] / 2 and abs(v) <= self.size_m[1] / 2)
+
+    def pixels_m(self, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """x and y of every pixel of an array of `shape` (ny, nx), each an array of that shape, in m."""
+        ny, nx = shape
+        u = np.linspace(-0.5, 0.5, nx) if nx > 1 else np.zeros(1)
+        v = np.linspace(-0.5, 0.5, ny) if ny > 1 else np.zeros(1)
+        offsets = np.stack(np.meshgrid(u * self.size_m[0], v * self.size_m[1]), axis=-1)
+        turned = self._turn(offsets)
+        return turned[..., 0] + self.center_m[0], turned[..., 1] + self.center_m[1]
+
+    def moved_to(self, center_m: XY) -> Region:
+        """The same size and angle about another centre."""
+        return replace(self, center_m=center_m)
+
+    def _turn(self, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+        cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        turned: NDArray[np.float64] = offsets @ np.array([[cos, sin], [-sin, cos]])
+        return turned

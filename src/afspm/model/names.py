@@ -1,0 +1,64 @@
+"""Names of actions and parameters. Those beginning with `x-` are extensions a peer of version 1 may not know."""
+
+from __future__ import annotations
+
+from typing import Final
+
+START_SCAN: Final = "start-scan"
+STOP_SCAN: Final = "stop-scan"
+START_SPEC: Final = "start-spec"
+STOP_SPEC: Final = "stop-spec"
+
+BASE_ACTIONS: Final = (START_SCAN, STOP_SCAN, START_SPEC, STOP_SPEC)
+
+# Tip preparation and safety, where a microscope has them.
+PULSE: Final = "x-pulse"
+CRASH: Final = "x-crash"
+RETRACT: Final = "x-retract"
+ENGAGE: Final = "x-engage"
+
+SCAN_TOP_LEFT_X: Final = "scan-top-left-x"
+SCAN_TOP_LEFT_Y: Final = "scan-top-left-y"
+SCAN_SIZE_X: Final = "scan-size-x"
+SCAN_SIZE_Y: Final = "scan-size-y"
+SCAN_ANGLE: Final = "scan-angle"
+SCAN_RESOLUTION_X: Final = "scan-resolution-x"
+SCAN_RESOLUTION_Y: Final = "scan-resolution-y"
+ZCTRL_SETPOINT: Final = "zctrl-setpoint"
+ZCTRL_PGAIN: Final = "zctrl-pgain"
+ZCTRL_IGAIN: Final = "zctrl-igain"
+SAMPLE_SLOPE_X: Final = "sample-slope-x"
+SAMPLE_SLOPE_Y: Final = "sample-slope-y"
+SCAN_SPEED: Final = "scan-speed"
+MOVE_SPEED: Final = "move-speed"
+PROBE_POS_X: Final = "probe-pos-x"
+PROBE_POS_Y: Final = "probe-pos-y"
+TIP_BIAS_VOLTAGE: Final = "tip-bias-voltage"
+
+# The SI unit of each base parameter; None where it depends on the operating mode of the microscope.
+BASE_PARAMETERS: Final[dict[str, str | None]] = {
+    SCAN_TOP_LEFT_X: "m",
+    SCAN_TOP_LEFT_Y: "m",
+    SCAN_SIZE_X: "m",
+    SCAN_SIZE_Y: "m",
+    SCAN_ANGLE: "rad",
+    SCAN_RESOLUTION_X: "px",
+    SCAN_RESOLUTION_Y: "px",
+    ZCTRL_SETPOINT: None,
+    ZCTRL_PGAIN: "",
+    ZCTRL_IGAIN: "",
+    SAMPLE_SLOPE_X: "",
+    SAMPLE_SLOPE_Y: "",
+    SCAN_SPEED: "m/s",
+    MOVE_SPEED: "m/s",
+    PROBE_POS_X: "m",
+    PROBE_POS_Y: "m",
+    TIP_BIAS_VOLTAGE: "V",
+}
+
+# Pulse and crash are described by parameters, so that the actions stay plain names.
+PULSE_VOLTAGE: Final = "x-pulse-voltage"
+PULSE_DURATION: Final = "x-pulse-duration"
+CRASH_SPEED: Final = "x-crash-speed"
+CRASH_DEPTH: Final = "x-crash-depth"
+SPEC_KIND: Final = "x-spec-kind"

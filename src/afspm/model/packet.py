@@ -1,0 +1,39 @@
+"""What is published: a packet, and what can be known of it without reading its values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(slots=True)
+class Packet:
+    """A published message.
+
+    Attributes:
+        envelope: the text by which it is subscribed to.
+        payload: the serialised message.
+        time_ns: when it was first published, ns since the Unix epoch; None from peers that do not say.
+    """
+
+    envelope: str
+    payload: bytes | memoryview
+    time_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PacketHeader:
+    """What the envelope of a packet may depend on.
+
+    Attributes:
+        message: the name of the message, e.g. "Scan2d".
+        channel: of a scan or a list of places.
+        size_m: (x, y) of a scan's region.
+        kind: of a spectrum, e.g. "IV".
+        time_ns: when it was measured, ns since the Unix epoch, if it says.
+    """
+
+    message: str
+    channel: str | None = None
+    size_m: tuple[float, float] | None = None
+    kind: str | None = None
+    time_ns: int | None = None

@@ -1,0 +1,73 @@
+"""Problems by name: those of the wire, and those that an experiment file adds."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+
+from afspm.errors import InvalidValue
+from afspm.model.enums import Problem
+
+HIGHEST_PROBLEM = 255  # a problem travels as one byte
+
+
+class ProblemNames(Mapping[str, int]):
+    """The problems that an experiment knows: name -> number, and back.
+
+    Args:
+        named: the problems of the experiment file, names and numbers (5 to 255).
+
+    Raises:
+        InvalidValue: a number or name is taken or out of range.
+    """
+
+    def __init__(self, named: Mapping[str, int] | None = None) -> None:
+        self._numbers = {_plain(p.name): int(p) for p in Problem if p is not Problem.NONE}
+        for name, number in (named or {}).items():
+            if _plain(name) in self._numbers:
+                raise InvalidValue(f"the problem {name!r} exists already", where="[problems]")
+            if not len(Problem) <= number <= HIGHEST_PROBLEM or number in self._numbers.values():
+                raise InvalidValue(
+                    f"the problem {name!r} can't have the number {number}",
+                    where="[problems]",
+                    hint=f"choose a free one from {len(Problem)} to {HIGHEST_PROBLEM}",
+                )
+            self._numbers[_plain(name)] = number
+        self._names = {number: name for name, number in self._numbers.items()}
+
+    def number(self, problem: str | int) -> int:
+        """The number of a problem given by number or by name ("tip-shape-changed", "EP_TIP_SHAPE_CHANGED").
+
+        Raises:
+            InvalidValue: no such problem.
+        """
+        if isinstance(problem, str):
+            number = self._numbers.get(_plain(problem))
+            if number is None:
+                close = difflib.get_close_matches(_plain(problem), self._numbers, 1)
+                raise InvalidValue(
+                    f"there is no problem {problem!r}",
+                    hint=f"did you mean {close[0]!r}?" if close else f"known: {', '.join(self._numbers)}",
+                )
+            return number
+        if int(problem) not in self._names:
+            raise InvalidValue(f"there is no problem with the number {int(problem)}", hint="name it under [problems]")
+        return int(problem)
+
+    def name(self, number: int) -> str:
+        """The name of a problem; a number that nobody named is told as such."""
+        return self._names.get(number, f"problem {number}")
+
+    def __getitem__(self, name: str) -> int:
+        return self._numbers[_plain(name)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._numbers)
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+
+def _plain(name: str) -> str:
+    """ "EP_TIP_SHAPE_CHANGED" and "Tip shape changed" as "tip-shape-changed"."""
+    return name.strip().lower().replace("_", "-").replace(" ", "-").removeprefix("ep-")

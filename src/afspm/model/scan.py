@@ -1,0 +1,158 @@
+"""Scans: what is asked for, one channel of what was measured, and all channels together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+from afspm.model.geometry import Region
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True)
+class ScanParameters:
+    """Where a scan is taken and in how many pixels. In a request, None is not to be changed.
+
+    Attributes:
+        region: the rectangle that is scanned.
+        shape: pixels as (rows, columns), the order of numpy.
+        unit: of the values of a scan; None for the microscope's own.
+    """
+
+    region: Region | None = None
+    shape: tuple[int, int] | None = None
+    unit: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.shape is not None and min(self.shape) < 1:
+            raise InvalidValue(f"a scan of {self.shape[0]} rows and {self.shape[1]} columns has no pixels")
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One channel of a scan.
+
+    Attributes:
+        region: where it was taken.
+        channel: e.g. "Height Retrace".
+        unit: of the values.
+        values: [y, x], both ascending, float64; empty where only the parameters came.
+        time_ns: when it was finished, ns since the Unix epoch; None if it is not known.
+        filename: where the controller saved it; empty if it did not.
+    """
+
+    region: Region
+    channel: str
+    unit: str
+    values: NDArray[np.float64]
+    time_ns: int | None = None
+    filename: str = ""
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2:
+            raise InvalidValue(f"a scan needs values as [y, x], not of shape {self.values.shape}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.values.shape[0], self.values.shape[1]
+
+    @property
+    def parameters(self) -> ScanParameters:
+        return ScanParameters(self.region, self.shape, self.unit)
+
+    @property
+    def time(self) -> datetime | None:
+        """When it was finished, UTC."""
+        return None if self.time_ns is None else datetime.fromtimestamp(self.time_ns / 1e9, UTC)
+
+    def to_xarray(self) -> xarray.DataArray:
+        """As an xarray DataArray with coordinates in m (needs the extra `xarray`).
+
+        The coordinates x and y are those of the unrotated rectangle; `angle_rad` is in the attributes.
+        """
+        import xarray
+
+        (left, low), (width, height) = self.region.top_left_m, self.region.size_m
+        ny, nx = self.shape
+        return xarray.DataArray(
+            self.values,
+            {
+                "y": ("y", np.linspace(low, low + height, ny), {"units": "m"}),
+                "x": ("x", np.linspace(left, left + width, nx), {"units": "m"}),
+            },
+            ("y", "x"),
+            self.channel,
+            {
+                "units": self.unit,
+                "angle_rad": self.region.angle_rad,
+                "frame": self.region.frame.value,
+                "time": str(self.time),
+                "file": self.filename,
+            },
+        )
+
+    def _repr_html_(self) -> str:
+        from afspm.model.picture import scan_html
+
+        return scan_html(self)
+
+
+class ScanSet(Mapping[str, Scan]):
+    """All channels of one scan: `scans["Height"]`, or `.first` where one is as good as another.
+
+    Attributes:
+        interruptions: what got in between before it could be taken, oldest first, for a person.
+    """
+
+    def __init__(self, scans: Iterable[Scan], interruptions: Iterable[str] = ()) -> None:
+        self._scans = {scan.channel: scan for scan in scans}
+        if not self._scans:
+            raise InvalidValue("a set of scans needs one channel at least")
+        self.interruptions = tuple(interruptions)
+
+    @property
+    def first(self) -> Scan:
+        """The channel that was published first."""
+        return next(iter(self._scans.values()))
+
+    @property
+    def region(self) -> Region:
+        return self.first.region
+
+    @property
+    def time(self) -> datetime | None:
+        return self.first.time
+
+    def __getitem__(self, channel: str) -> Scan:
+        if channel not in self._scans:
+            raise KeyError(f"no channel {channel!r}; there are {', '.join(self._scans)}")
+        return self._scans[channel]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._scans)
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def __repr__(self) -> str:
+        ny, nx = self.first.shape
+        width, height = (size * 1e9 for size in self.region.size_m)
+        return f"<ScanSet {', '.join(self)}: {nx} x {ny} px, {width:g} x {height:g} nm, {self.time}>"
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All channels as an xarray Dataset (needs the extra `xarray`)."""
+        import xarray
+
+        return xarray.Dataset({channel: scan.to_xarray() for channel, scan in self.items()})
+
+    def _repr_html_(self) -> str:
+        return "".join(scan._repr_html_() for scan in self.values())

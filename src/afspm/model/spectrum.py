@@ -1,0 +1,84 @@
+"""A spectrum: curves measured at one position of the probe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+from afspm.model.geometry import XY, Frame
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Several variables measured together, point by point.
+
+    Attributes:
+        position_m: (x, y) of the probe in m; None if it is not known.
+        kind: what was done, e.g. "IV" or "force".
+        names: of the variables; the first is by custom the one that was swept.
+        units: of the variables.
+        values: shape (points, variables), float64.
+        time_ns: when it was taken, ns since the Unix epoch; None if it is not known.
+        filename: where the controller saved it; empty if it did not.
+        frame: of the position.
+
+    Raises:
+        InvalidValue: names, units and values do not fit together.
+    """
+
+    position_m: XY | None
+    kind: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: NDArray[np.float64]
+    time_ns: int | None = None
+    filename: str = ""
+    frame: Frame = Frame.TIP
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or self.values.shape[1] != len(self.names) or len(self.names) != len(self.units):
+            raise InvalidValue(
+                f"a spectrum of {len(self.names)} names, {len(self.units)} units and values of shape "
+                f"{self.values.shape} does not fit together",
+                hint="values have the shape (points, variables)",
+            )
+
+    @property
+    def time(self) -> datetime | None:
+        """When it was taken, UTC."""
+        return None if self.time_ns is None else datetime.fromtimestamp(self.time_ns / 1e9, UTC)
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        """One variable by its name, shape (points,)."""
+        if name not in self.names:
+            raise KeyError(f"no variable {name!r}; there are {', '.join(self.names)}")
+        return self.values[:, self.names.index(name)]
+
+    def to_xarray(self) -> xarray.Dataset:
+        """As an xarray Dataset over the first variable (needs the extra `xarray`)."""
+        import xarray
+
+        swept, *rest = self.names
+        columns: dict[str, Any] = {
+            name: (swept, self[name], {"units": unit}) for name, unit in zip(rest, self.units[1:], strict=True)
+        }
+        attributes = {
+            "kind": self.kind,
+            "position_m": self.position_m,
+            "time": str(self.time),
+            "file": self.filename,
+        }
+        return xarray.Dataset(columns, {swept: (swept, self[swept], {"units": self.units[0]})}, attributes)
+
+    def _repr_html_(self) -> str:
+        from afspm.model.picture import spectrum_html
+
+        return spectrum_html(self)

@@ -1,0 +1,57 @@
+"""What the microscope and the experiment are in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from afspm.model.enums import ControlMode, ScopeState
+from afspm.model.geometry import XY
+
+
+@dataclass(frozen=True)
+class ScopeStatus:
+    """What the microscope is doing.
+
+    Attributes:
+        paused: a scan is running but stands still; None if the microscope does not say.
+    """
+
+    state: ScopeState
+    paused: bool | None = None
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """The z feedback. None is what is not said, or in a request not to be changed.
+
+    Attributes:
+        on: whether it acts.
+        proportional_gain, integral_gain, setpoint: in the units of the microscope's operating mode.
+    """
+
+    on: bool | None = None
+    proportional_gain: float | None = None
+    integral_gain: float | None = None
+    setpoint: float | None = None
+
+
+@dataclass(frozen=True)
+class ProbePosition:
+    """Where the probe stands when it does not scan: (x, y) in m, tip coordinates unless a component maps them."""
+
+    xy_m: XY
+
+
+@dataclass(frozen=True)
+class ControlState:
+    """Who is in control, and what stands in the way.
+
+    Attributes:
+        mode: automated or manual.
+        holder: the name of the component in control; None if nobody is.
+        problems: the numbers of the problems that are flagged, ascending.
+    """
+
+    mode: ControlMode = ControlMode.AUTOMATED
+    holder: str | None = None
+    problems: tuple[int, ...] = ()

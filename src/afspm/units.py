@@ -1,0 +1,190 @@
+"""Units at the edges: everything inside afspm is in SI (metres, seconds, volts, amperes, radians …).
+
+The units of scanning probe microscopy are in a small exact table; any other goes to pint, which is only loaded then.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from typing import Annotated, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import UnitError
+
+Number = TypeVar("Number", float, NDArray[np.float64])
+
+_PREFIXES = {"": 0, "k": 3, "M": 6, "G": 9, "m": -3, "u": -6, "µ": -6, "μ": -6, "n": -9, "p": -12, "f": -15}
+_BASES = {
+    "m": "m",
+    "s": "s",
+    "V": "V",
+    "A": "A",
+    "Hz": "Hz",
+    "N": "N",
+    "rad": "rad",
+    "W": "W",
+    "K": "K",
+    "Ohm": "ohm",
+    "ohm": "ohm",
+}
+_NANO, _MICRO = Fraction(1, 10**9), Fraction(1, 10**6)
+_DEGREE = Fraction(math.pi) / 180
+_SPECIAL: dict[str, tuple[str, Fraction]] = {
+    "": ("", Fraction(1)),
+    "1": ("", Fraction(1)),
+    "%": ("", Fraction(1, 100)),
+    **dict.fromkeys(("Å", "\u212b", "angstrom"), ("m", Fraction(1, 10**10))),  # the letter, and the sign of its own
+    **dict.fromkeys(("min", "minute", "minutes"), ("s", Fraction(60))),
+    **dict.fromkeys(("h", "hour", "hours"), ("s", Fraction(3600))),
+    **dict.fromkeys(("d", "day", "days"), ("s", Fraction(86400))),
+    **dict.fromkeys(("sec", "second", "seconds"), ("s", Fraction(1))),
+    **dict.fromkeys(("deg", "°", "degree", "degrees"), ("rad", _DEGREE)),
+    **dict.fromkeys(("meter", "metre"), ("m", Fraction(1))),
+    **dict.fromkeys(("micron", "micrometer", "micrometre"), ("m", _MICRO)),
+    **dict.fromkeys(("nanometer", "nanometre"), ("m", _NANO)),
+    **dict.fromkeys(("px", "pixel", "pixels"), ("px", Fraction(1))),
+}
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Marks a float of a component's settings: the experiment file may give it as text with any unit of this kind.
+
+    Attributes:
+        si: the SI unit that the component gets, e.g. "m".
+    """
+
+    si: str
+
+
+Length = Annotated[float, Unit("m")]
+Duration = Annotated[float, Unit("s")]
+Angle = Annotated[float, Unit("rad")]
+Voltage = Annotated[float, Unit("V")]
+Current = Annotated[float, Unit("A")]
+Speed = Annotated[float, Unit("m/s")]
+Frequency = Annotated[float, Unit("Hz")]
+
+
+def convert(value: Number, unit_from: str, unit_to: str) -> Number:
+    """`value` (a float or an array) from one unit to another.
+
+    Raises:
+        UnitError: a unit is unknown, or the two are of different kinds.
+    """
+    if unit_from == unit_to:
+        return value
+    ratio = _ratio(unit_from, unit_to)
+    # a power of ten below one is no exact float, its inverse is: 1500 nm become 1.5e-06 m to the last bit
+    if ratio.numerator == 1:
+        return value / float(ratio.denominator)
+    return value * float(ratio)
+
+
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf))\s*(.*?)\s*", re.IGNORECASE)
+
+
+def parse_quantity(text: str) -> tuple[float, str]:
+    """ "2.5 um" -> (2.5, "um"); the unit may be missing.
+
+    Raises:
+        UnitError: it does not begin with a number.
+    """
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
+        raise UnitError(f"{text!r} is not a number with a unit", hint='write it as "2.5 um"')
+    return float(match[1]), match[2]
+
+
+def si(value: str | float, unit: str) -> float:
+    """A quantity as text ("2.5 um") or a plain number (SI already) as a float in the SI unit `unit`.
+
+    Raises:
+        UnitError: not a number, an unknown unit, or one of another kind than `unit`.
+    """
+    if isinstance(value, bool):
+        raise UnitError(f"{value} is not a number in {unit}")
+    if not isinstance(value, str):
+        return float(value)
+    number, given = parse_quantity(value)
+    return convert(number, given or unit, unit)
+
+
+def same_kind(unit_a: str, unit_b: str) -> bool:
+    """Whether one unit can be converted to the other; False for unknown ones."""
+    try:
+        return _base_and_factor(unit_a)[0] == _base_and_factor(unit_b)[0]
+    except UnitError:
+        return False
+
+
+@lru_cache(maxsize=1000)
+def _ratio(unit_from: str, unit_to: str) -> Fraction:
+    base_from, factor_from = _base_and_factor(unit_from)
+    base_to, factor_to = _base_and_factor(unit_to)
+    if base_from != base_to:
+        raise UnitError(
+            f"{unit_from or 'a number without a unit'} can't be converted to {unit_to or 'one without a unit'}",
+            hint=f"give it in {unit_to}" if unit_to else "leave the unit out",
+        )
+    return factor_from / factor_to
+
+
+@lru_cache(maxsize=1000)
+def _base_and_factor(unit: str) -> tuple[str, Fraction]:
+    """A unit as its kind, written in base units, and the factor to them."""
+    unit = unit.strip()
+    simple = _simple(unit)
+    if simple is not None:
+        return simple
+    if unit.count("/") == 1:
+        over, under = (_simple(part.strip()) for part in unit.split("/"))
+        if over is not None and under is not None:
+            return (over[0] if not under[0] else f"{over[0]}/{under[0]}"), over[1] / under[1]
+    return _by_pint(unit)
+
+
+def _simple(unit: str) -> tuple[str, Fraction] | None:
+    if unit in _SPECIAL:
+        return _SPECIAL[unit]
+    if unit in _BASES:
+        return _BASES[unit], Fraction(1)
+    prefix, base = unit[:1], unit[1:]
+    if prefix in _PREFIXES and base in _BASES:
+        return _BASES[base], Fraction(10) ** _PREFIXES[prefix]
+    return None
+
+
+_SI_NAMES = {
+    "meter": "m",
+    "second": "s",
+    "radian": "rad",
+    "meter / second": "m/s",
+    "1 / second": "Hz",
+    "kelvin": "K",
+    "kilogram * meter ** 2 / ampere / second ** 3": "V",
+    "kilogram * meter / second ** 2": "N",
+    "ampere": "A",
+    "kilogram * meter ** 2 / second ** 3": "W",
+    "kilogram * meter ** 2 / ampere ** 2 / second ** 3": "ohm",
+    "dimensionless": "",
+}
+
+
+def _by_pint(unit: str) -> tuple[str, Fraction]:
+    if len(unit) > 100:
+        raise UnitError(f"{unit[:30]!r}… is not a unit")
+    import pint
+
+    try:
+        quantity = pint.Quantity(1.0, unit).to_base_units()
+        base, factor = f"{quantity.units}", Fraction(float(quantity.magnitude))
+    except Exception as error:  # pint raises many kinds, even plain AttributeError and TokenError
+        raise UnitError(f"{unit!r} is not a unit that is known here", hint="e.g. nm, um, mV, nA, deg, nm/s") from error
+    return _SI_NAMES.get(base, base), factor
