@@ -1,0 +1,29 @@
+"""How a process of an experiment ends, told to its supervisor by the exit code."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit codes of our processes. Every other code, and every signal, is a crash: restart it."""
+
+    DONE = 0
+    """Finished on purpose: there is nothing more to do."""
+    CRASHED = 1
+    """An exception nobody handled; its traceback is in the log."""
+    CONFIG = 78
+    """The settings can't work: a restart would fail the same way."""
+    ENDED = 80
+    """The experiment ended (KILL)."""
+    ORPHAN = 81
+    """The parent went away, or asked us to stop by closing our standard input."""
+
+    @property
+    def restartable(self) -> bool:
+        return self is ExitCode.CRASHED
+
+
+def worth_restarting(code: int) -> bool:
+    """Whether a process that ended with this exit code (negative: a signal) should be started again."""
+    return code not in {ExitCode.DONE, ExitCode.CONFIG, ExitCode.ENDED, ExitCode.ORPHAN}

@@ -1,0 +1,100 @@
+"""What a process of an experiment is to the one that hosts it, and what it is given to run with."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from afspm.clock import Clock
+from afspm.model import ProblemNames
+from afspm.runtime.launch import Launch
+from afspm.transport.port import Port
+
+DEFAULT_LONGEST_STEP_S = 30.0
+
+
+class Activity:
+    """How long the current step has been running: what tells a busy process from a frozen one.
+
+    Written by the process, read by the thread that sends its heartbeats.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._since_s: float | None = None
+        self.longest_step_s = DEFAULT_LONGEST_STEP_S
+
+    @contextmanager
+    def step(self) -> Iterator[None]:
+        """Something is being worked on in this block."""
+        before, self._since_s = self._since_s, self._clock.monotonic_s()
+        try:
+            yield
+        finally:
+            self._since_s = before
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Within a step: this block only waits. The step counts anew afterwards."""
+        working, self._since_s = self._since_s is not None, None
+        try:
+            yield
+        finally:
+            self._since_s = self._clock.monotonic_s() if working else None
+
+    def age_s(self) -> float:
+        """Real seconds since the current step began; 0 when idle."""
+        since_s = self._since_s
+        return 0.0 if since_s is None else max(0.0, self._clock.monotonic_s() - since_s)
+
+
+def _never(_: Callable[[], None]) -> None:
+    """Nobody asks a process to stop that has no host."""
+
+
+@dataclass
+class Context:
+    """What the host gives to a process.
+
+    Attributes:
+        launch: the line that we were started with.
+        clock: the experiment's.
+        open_port: connects to the experiment as a component does (scheduler and translators have sockets of their own).
+        log: records go to the supervisor, and to the log collector if there is one.
+        activity: to be told of steps that take time.
+        when_stopping: registers what is called, from another thread, when the parent has gone or wants us to stop
+            (a port made by `open_port` is told by itself).
+        session: differs between two lives of a process, for ids that must not meet.
+    """
+
+    launch: Launch
+    clock: Clock
+    open_port: Callable[[], Port]
+    log: logging.Logger
+    activity: Activity
+    when_stopping: Callable[[Callable[[], None]], None] = _never
+    session: str = "0"
+    problems: ProblemNames = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.problems = ProblemNames(self.launch.problems)
+
+    @property
+    def name(self) -> str:
+        return self.launch.name
+
+
+@runtime_checkable
+class Process(Protocol):
+    """What the host can run: a component, a scheduler, a translator. It is made with the settings as arguments."""
+
+    def run_process(self, context: Context) -> int:
+        """Run until done, ended or stopped; returns an `ExitCode`.
+
+        Called on the main thread. To end within a second of a stop it must wait in one poller that
+        `context.when_stopping` (or the port) can wake.
+        """
+        ...
