@@ -1,6 +1,7 @@
 """What a component sees of the network: packets come in, requests and packets go out.
 
-No socket library is named here, so that the in-memory network of `afspm.testing` can stand in for the real one.
+No socket library is named here, so that the in-memory network of `afspm.testing` can stand in for the
+real one.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from afspm.model import Packet, Response
 
 @dataclass(frozen=True, slots=True)
 class PacketReceived:
-    """A packet arrived from the publisher at the address `source`; each packet arrives once, replayed or not."""
+    """A packet arrived from the publisher at the address `source`; each arrives once, replayed or not."""
 
     packet: Packet
     source: str
@@ -23,7 +24,7 @@ class PacketReceived:
 
 @dataclass(frozen=True, slots=True)
 class ReplyReceived:
-    """The scheduler answered; `response.id` is the id of the request it answers ("" from a peer of version 1)."""
+    """The scheduler answered; `response.id` is the id of the request that it answers ("": from version 1)."""
 
     response: Response
 
@@ -51,8 +52,10 @@ class ParentGone:
 
 @dataclass(frozen=True, slots=True)
 class ControlConnected:
-    """The scheduler can be asked, for the first time or again. What was asked before and not answered is lost:
-    ask again with the same id."""
+    """The scheduler can be asked, for the first time or again.
+
+    What was asked before and not answered may be lost: ask again with the same id.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,26 +63,25 @@ class ControlDisconnected:
     """The scheduler is gone for now; the connection is made again by itself."""
 
 
-Incoming = (
-    PacketReceived | ReplyReceived | CaughtUp | Killed | ParentGone | ControlConnected | ControlDisconnected
-)
+Incoming = PacketReceived | ReplyReceived | CaughtUp | Killed | ParentGone | ControlConnected | ControlDisconnected
 
 
 class Port(Protocol):
-    """One component's access to the network. Used from one thread; only `wake_up` may be called from others."""
+    """One component's access to the network, for one thread; only `wake_up` may be called from others."""
 
     @property
     def clock(self) -> Clock:
         """The clock of the experiment."""
 
     def send(self, frames: Sequence[bytes]) -> None:
-        """Ask the scheduler: `frames` are those of `wire.encode_request`. Never blocks; the answer comes by `poll`.
+        """Ask the scheduler: `frames` are those of `wire.encode_request`; the answer comes by `poll`.
 
-        While the scheduler is not connected the request is dropped: `ControlConnected` says when to ask again.
+        Never blocks. While the scheduler is not connected the request is dropped: `ControlConnected` says
+        when to ask again.
         """
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
-        """All that has arrived, in order; waits up to `timeout_s` real seconds (None: for ever) for the first.
+        """All that has arrived, in order; waits up to `timeout_s` real seconds (None: as long as it takes).
 
         Returns early after `wake_up`.
         """
@@ -98,4 +100,4 @@ class Port(Protocol):
         """
 
     def close(self) -> None:
-        """Close all sockets, after what was sent has gone out (at most a fraction of a second). Safe to repeat."""
+        """Close all once what was sent has gone out, within a fraction of a second. Safe to repeat."""
