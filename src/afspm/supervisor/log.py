@@ -1,0 +1,116 @@
+"""One log of a run: the lines of all processes, in the terminal with name and colour, in log.txt complete."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+import sys
+import zlib
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TextIO
+
+from afspm.clock import Clock, ExperimentClock
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+SUPERVISOR = "afspm"
+COLOURS = ("cyan", "green", "magenta", "blue", "bright_cyan", "bright_green", "bright_magenta", "bright_blue")
+LEVEL_STYLES = {logging.WARNING: "yellow", logging.ERROR: "bold red", logging.CRITICAL: "bold red"}
+_LEVELS = {name: getattr(logging, name) for name in ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")}
+_LEVELLED = re.compile(rf"(?P<level>{'|'.join(_LEVELS)})\b:?\s*(?P<text>.*)", re.DOTALL)
+
+
+class LineReader:
+    """Tells the level of the lines that one process writes.
+
+    On stderr a line may begin with its level ("WARNING the tip is blunt"), as ours do. Lines without one belong to
+    the line before: a traceback below an ERROR. Before any levelled line they are warnings, since a program that
+    complains before it has a log has reason to. What a component prints to stdout is information.
+    """
+
+    def __init__(self) -> None:
+        self._level: int = logging.WARNING
+
+    def read(self, stream: Literal["stdout", "stderr"], line: str) -> tuple[int, str]:
+        """The level (that of `logging`) and the text of a line."""
+        if stream == "stdout":
+            return logging.INFO, line
+        match = _LEVELLED.match(line)
+        if match is None:
+            return self._level, line
+        self._level = _LEVELS[match["level"]]
+        return self._level, match["text"]
+
+
+class RunLog:
+    """Writes every line to `file`, and those of `level` and above to the terminal.
+
+    A terminal that has gone away is no reason to end a measurement: what can't be written there is still in the file.
+    """
+
+    def __init__(self, file: Path, clock: Clock, *, terminal: TextIO | None = None, level: int = logging.INFO) -> None:
+        self._file = file.open("a", encoding="utf-8", errors="replace")
+        self._clock = clock
+        self._wall = ExperimentClock.real()
+        self._level = level
+        terminal = terminal or sys.stdout
+        self._show = _coloured(terminal) if terminal.isatty() else _plain(terminal)
+        self._widest = len(SUPERVISOR)
+
+    def write(self, name: str, level: int, text: str) -> None:
+        """One line of the process `name`; `level` is that of `logging`."""
+        wall = datetime.fromtimestamp(self._wall.now_s()).astimezone()
+        self._widest = max(self._widest, len(name))
+        with contextlib.suppress(OSError, ValueError):  # a full disk must not end the run from here
+            stamp = f"{wall:%Y-%m-%d %H:%M:%S}.{wall.microsecond // 1000:03d}{self._experiment_time()}"
+            self._file.write(f"{stamp} {logging.getLevelName(level):8} {name:{self._widest}} {text}\n")
+            self._file.flush()
+        if level >= self._level:
+            with contextlib.suppress(OSError, ValueError):
+                self._show(f"{wall:%H:%M:%S}", f"{name:{self._widest}}", level, text)
+
+    def _experiment_time(self) -> str:
+        """The time in the experiment, where it is another than the one on the wall."""
+        now_s = self._clock.now_s()
+        if abs(now_s - self._wall.now_s()) < 1.0:
+            return ""
+        return f" [{datetime.fromtimestamp(now_s).astimezone():%Y-%m-%d %H:%M:%S}]"
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def colour_of(name: str) -> str:
+    """The colour of a component's name: the same in every run and on every computer."""
+    return COLOURS[zlib.crc32(name.encode()) % len(COLOURS)]
+
+
+Show = Callable[[str, str, int, str], None]
+
+
+def _plain(terminal: TextIO) -> Show:
+    def show(time: str, name: str, level: int, text: str) -> None:
+        mark = "" if level < logging.WARNING else f"{logging.getLevelName(level)} "
+        terminal.write(f"{time} {name} {mark}{text}\n")
+        terminal.flush()
+
+    return show
+
+
+def _coloured(terminal: TextIO) -> Show:
+    from rich.console import Console
+    from rich.text import Text
+
+    console: Console = Console(file=terminal, highlight=False, soft_wrap=True)
+
+    def show(time: str, name: str, level: int, text: str) -> None:
+        line = Text.assemble((time, "dim"), " ", (name, colour_of(name.strip())), " ")
+        line.append(text, style=LEVEL_STYLES.get(level, ""))
+        console.print(line)
+
+    return show

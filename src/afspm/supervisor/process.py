@@ -1,0 +1,133 @@
+"""One child process: started, fed its launch line, read, waited for and killed. Every platform difference is here."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import IO, Literal
+
+from afspm.errors import AfspmError
+
+LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
+LAST_WORDS_S = 0.3  # how long output may still come after an exit (a grandchild can hold the pipe open)
+
+Stream = Literal["stdout", "stderr"]
+
+
+@dataclass(frozen=True, slots=True)
+class Printed:
+    """A child wrote a line."""
+
+    name: str
+    pid: int
+    stream: Stream
+    line: str
+
+
+@dataclass(frozen=True, slots=True)
+class Exited:
+    """A child is gone; a negative code is the number of the signal that ended it, as in `subprocess`."""
+
+    name: str
+    pid: int
+    code: int
+
+
+ProcessEvent = Printed | Exited
+
+
+class Process:
+    """A running child. Its output and its exit are told to `tell`, from threads of this object.
+
+    The child lives in a process group of its own: Ctrl-C in the terminal reaches the supervisor alone, and killing
+    takes what the child itself has started along. Its stdin stays open until `close_stdin`: the end of it means to the
+    child that its parent wants it to stop, or is dead (then the system closes it).
+
+    Raises:
+        AfspmError: the program can't be started.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        first_line: str,
+        tell: Callable[[ProcessEvent], None],
+        environment: Mapping[str, str],
+    ) -> None:
+        self.name = name
+        self._tell = tell
+        try:
+            self._popen = _start(command, environment)
+        except (OSError, ValueError) as error:
+            raise AfspmError(
+                f"{command[0]} can't be started: {error}", where=name, hint="is it installed and executable?"
+            ) from error
+        self.pid = self._popen.pid
+        self._fed = threading.Event()
+        readers = [self._reader("stdout", self._popen.stdout), self._reader("stderr", self._popen.stderr)]
+        threading.Thread(
+            target=self._feed_and_wait, args=(first_line, readers), name=f"{name}-wait", daemon=True
+        ).start()
+
+    def close_stdin(self) -> None:
+        """Ask the child to end. One that hasn't even taken its launch line is killed instead."""
+        if not self._fed.is_set():
+            self.kill()
+        elif self._popen.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._popen.stdin.close()
+
+    def kill(self) -> None:
+        """End the child and everything in its process group, now. A child that is gone already is left in peace."""
+        if sys.platform == "win32":
+            with contextlib.suppress(OSError):
+                self._popen.kill()
+        else:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.pid, signal.SIGKILL)
+
+    def _feed_and_wait(self, first_line: str, readers: list[threading.Thread]) -> None:
+        # here and not in __init__: a child that doesn't read must not block the supervisor
+        assert self._popen.stdin is not None
+        with contextlib.suppress(OSError, ValueError):  # gone already: its exit says so
+            self._popen.stdin.write(first_line.encode() + b"\n")
+            self._popen.stdin.flush()
+        self._fed.set()
+        code = self._popen.wait()
+        self.kill()  # what the child started and left behind must not live on beside its successor
+        for reader in readers:
+            reader.join(LAST_WORDS_S)
+        self.close_stdin()
+        self._tell(Exited(self.name, self.pid, code))
+
+    def _reader(self, stream: Stream, pipe: IO[bytes] | None) -> threading.Thread:
+        thread = threading.Thread(target=self._read, args=(stream, pipe), name=f"{self.name}-{stream}", daemon=True)
+        thread.start()
+        return thread
+
+    def _read(self, stream: Stream, pipe: IO[bytes] | None) -> None:
+        assert pipe is not None
+        with contextlib.suppress(OSError, ValueError), pipe:
+            while line := pipe.readline(LONGEST_LINE):
+                text = line.decode("utf-8", errors="replace").rstrip("\r\n")
+                self._tell(Printed(self.name, self.pid, stream, text))
+
+
+def _start(command: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        bufsize=-1,
+        env={**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", **environment},
+        start_new_session=sys.platform != "win32",
+        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+    )

@@ -1,0 +1,67 @@
+"""The folder that an experiment leaves behind: what was asked for, what happened, and all that was measured."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from afspm.errors import FileError
+
+EXPERIMENT_FILE = "experiment.toml"
+RUN_FILE = "run.json"
+LOG_FILE = "log.txt"
+STATE_DIR = "state"
+LATEST_FILE = "latest"
+MOST_RUNS_A_SECOND = 1000
+
+
+def create(runs: Path, experiment: str, started: datetime) -> Path:
+    """A new, empty run folder `runs/<experiment>-<time>/`, absolute; `runs/latest` then names it.
+
+    Raises:
+        FileError: the folder can't be made.
+    """
+    name = re.sub(r"[^\w.-]+", "-", experiment).strip("-.") or "experiment"
+    stamp = f"{name}-{started:%Y%m%d-%H%M%S}"
+    try:
+        runs.mkdir(parents=True, exist_ok=True)
+        folder = _new_folder(runs.resolve(), stamp)
+        (folder / STATE_DIR).mkdir()
+        _replace(runs / LATEST_FILE, folder.name + "\n")
+    except OSError as error:
+        raise FileError(
+            f"no folder for the run can be made: {error}", where=str(runs), hint="choose another with --runs"
+        ) from error
+    return folder
+
+
+def write_run(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Write run.json, which `afspm.connect` reads to find the running experiment."""
+    _replace(folder / RUN_FILE, json.dumps(facts, indent=2, ensure_ascii=False) + "\n")
+
+
+def write_experiment(folder: Path, text: str) -> None:
+    """Write the experiment file as it was expanded: nothing left to defaults, the whole run in one file."""
+    _replace(folder / EXPERIMENT_FILE, text)
+
+
+def _new_folder(runs: Path, stamp: str) -> Path:
+    for number in range(1, MOST_RUNS_A_SECOND):  # several may start in the same second
+        folder = runs / (stamp if number == 1 else f"{stamp}-{number}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise FileExistsError(f"{stamp} is there {MOST_RUNS_A_SECOND} times")
+
+
+def _replace(file: Path, text: str) -> None:
+    """Write so that a reader sees the old or the new text, never half of it."""
+    new = file.with_name(f".{file.name}.{os.getpid()}")
+    new.write_text(text, encoding="utf-8")
+    new.replace(file)

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import io
+import logging
+from pathlib import Path
+
+from afspm.clock import ExperimentClock
+from afspm.supervisor.log import COLOURS, LineReader, RunLog, colour_of
+
+
+def test_a_line_on_stderr_has_the_level_that_it_begins_with() -> None:
+    reader = LineReader()
+    assert reader.read("stderr", "INFO the scan begins") == (logging.INFO, "the scan begins")
+    assert reader.read("stderr", "WARNING: drift") == (logging.WARNING, "drift")
+
+
+def test_a_traceback_belongs_to_the_error_above_it() -> None:
+    reader = LineReader()
+    reader.read("stderr", "ERROR it failed")
+    assert reader.read("stderr", "Traceback (most recent call last):") == (
+        logging.ERROR,
+        "Traceback (most recent call last):",
+    )
+
+
+def test_a_word_that_only_begins_like_a_level_is_text() -> None:
+    assert LineReader().read("stderr", "INFORMATION about it") == (logging.WARNING, "INFORMATION about it")
+
+
+def test_what_a_component_prints_is_information() -> None:
+    assert LineReader().read("stdout", "ERROR of 3 nm") == (logging.INFO, "ERROR of 3 nm")
+
+
+def test_the_file_has_every_line_and_the_terminal_those_of_its_level(tmp_path: Path) -> None:
+    terminal = io.StringIO()
+    log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=terminal)
+    log.write("scheduler", logging.DEBUG, "a detail")
+    log.write("experiment", logging.ERROR, "a scan with µm failed")
+    log.close()
+    text = (tmp_path / "log.txt").read_text(encoding="utf-8")
+    assert "DEBUG    scheduler a detail" in text
+    assert "ERROR    experiment a scan with µm failed" in text
+    assert "a detail" not in terminal.getvalue()
+    assert "experiment ERROR a scan with µm failed" in terminal.getvalue()
+
+
+def test_the_file_says_the_experiments_time_where_it_is_another(tmp_path: Path) -> None:
+    log = RunLog(tmp_path / "log.txt", ExperimentClock.starting_now(start_s=1e9), terminal=io.StringIO())
+    log.write("scheduler", logging.INFO, "begin")
+    log.close()
+    assert "[2001-09-" in (tmp_path / "log.txt").read_text(encoding="utf-8")
+
+
+def test_a_terminal_that_is_gone_does_not_end_the_run(tmp_path: Path) -> None:
+    log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=_Gone())
+    log.write("scheduler", logging.INFO, "still here")
+    log.close()
+    assert "still here" in (tmp_path / "log.txt").read_text(encoding="utf-8")
+
+
+def test_a_terminal_shows_the_name_in_its_colour(tmp_path: Path) -> None:
+    terminal = _Colourful()
+    log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=terminal)
+    log.write("scheduler", logging.INFO, "[bold]not markup[/bold]")
+    log.close()
+    assert "\x1b[" in terminal.getvalue()
+    assert "[bold]not markup[/bold]" in terminal.getvalue()
+
+
+def test_a_name_keeps_its_colour() -> None:
+    assert colour_of("scheduler") == colour_of("scheduler")
+    assert {colour_of(f"component {n}") for n in range(200)} == set(COLOURS)
+
+
+class _Gone(io.StringIO):
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+
+class _Colourful(io.StringIO):
+    def isatty(self) -> bool:
+        return True

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from afspm.errors import FileError
+from afspm.supervisor import run_folder
+
+STARTED = datetime(2026, 11, 20, 22, 15, 3, tzinfo=UTC)
+
+
+def test_the_folder_is_named_after_experiment_and_time(tmp_path: Path) -> None:
+    folder = run_folder.create(tmp_path / "runs", "tip repair", STARTED)
+    assert folder == (tmp_path / "runs" / "tip-repair-20261120-221503").resolve()
+    assert (folder / "state").is_dir()
+
+
+def test_two_runs_of_one_second_do_not_share_a_folder(tmp_path: Path) -> None:
+    first = run_folder.create(tmp_path, "night", STARTED)
+    second = run_folder.create(tmp_path, "night", STARTED)
+    assert first != second
+    assert (tmp_path / "latest").read_text() == second.name + "\n"
+
+
+def test_a_name_cannot_lead_out_of_the_folder(tmp_path: Path) -> None:
+    folder = run_folder.create(tmp_path / "runs", "../../elsewhere", STARTED)
+    assert folder.parent == (tmp_path / "runs").resolve()
+
+
+def test_where_no_folder_can_be_made_the_error_says_so(tmp_path: Path) -> None:
+    (tmp_path / "runs").write_text("a file")
+    with pytest.raises(FileError, match="--runs"):
+        run_folder.create(tmp_path / "runs", "night", STARTED)
+
+
+def test_run_json_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    run_folder.write_run(tmp_path, {"name": "night"})
+    run_folder.write_run(tmp_path, {"name": "µ"})
+    assert json.loads((tmp_path / "run.json").read_text(encoding="utf-8")) == {"name": "µ"}
+    assert [file.name for file in tmp_path.iterdir()] == ["run.json"]
