@@ -1,0 +1,207 @@
+"""What happens to a scheduler, and what it does about it: the inputs and effects of `SchedulerCore`.
+
+Times are given beside the input: `now_s`, real and monotonic, for timeouts; `now_ns`, the experiment's, for whatever
+means something in the experiment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from afspm.model import ControlState, Packet, PacketHeader, Parameter, Request, Response
+
+# --- inputs ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Connected:
+    """A peer connected to the control socket. `connection` numbers grow and are never used again."""
+
+    connection: int
+
+
+@dataclass(frozen=True, slots=True)
+class Disconnected:
+    """A connection to the control socket is gone."""
+
+    connection: int
+
+
+@dataclass(frozen=True, slots=True)
+class Greeted:
+    """The peer of a connection said its name and nothing else (the empty first message of ZMQ_PROBE_ROUTER)."""
+
+    connection: int
+    name: str
+    user: str | None = None
+
+
+@dataclass(slots=True)
+class RequestIn:
+    """A request came by `connection` from the peer that calls itself `name`.
+
+    Attributes:
+        user: whose key it was, where connections are authenticated; None where they are not.
+    """
+
+    connection: int
+    name: str
+    request: Request
+    user: str | None = None
+
+
+@dataclass(slots=True)
+class PacketIn:
+    """The translator published a packet."""
+
+    packet: Packet
+    header: PacketHeader
+
+
+@dataclass(frozen=True, slots=True)
+class SubscriberJoined:
+    """A subscriber asks for what is cached under `prefixes` and newer than `since_ns`.
+
+    Attributes:
+        subscriber: whatever the caller needs to find it again; comes back in `Replay`.
+    """
+
+    subscriber: Hashable
+    prefixes: tuple[str, ...]
+    since_ns: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class TranslatorUp:
+    """The translator can be asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class TranslatorDown:
+    """The connection to the translator is gone."""
+
+
+@dataclass(slots=True)
+class TranslatorReply:
+    """The translator answered the request that was forwarded under `number`."""
+
+    number: int
+    response: Response
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentDied:
+    """Whoever watches the processes says that a component's has ended.
+
+    Attributes:
+        for_good: it will not be started again, so there is no use in waiting for it.
+    """
+
+    name: str
+    for_good: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Nothing happened, but a deadline (`SchedulerCore.wait_s`) has come."""
+
+
+Input = (
+    Connected
+    | Disconnected
+    | Greeted
+    | RequestIn
+    | PacketIn
+    | SubscriberJoined
+    | TranslatorUp
+    | TranslatorDown
+    | TranslatorReply
+    | ComponentDied
+    | Tick
+)
+
+
+# --- effects, to be carried out in the order given --------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Reply:
+    """Answer the peer `name`, over `connection` (which is open, and the newest of that name)."""
+
+    connection: int
+    name: str
+    response: Response
+
+
+@dataclass(slots=True)
+class Forward:
+    """Send a request to the translator, marked with `number`.
+
+    `request.payload` is to be sent as it is: also the requests of the scheduler's own are encoded already.
+    """
+
+    number: int
+    request: Request
+
+
+@dataclass(slots=True)
+class Publish:
+    """Publish a packet to whoever subscribes to its envelope.
+
+    Attributes:
+        source_ns: the translator's own time of it; None for what comes from the scheduler.
+        cached: whether it is in the cache now, so that it should be kept over a restart.
+    """
+
+    packet: Packet
+    source_ns: int | None = None
+    cached: bool = True
+
+
+@dataclass(slots=True)
+class Replay:
+    """Send these packets to one subscriber, in this order, and then that it has caught up."""
+
+    subscriber: Hashable
+    packets: tuple[Packet, ...]
+
+
+@dataclass(slots=True)
+class SaveState:
+    """Keep `state` (plain JSON) so that it survives a kill, before the effects that follow are carried out."""
+
+    state: dict[str, Any]
+
+
+@dataclass(slots=True)
+class Log:
+    """Tell people. `level` is a name of the logging module: "INFO", "WARNING", "ERROR"."""
+
+    level: str
+    text: str
+
+
+@dataclass(slots=True)
+class Kill:
+    """The experiment ends: publish the signal KILL, and close."""
+
+
+Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill
+
+
+class Codec(Protocol):
+    """The wire as far as decisions need it, so that they need not know the wire."""
+
+    def encode_control_state(self, state: ControlState) -> bytes:
+        """A ControlState as the payload of a packet."""
+
+    def encode_action(self, name: str) -> bytes:
+        """An ActionMsg as the payload of a request."""
+
+    def decode_parameter(self, payload: bytes) -> Parameter | None:
+        """A ParameterMsg out of a response; None if it is not one."""
+
+    def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
+        """The object of a small packet (ScopeStatus, Feedback, ScanParameters, ProbePosition); None if malformed."""
