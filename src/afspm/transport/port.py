@@ -101,3 +101,35 @@ class Port(Protocol):
 
     def close(self) -> None:
         """Close all once what was sent has gone out, within a fraction of a second. Safe to repeat."""
+
+
+Served = RequestReceived | SubscriberJoined | ParentGone
+
+
+class ServerPort(Protocol):
+    """A translator's access to the network: it answers requests, one at a time, and publishes.
+
+    What it has published lately is kept, and sent to whoever subscribes later.
+    """
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the experiment."""
+
+    def poll(self, timeout_s: float | None) -> list[Served]:
+        """What has arrived, in order: at most one request, which `reply` has to answer before another comes.
+
+        Waits up to `timeout_s` real seconds (None: as long as it takes); returns early after `wake_up`.
+        """
+
+    def reply(self, frames: Sequence[bytes]) -> None:
+        """Answer the request, with the frames of `wire.encode_response`. Never blocks."""
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        """Publish; the time is the experiment's, made strictly increasing."""
+
+    def wake_up(self, incoming: Served | None = None) -> None:
+        """End the `poll` under way, or the next; it returns `incoming` with what has arrived. From any thread."""
+
+    def close(self) -> None:
+        """Close all once what was sent has gone out, within a fraction of a second. Safe to repeat."""
