@@ -103,6 +103,19 @@ class Port(Protocol):
         """Close all once what was sent has gone out, within a fraction of a second. Safe to repeat."""
 
 
+@dataclass(frozen=True, slots=True)
+class RequestReceived:
+    """A request for a server to answer, as frames for `wire.decode_request`; `user` is whose keys it came with."""
+
+    frames: Sequence[bytes]
+    user: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SubscriberJoined:
+    """Somebody (a scheduler, to a translator) subscribed, and was sent what we had published before."""
+
+
 Served = RequestReceived | SubscriberJoined | ParentGone
 
 
