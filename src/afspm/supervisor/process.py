@@ -39,10 +39,10 @@ class Exited:
     code: int
 
 
-ProcessEvent = Printed | Exited
+ChildEvent = Printed | Exited
 
 
-class Process:
+class ChildProcess:
     """A running child. Its output and its exit are told to `tell`, from threads of this object.
 
     The child lives in a process group of its own: Ctrl-C in the terminal reaches the supervisor alone, and killing
@@ -58,7 +58,7 @@ class Process:
         name: str,
         command: Sequence[str],
         first_line: str,
-        tell: Callable[[ProcessEvent], None],
+        tell: Callable[[ChildEvent], None],
         environment: Mapping[str, str],
     ) -> None:
         self.name = name

@@ -1,0 +1,119 @@
+"""A child process: its output, its exit and its end are told, whatever it does."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from queue import Queue
+
+import pytest
+
+from afspm.errors import AfspmError
+from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed
+
+DEADLINE_S = 15.0
+Start = Callable[[str], ChildProcess]
+
+
+@pytest.fixture
+def events() -> Queue[ChildEvent]:
+    return Queue()
+
+
+@pytest.fixture
+def start(events: Queue[ChildEvent]) -> Iterator[Start]:
+    started: list[ChildProcess] = []
+
+    def run(code: str) -> ChildProcess:
+        child = ChildProcess("child", [sys.executable, "-c", code], '{"name": "child"}', events.put, {})
+        started.append(child)
+        return child
+
+    yield run
+    for child in started:
+        child.kill()
+
+
+def test_the_launch_line_arrives_and_the_answer_comes_back(start: Start, events: Queue[ChildEvent]) -> None:
+    child = start("print(input())")
+    assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stdout", '{"name": "child"}')
+    assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 0)
+
+
+def test_the_last_words_come_before_the_exit(start: Start, events: Queue[ChildEvent]) -> None:
+    child = start("import sys; print('it broke', file=sys.stderr); sys.exit(3)")
+    assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stderr", "it broke")
+    assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 3)
+
+
+def test_bytes_that_are_no_text_are_shown_as_well_as_can_be(start: Start, events: Queue[ChildEvent]) -> None:
+    start(r"import sys; sys.stdout.buffer.write(b'caf\xe9\n')")
+    printed = events.get(timeout=DEADLINE_S)
+    assert isinstance(printed, Printed)
+    assert printed.line == "caf\N{REPLACEMENT CHARACTER}"
+
+
+def test_closing_stdin_ends_a_child_that_waits_for_it(start: Start, events: Queue[ChildEvent]) -> None:
+    child = start("import sys; print('up', flush=True); sys.stdin.read(); sys.exit(81)")
+    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    child.close_stdin()
+    assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 81)
+
+
+def test_a_child_that_does_not_read_its_launch_line_does_not_block_us(events: Queue[ChildEvent]) -> None:
+    deaf = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
+    child = ChildProcess("deaf", deaf, "x" * 1_000_000, events.put, {})
+    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    child.close_stdin()
+    exited = events.get(timeout=DEADLINE_S)
+    assert isinstance(exited, Exited)
+    assert exited.code != 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="process groups")
+def test_killing_takes_what_the_child_has_started_along(start: Start, events: Queue[ChildEvent]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(DEADLINE_S)
+        port = server.getsockname()[1]
+        grandchild = f"import socket; socket.create_connection(('127.0.0.1', {port})).recv(1)"
+        child = start(f"import subprocess, sys; subprocess.run([sys.executable, '-c', {grandchild!r}])")
+        connection, _ = server.accept()
+        with connection:
+            connection.settimeout(DEADLINE_S)
+            child.kill()
+            assert connection.recv(1) == b""  # the system closes it when the grandchild is gone
+    assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, -signal.SIGKILL)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP")
+def test_a_frozen_child_can_be_killed(start: Start, events: Queue[ChildEvent]) -> None:
+    child = start("import sys; print('up', flush=True); sys.stdin.read()")
+    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    os.kill(child.pid, signal.SIGSTOP)
+    child.kill()
+    assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, -signal.SIGKILL)
+
+
+def test_a_program_that_is_not_there_is_named(events: Queue[ChildEvent]) -> None:
+    with pytest.raises(AfspmError, match="no-such-program"):
+        ChildProcess("child", ["no-such-program"], "{}", events.put, {})
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a pipe handed on by inheritance is a matter of POSIX")
+def test_a_child_does_not_hold_the_stdin_of_another_open(start: Start, events: Queue[ChildEvent]) -> None:
+    first = start("import sys; print('up', flush=True); sys.stdin.read()")
+    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    start("import sys; print('up', flush=True); sys.stdin.read()")
+    assert isinstance(events.get(timeout=DEADLINE_S), Printed)
+    first.close_stdin()
+    assert events.get(timeout=DEADLINE_S) == Exited("child", first.pid, 0)
+
+
+def test_output_is_not_held_back(start: Start, events: Queue[ChildEvent]) -> None:
+    start("import sys; print('at once'); sys.stdin.read()")
+    printed = events.get(timeout=DEADLINE_S)
+    assert isinstance(printed, Printed)
+    assert printed.line == "at once"
