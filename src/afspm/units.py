@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,25 @@ class Unit:
     """
 
     si: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Makes pydantic read the text too. Called by it alone, so that we need not load it here."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_before_validator_function(self.read, handler(source))
+
+    def read(self, value: Any) -> float:
+        """A quantity of the experiment file in this SI unit; a plain number is in it already.
+
+        Raises:
+            UnitError: not a finite number, an unknown unit, or one of another kind.
+        """
+        if isinstance(value, bool) or not isinstance(value, str | float | int):
+            raise UnitError(f"{value!r} is not a quantity", hint=f'write it as "2.5 {self.si}"')
+        number = si(value, self.si)
+        if not math.isfinite(number):
+            raise UnitError(f"{value!r} is not a finite number")
+        return number
 
 
 Length = Annotated[float, Unit("m")]

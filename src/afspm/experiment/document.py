@@ -1,0 +1,95 @@
+"""One or more TOML files read, laid over each other, and remembered line by line."""
+
+from __future__ import annotations
+
+import copy
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from afspm.experiment import lines
+from afspm.experiment.findings import Findings, Place
+
+
+@dataclass
+class Document:
+    """The merged tables, and where each key was set last."""
+
+    files: tuple[Path, ...]
+    data: dict[str, Any] = field(default_factory=dict)
+    places: dict[lines.Path, Place] = field(default_factory=dict)
+
+    def place(self, *path: str | int) -> Place:
+        """Where `path` was set: its own line, or that of the nearest thing around it."""
+        for depth in range(len(path), 0, -1):
+            found = self.places.get(path[:depth])
+            if found is not None:
+                return found
+        return Place(str(self.files[0]))
+
+    def folder_of(self, *path: str | int) -> Path:
+        """The folder of the file that set `path`; relative file names in it are meant from there."""
+        return Path(self.place(*path).file).resolve().parent
+
+    @property
+    def folders(self) -> list[Path]:
+        """The folders of the files, the first file's first; modules beside a file are found there."""
+        return list(dict.fromkeys(file.resolve().parent for file in self.files))
+
+
+def read(files: Sequence[Path], findings: Findings) -> Document:
+    """Read the files and lay each over those before it: tables merge, of anything else the later wins."""
+    document = Document(tuple(files))
+    for file in files:
+        text = _text(file, findings)
+        data = None if text is None else _parse(text, file, findings)
+        if text is None or data is None:
+            continue
+        where = {path: Place(str(file), line) for path, line in lines.locate(text).items()}
+        _lay_over(document, data, where)
+    return document
+
+
+def _text(file: Path, findings: Findings) -> str | None:
+    try:
+        return file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        findings.error(f"the file is not UTF-8 text: {error.reason} at byte {error.start}", Place(str(file)))
+    except OSError as error:
+        findings.error(f"the file can't be read: {error.strerror or error}", Place(str(file)))
+    return None
+
+
+def _parse(text: str, file: Path, findings: Findings) -> dict[str, Any] | None:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        match = re.search(r"^(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)$", str(error), re.S)
+        line = text.count("\n") + 1
+        what = str(error)
+        if match:
+            what = match[1]
+            if match[2]:
+                line = int(match[2])
+                what += f" at column {match[3]}"
+        findings.error(f"not valid TOML: {what}", Place(str(file), line))
+        return None
+
+
+def _lay_over(document: Document, data: dict[str, Any], where: dict[lines.Path, Place]) -> None:
+    _merge(document.data, data, (), document.places)
+    document.places.update(where)
+
+
+def _merge(below: dict[str, Any], above: dict[str, Any], path: lines.Path, places: dict[lines.Path, Place]) -> None:
+    for key, value in above.items():
+        here = (*path, key)
+        if isinstance(value, dict) and isinstance(below.get(key), dict):
+            _merge(below[key], value, here, places)
+            continue
+        for old in [p for p in places if p[: len(here)] == here]:
+            del places[old]  # what stood there is replaced as a whole
+        below[key] = copy.deepcopy(value)

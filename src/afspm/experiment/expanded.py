@@ -1,0 +1,59 @@
+"""The experiment written out as one TOML text: references replaced and defaults filled in."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from datetime import date, datetime, time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from afspm.experiment.experiment import Experiment
+
+
+def to_toml(experiment: Experiment) -> str:
+    """Variables, sections and components as they are in force. Reads back as the same experiment."""
+    parts = experiment.parts
+    tables: dict[str, Any] = dict(parts.variables)
+    tables.update(parts.sections)
+    for part in parts.components:
+        what: dict[str, Any] = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
+        own = {k: v for k, v in part.own.items() if k not in {"class", "command", "component"}}
+        tables[part.name] = {"component": True, **what, **own, **part.settings}
+    return dumps(tables)
+
+
+def dumps(document: Mapping[str, Any]) -> str:
+    """A document of plain TOML values as text."""
+    lines = [f"{_key(k)} = {_value(v)}" for k, v in document.items() if not isinstance(v, Mapping)]
+    blocks = ["\n".join(lines)] if lines else []
+    blocks += [_table((key,), value) for key, value in document.items() if isinstance(value, Mapping)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _table(path: tuple[str, ...], table: Mapping[str, Any]) -> str:
+    header = "[" + ".".join(map(_key, path)) + "]"
+    return "\n".join([header, *(f"{_key(k)} = {_value(v)}" for k, v in table.items() if v is not None)])
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # JSON's escapes are TOML's, but for the delete character, which TOML wants escaped
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, float):
+        return repr(value) if math.isfinite(value) else str(value)
+    if isinstance(value, datetime | date | time):
+        return value.isoformat()
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    return str(value)

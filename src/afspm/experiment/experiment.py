@@ -1,0 +1,140 @@
+"""An experiment as one or more TOML files say it: loaded, checked, and made into what is to be started."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from afspm.errors import ConfigError
+from afspm.experiment import document as documents
+from afspm.experiment import parts as sorting
+from afspm.experiment.findings import Finding, Findings
+from afspm.experiment.parts import Role
+from afspm.runtime.launch import Launch
+
+if TYPE_CHECKING:
+    from afspm.experiment.resolved import Resolved
+
+
+@dataclass(frozen=True)
+class Start:
+    """One process to start.
+
+    Attributes:
+        launch: the line for its standard input; heartbeat, log, clock and folders are for the supervisor to add
+            where it has not given them to `Experiment.launches`.
+        command: program and arguments; empty: the Python host runs `launch.class_`.
+        folder: to start commands in: that of the experiment file.
+        python_path: to be put before PYTHONPATH, so that modules beside the file are found.
+    """
+
+    launch: Launch
+    role: Role
+    command: tuple[str, ...]
+    folder: Path
+    python_path: tuple[str, ...]
+
+
+class Experiment:
+    """What the files say. Made by `load`."""
+
+    def __init__(self, document: documents.Document, found: Findings) -> None:
+        self._document = document
+        self._found = found
+        self.parts = sorting.sort(document, found)
+
+    @property
+    def name(self) -> str:
+        """The general variable `name`, else the folder of an `experiment.toml`, else the file's own name."""
+        named = self.parts.variables.get("name")
+        file = self._document.files[0].resolve()
+        return (
+            named if isinstance(named, str) and named else file.parent.name if file.stem == "experiment" else file.stem
+        )
+
+    @property
+    def folder(self) -> Path:
+        """Of the first file, absolute: relative paths in it are meant from there."""
+        return self._document.folders[0]
+
+    @property
+    def component_names(self) -> list[str]:
+        """All processes of the experiment: translator and scheduler too, in the order of the file."""
+        return [part.name for part in self.parts.components]
+
+    def check(self) -> list[Finding]:
+        """Everything that is wrong or doubtful; nothing is started. Errors first, then by line."""
+        self.resolved  # noqa: B018  (finds what there is to find)
+        return self._found.ordered()
+
+    @cached_property
+    def resolved(self) -> Resolved:
+        """Classes imported, settings in SI, sections parsed, sockets connected."""
+        from afspm.experiment.resolved import resolve
+
+        return resolve(self.parts, self._document, self._found)
+
+    def require_valid(self) -> None:
+        """Raises ConfigError that lists all errors, if there are any."""
+        errors = [finding for finding in self.check() if finding.is_error]
+        if errors:
+            raise ConfigError("\n".join(map(str, errors)), hint="afspm check shows what is wrong")
+
+    def launches(
+        self,
+        *,
+        take_address: Callable[[], str],
+        only: Collection[str] = (),
+        without: Collection[str] = (),
+        clock: Mapping[str, Any] | None = None,
+        run_dir: str = "",
+        state_dir: str = "",
+        log_level: str = "INFO",
+    ) -> list[Start]:
+        """What is to be started: translator and scheduler first.
+
+        Args:
+            take_address: gives a free loopback address for each that the file leaves open.
+            only: names of those to start here (empty: all); the addresses between them and the others must be in the
+                file, since nobody else would know one that is chosen here.
+            without: names of those not to start here.
+
+        Raises:
+            ConfigError: the file has errors, a name is unknown, or an address is missing for a piecemeal start.
+        """
+        from afspm.experiment import starting
+
+        self.require_valid()
+        starts = starting.starts(self, take_address, only, without)
+        return [
+            replace(
+                start,
+                launch=replace(
+                    start.launch,
+                    clock=dict(clock or {}),
+                    run_dir=run_dir,
+                    state_dir=state_dir,
+                    log_level=log_level,
+                ),
+            )
+            for start in starts
+        ]
+
+    def expanded(self) -> str:
+        """The whole experiment as one TOML text: references replaced, defaults filled in."""
+        from afspm.experiment.expanded import to_toml
+
+        return to_toml(self)
+
+
+def load(path: str | Path, *overlays: str | Path) -> Experiment:
+    """Read an experiment file, and lay others over it: tables merge key by key, of anything else the later file wins.
+
+    Nothing is raised for what is wrong in the files: `Experiment.check` tells it all at once.
+    """
+    found = Findings()
+    document = documents.read([Path(path), *map(Path, overlays)], found)
+    return Experiment(document, found)

@@ -1,0 +1,84 @@
+"""What a check finds: said with file, line, and what would put it right."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import Enum
+
+
+class Level(Enum):
+    """An error keeps the experiment from starting; a warning does not."""
+
+    ERROR = "error"
+    WARNING = "warning"
+
+
+@dataclass(frozen=True)
+class Place:
+    """A line of a file; line 0 means the file as a whole."""
+
+    file: str
+    line: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}" if self.line else self.file
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong (or doubtful) in an experiment file."""
+
+    level: Level
+    what: str
+    place: Place
+    hint: str = ""
+
+    @property
+    def is_error(self) -> bool:
+        return self.level is Level.ERROR
+
+    def __str__(self) -> str:
+        hint = f" ({self.hint})" if self.hint else ""
+        return f"{self.place}: {self.level.value}: {self.what}{hint}"
+
+
+@dataclass
+class Findings:
+    """Collects what is found, so that one check reports everything."""
+
+    found: list[Finding] = field(default_factory=list)
+
+    def error(self, what: str, place: Place, hint: str = "") -> None:
+        self._add(Finding(Level.ERROR, what, place, hint))
+
+    def warning(self, what: str, place: Place, hint: str = "") -> None:
+        self._add(Finding(Level.WARNING, what, place, hint))
+
+    def _add(self, finding: Finding) -> None:
+        if finding not in self.found:
+            self.found.append(finding)
+
+    def ordered(self) -> list[Finding]:
+        """Errors first, then in the order of the files' lines."""
+        return sorted(self.found, key=lambda f: (not f.is_error, f.place.file, f.place.line))
+
+
+def nearest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
+    """A hint that names the valid name nearest to `name`, or, where none is near, a few of them."""
+    names = sorted(set(valid))
+    close = closest(name, names, cutoff)
+    if close:
+        return f"did you mean {close!r}?"
+    if not names:
+        return ""
+    shown = ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
+    return f"known here: {shown}"
+
+
+def closest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
+    """The valid name nearest to `name` (upper and lower case alike), or None where none is near."""
+    by_fold = {v.casefold(): v for v in valid}
+    match = difflib.get_close_matches(name.casefold(), list(by_fold), n=1, cutoff=cutoff)
+    return by_fold[match[0]] if match else None

@@ -1,0 +1,108 @@
+"""Names that the experiment file may use for what is in afspm already: the paper's form, and short ones of ours."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final
+
+
+class Wire(Enum):
+    """The kinds of intermediary classes: they say where sockets are, and are not imported."""
+
+    PUBLISHER = "publisher"
+    SUBSCRIBER = "subscriber"
+    COMBINED = "several subscribers"
+    CACHE = "cache"
+    SERVER = "control server"
+    ROUTER = "router"
+    CLIENT = "control client"
+    CACHE_LOGIC = "cache logic"
+    ENVELOPE = "envelope of scans by size"
+    HISTORIES = "histories of scans by size"
+
+
+_PUBSUB = "afspm.io.pubsub"
+_CONTROL = "afspm.io.control"
+_LOGIC = f"{_PUBSUB}.logic"
+
+WIRE_CLASSES: Final[dict[str, Wire]] = {
+    f"{_PUBSUB}.publisher.Publisher": Wire.PUBLISHER,
+    f"{_PUBSUB}.cache.PubSubCache": Wire.CACHE,
+    f"{_PUBSUB}.subscriber.Subscriber": Wire.SUBSCRIBER,
+    f"{_PUBSUB}.subscriber.ComboSubscriber": Wire.COMBINED,
+    f"{_CONTROL}.server.ControlServer": Wire.SERVER,
+    f"{_CONTROL}.router.ControlRouter": Wire.ROUTER,
+    f"{_CONTROL}.client.ControlClient": Wire.CLIENT,
+    f"{_CONTROL}.client.AdminControlClient": Wire.CLIENT,
+    f"{_LOGIC}.pbc_logic.PBCScanLogic": Wire.CACHE_LOGIC,
+    f"{_LOGIC}.pbc_logic.ProtoBasedCacheLogic": Wire.CACHE_LOGIC,
+    f"{_LOGIC}.cache_logic.CacheLogic": Wire.CACHE_LOGIC,
+    f"{_LOGIC}.pbc_logic.create_roi_scan_envelope": Wire.ENVELOPE,
+    f"{_LOGIC}.pbc_logic.create_roi_proto_hist_list": Wire.HISTORIES,
+    "Publisher": Wire.PUBLISHER,
+    "Subscriber": Wire.SUBSCRIBER,
+    "Cache": Wire.CACHE,
+    "Server": Wire.SERVER,
+    "Router": Wire.ROUTER,
+    "Client": Wire.CLIENT,
+}
+
+# What each kind understands. Settings of the published classes that only say how Python is to decode or to name
+# packets are accepted and have no meaning here: decoding is the wire's, naming is the [cache] section's.
+WIRE_SETTINGS: Final[dict[Wire, frozenset[str]]] = {
+    Wire.PUBLISHER: frozenset({"url", "get_envelope_for_proto"}),
+    Wire.SUBSCRIBER: frozenset(
+        {
+            "sub_url",
+            "topics_to_sub",
+            "sub_extract_proto",
+            "update_cache",
+            "extract_proto_kwargs",
+            "update_cache_kwargs",
+        }
+    ),
+    Wire.COMBINED: frozenset({"subs"}),
+    Wire.CACHE: frozenset(
+        {
+            "url",
+            "sub_url",
+            "sub_extract_proto",
+            "pub_get_envelope_for_proto",
+            "update_cache",
+            "extract_proto_kwargs",
+            "update_cache_kwargs",
+            "topics_to_sub",
+        }
+    ),
+    Wire.SERVER: frozenset({"url"}),
+    Wire.ROUTER: frozenset({"server_url", "router_url", "request_timeout_ms", "request_retries"}),
+    Wire.CLIENT: frozenset({"url", "request_timeout_ms", "request_retries", "uuid"}),
+    Wire.CACHE_LOGIC: frozenset({"default_scan_history", "proto_with_history_list"}),
+    Wire.ENVELOPE: frozenset({"size", "channel"}),
+    Wire.HISTORIES: frozenset({"sizes_with_hist_list"}),
+}
+
+# The keys by which a component names its intermediaries, and the kinds that fit.
+WIRE_KEYS: Final[dict[str, tuple[Wire, ...]]] = {
+    "subscriber": (Wire.SUBSCRIBER, Wire.COMBINED),
+    "control_client": (Wire.CLIENT,),
+    "publisher": (Wire.PUBLISHER,),
+    "control_server": (Wire.SERVER,),
+    "pubsubcache": (Wire.CACHE,),
+    "router": (Wire.ROUTER,),
+}
+
+# Components of the published implementation that are ours under another name.
+COMPONENT_ALIASES: Final[dict[str, str]] = {
+    "afspm.components.microscope.mediator.MicroscopeMediator": "Scheduler",
+    "afspm.components.microscope.scheduler.MicroscopeScheduler": "Scheduler",
+    "afspm.components.scan.metadata.ScanMetadataWriter": "Metadata",
+}
+
+# Where a class named without a module is looked for, in this order.
+SHORT_NAME_PACKAGES: Final[tuple[str, ...]] = (
+    "afspm.components",
+    "afspm.scheduler",
+    "afspm.microscopes",
+    "afspm.microscopes.simulator",
+)

@@ -1,0 +1,149 @@
+"""The file's top level sorted into variables, our own sections, intermediary tables and components."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Final
+
+from afspm.experiment.document import Document
+from afspm.experiment.findings import Findings, Place, closest, nearest
+from afspm.experiment.known import COMPONENT_ALIASES, WIRE_CLASSES, WIRE_KEYS, Wire
+from afspm.experiment.references import References
+
+SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "messages", "restart")
+
+# Keys of a component's table that are for us; everything else is a setting of its class or command.
+OWN_KEYS: Final = frozenset({"component", "class", "command", "envelopes", "listens_to", "role", *WIRE_KEYS})
+DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")
+
+
+class Role(Enum):
+    """What a process is in the experiment."""
+
+    TRANSLATOR = "translator"
+    SCHEDULER = "scheduler"
+    COMPONENT = "component"
+
+
+@dataclass(frozen=True)
+class Part:
+    """One process of the experiment as the file has it, references replaced.
+
+    Attributes:
+        class_path: as written (an alias of the published form already ours); empty for a command.
+        command: program and arguments; empty for a Python class.
+        settings: what goes to the constructor, still with units.
+        own: the keys of the table that are for us (wiring, envelopes, role …).
+    """
+
+    name: str
+    class_path: str
+    command: tuple[str, ...]
+    settings: Mapping[str, Any]
+    own: Mapping[str, Any]
+    place: Place
+
+
+@dataclass
+class Parts:
+    """The sorted and expanded file."""
+
+    variables: dict[str, Any] = field(default_factory=dict)
+    sections: dict[str, dict[str, Any]] = field(default_factory=dict)
+    intermediaries: dict[str, dict[str, Any]] = field(default_factory=dict)
+    components: list[Part] = field(default_factory=list)
+
+
+def sort(document: Document, findings: Findings) -> Parts:
+    """Sort and expand; report what can't be part of an experiment."""
+    parts = Parts()
+    raw_components: dict[str, dict[str, Any]] = {}
+    for key, value in document.data.items():
+        if not isinstance(value, dict):
+            parts.variables[key] = value
+        elif _is_component(key, value, document, findings):
+            raw_components[key] = value
+        elif key in SECTIONS and "class" not in value:
+            parts.sections[key] = value
+        else:
+            parts.intermediaries[key] = value
+    references = References(document, {**parts.variables, **parts.intermediaries}, findings)
+    parts.variables = {k: references.expand(v, (k,)) for k, v in parts.variables.items()}
+    parts.sections = {k: references.expand(v, (k,)) for k, v in parts.sections.items()}
+    parts.intermediaries = {k: references.expand(v, (k,)) for k, v in parts.intermediaries.items()}
+    for name, table in raw_components.items():
+        part = _component(name, references.expand(table, (name,)), document, findings)
+        if part is not None:
+            parts.components.append(part)
+    _report_unused(parts, references.used, document, findings)
+    return parts
+
+
+def wire_of(table: Any) -> Wire | None:
+    """The kind of intermediary that a value is, or None."""
+    name = table.get("class") if isinstance(table, dict) else None
+    return WIRE_CLASSES.get(name) if isinstance(name, str) else None
+
+
+def _is_component(name: str, table: dict[str, Any], document: Document, findings: Findings) -> bool:
+    marked = table.get("component", False)
+    if not isinstance(marked, bool):
+        findings.error(f"`component` of [{name}] is {marked!r}, not true or false", document.place(name, "component"))
+    return marked is True
+
+
+def _component(name: str, table: dict[str, Any], document: Document, findings: Findings) -> Part | None:
+    place = document.place(name)
+    class_path, command = table.get("class", ""), table.get("command", ())
+    if not isinstance(class_path, str):
+        findings.error(f"`class` of [{name}] is not text", document.place(name, "class"), 'class = "module.Name"')
+        return None
+    if isinstance(command, str):
+        command = [command]
+    if not isinstance(command, list | tuple) or not all(isinstance(word, str) for word in command):
+        findings.error(
+            f"`command` of [{name}] is not a list of texts", document.place(name, "command"), 'command = ["program", …]'
+        )
+        return None
+    if bool(class_path) == bool(command):
+        both = "both `class` and `command`" if class_path else "neither `class` nor `command`"
+        near = "" if class_path else _misspelt(table, ("class", "command"))
+        findings.error(f"component [{name}] has {both}", place, near or "one of them says what to run")
+        return None
+    own_keys = OWN_KEYS if class_path else OWN_KEYS | set(DECLARED_KEYS)
+    return Part(
+        name=name,
+        class_path=COMPONENT_ALIASES.get(class_path, class_path),
+        command=tuple(command),
+        settings={k: v for k, v in table.items() if k not in own_keys},
+        own={k: v for k, v in table.items() if k in own_keys},
+        place=place,
+    )
+
+
+def _misspelt(table: Mapping[str, Any], wanted: tuple[str, ...]) -> str:
+    for key in table:
+        near = closest(key, wanted, 0.7)
+        if near:
+            return f"did you mean {near!r} by {key!r}?"
+    return ""
+
+
+def _report_unused(parts: Parts, used: set[str], document: Document, findings: Findings) -> None:
+    for name, table in parts.intermediaries.items():
+        if name in used:
+            continue
+        section = closest(name, SECTIONS, 0.75)
+        if section and "class" not in table:
+            findings.error(f"there is no section [{name}]", document.place(name), f"did you mean [{section}]?")
+        elif "component" in table:
+            continue  # switched off: component = false
+        elif "class" in table or "command" in table:
+            hint = "does it lack `component = true`?" if wire_of(table) is None else ""
+            findings.warning(f"nothing refers to [{name}]", document.place(name), hint)
+        else:
+            findings.warning(
+                f"[{name}] is neither a section nor a component", document.place(name), nearest(name, SECTIONS)
+            )

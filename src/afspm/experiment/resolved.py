@@ -1,0 +1,133 @@
+"""From the sorted file to what can be started: classes imported, settings in SI, sections parsed, sockets connected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from afspm.errors import InvalidValue
+from afspm.experiment import classes, sections, settings, wiring
+from afspm.experiment.classes import Declared
+from afspm.experiment.document import Document
+from afspm.experiment.findings import Findings, nearest
+from afspm.experiment.parts import Part, Parts, Role
+from afspm.experiment.wiring import Net, Wires
+from afspm.model import ProblemNames
+
+
+@dataclass
+class Resolved:
+    """Everything about the experiment that is known before it starts. Mappings are by the component's name."""
+
+    parts: Parts
+    document: Document
+    findings: Findings
+    clock: sections.Clock
+    control: sections.Control
+    security: sections.Security
+    messages: sections.Messages
+    problems: ProblemNames
+    named_problems: dict[str, int]
+    classes: dict[str, type] = field(default_factory=dict)
+    class_paths: dict[str, str] = field(default_factory=dict)
+    roles: dict[str, Role] = field(default_factory=dict)
+    declared: dict[str, Declared] = field(default_factory=dict)
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    wires: dict[str, Wires] = field(default_factory=dict)
+    net: Net = field(default_factory=Net)
+
+    def with_role(self, role: Role) -> list[Part]:
+        return [part for part in self.parts.components if self.roles.get(part.name) is role]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the microscope is a simulated one, as its class says with `simulated = True`."""
+        translators = [self.classes.get(part.name) for part in self.with_role(Role.TRANSLATOR)]
+        return bool(translators) and all(getattr(t, "simulated", False) is True for t in translators)
+
+
+def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:
+    """Resolve all that can be; what can't is reported and left out."""
+
+    def section(model: type[sections.S], name: str) -> sections.S:
+        return sections.parse(model, name, parts.sections.get(name, {}), document, findings)
+
+    named = _problems(parts.sections.get("problems", {}), document, findings)
+    resolved = Resolved(
+        parts=parts,
+        document=document,
+        findings=findings,
+        clock=section(sections.Clock, "clock"),
+        control=section(sections.Control, "control"),
+        security=section(sections.Security, "security"),
+        messages=section(sections.Messages, "messages"),
+        problems=ProblemNames(named),
+        named_problems=named,
+    )
+    with classes.importing_from(document.folders):
+        for part in parts.components:
+            _resolve_part(part, resolved)
+    for part in parts.components:
+        resolved.wires[part.name] = wiring.read_wires(part, document.place, findings)
+    resolved.net = wiring.connect(parts.components, resolved.roles, resolved.declared, resolved.wires, document.place)
+    return resolved
+
+
+def _resolve_part(part: Part, resolved: Resolved) -> None:
+    name, document, findings = part.name, resolved.document, resolved.findings
+    resolved.declared[name] = Declared.of_table(part.own)
+    resolved.roles[name] = _written_role(part, resolved)
+    resolved.settings[name] = settings.jsonable(part.settings, document.folder_of(name))
+    if part.command:
+        return
+    try:
+        path = classes.full_path(part.class_path)
+        component = classes.load(path)
+    except classes.Unloadable as error:
+        findings.error(f"[{name}] class: {error.what}", document.place(name, "class"), error.hint)
+        return
+    role = classes.role_of(component) if isinstance(component, type) else None
+    if role is None:
+        findings.error(
+            f"[{name}] {path} is not a component",
+            document.place(name, "class"),
+            "derive it from afspm.runtime.component.Component",
+        )
+        return
+    resolved.classes[name], resolved.class_paths[name], resolved.roles[name] = component, path, role
+    resolved.declared[name] = Declared.of_class(component)
+    resolved.settings[name] = settings.check(component, part.settings, (name,), document, findings)
+
+
+def _written_role(part: Part, resolved: Resolved) -> Role:
+    """By the key `role`, else by the wiring keys that only one role has."""
+    written = part.own.get("role")
+    if written is not None:
+        if written in [role.value for role in Role]:
+            return Role(written)
+        resolved.findings.error(
+            f"[{part.name}] has no role {written!r}",
+            resolved.document.place(part.name, "role"),
+            nearest(str(written), [role.value for role in Role]),
+        )
+    if "control_server" in part.own:
+        return Role.TRANSLATOR
+    return Role.SCHEDULER if {"router", "pubsubcache"} & part.own.keys() else Role.COMPONENT
+
+
+def _problems(table: Mapping[str, Any], document: Document, findings: Findings) -> dict[str, int]:
+    """[problems]: each name with its number; a wrong one is reported and left out."""
+    named: dict[str, int] = {}
+    for name, number in table.items():
+        place = document.place("problems", name)
+        if not isinstance(number, int) or isinstance(number, bool):
+            findings.error(f"[problems] {name} = {number!r} is not a whole number", place)
+            continue
+        try:
+            ProblemNames({**named, name: number})
+        except InvalidValue as error:
+            findings.error(error.what, place, error.hint)
+        else:
+            named[name] = number
+    return named

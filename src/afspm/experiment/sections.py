@@ -1,0 +1,114 @@
+"""Our own sections of the experiment file, as pydantic models. Only loaded where a file is checked or run."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, TypeVar
+
+import pydantic
+from pydantic import Field
+
+from afspm.experiment.document import Document
+from afspm.experiment.findings import Findings, nearest
+from afspm.units import Duration
+
+
+class Section(pydantic.BaseModel):
+    """Base: an unknown key is an error."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+PositiveDuration = Annotated[Duration, Field(gt=0)]
+
+
+class Clock(Section):
+    """[clock]: when the experiment's time begins and how fast it goes (simulated microscopes only)."""
+
+    start: datetime | None = None
+    speed: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+
+
+class Roles(Section):
+    """[control.roles]: who may do what concerns everyone; None: everyone may."""
+
+    end_experiment: tuple[str, ...] | None = None
+    set_mode: tuple[str, ...] | None = None
+    clear_problems: tuple[str, ...] | None = None
+
+
+class Control(Section):
+    """[control]: how control is given and taken away."""
+
+    lease: PositiveDuration | None = None
+    grace: Annotated[Duration, Field(ge=0)] = 5.0
+    stop_scan_on_problem: bool = True
+    stop_scan_on_manual: bool = True
+    request_timeout: PositiveDuration = 5.0
+    request_retries: Annotated[int, Field(ge=0)] = 3
+    roles: Roles = Roles()
+
+
+class Security(Section):
+    """[security]: the folder of CURVE keys, or the spoken word that there are none."""
+
+    keys: str | None = None
+    insecure: bool = False
+
+
+class Messages(Section):
+    """[messages]: Python modules or .proto files with message types of the user."""
+
+    modules: tuple[str, ...] = ()
+
+
+S = TypeVar("S", bound=Section)
+
+
+def parse(model: type[S], name: str, table: dict[str, Any], document: Document, findings: Findings) -> S:
+    """The section `[name]`; what is wrong with it is reported, and its defaults returned."""
+    try:
+        return model.model_validate(table)
+    except pydantic.ValidationError as error:
+        for one in error.errors(include_url=False):
+            report(one, (name,), document, findings, known=_fields_at(model, one["loc"]))
+        return model()
+
+
+def report(
+    error: Any, path: tuple[str | int, ...], document: Document, findings: Findings, known: tuple[str, ...] = ()
+) -> None:
+    """One error of pydantic in the words of the experiment file."""
+    location = tuple(part for part in error["loc"] if isinstance(part, int) or not part.startswith("function-"))
+    full = (*path, *location)
+    place = document.place(*full)
+    shown = name_of(full)
+    if error["type"] == "extra_forbidden":
+        findings.error(f"{shown} is not a setting", place, nearest(str(location[-1]), known))
+    elif error["type"] == "missing":
+        findings.error(f"{shown} is missing", place)
+    else:
+        said = error["msg"].removeprefix("Value error, ")
+        said = said[:1].lower() + said[1:]
+        given = error.get("input")
+        tail = f", not {given!r}" if not isinstance(given, dict) and repr(given) not in said else ""
+        findings.error(f"{shown}: {said}{tail}", place)
+
+
+def name_of(path: tuple[str | int, ...]) -> str:
+    """("limits", "a", 0) as "[limits] a[0]"."""
+    text = ""
+    for part in path[1:]:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return f"[{path[0]}] {text}".rstrip()
+
+
+def _fields_at(model: type[pydantic.BaseModel], location: tuple[str | int, ...]) -> tuple[str, ...]:
+    """The names that are valid where an error occurred: those of the (sub)section around it."""
+    here: type[pydantic.BaseModel] = model
+    for part in location[:-1]:
+        info = here.model_fields.get(str(part))
+        inner = info.annotation if info else None
+        if isinstance(inner, type) and issubclass(inner, pydantic.BaseModel):
+            here = inner
+    return tuple(here.model_fields)

@@ -1,0 +1,121 @@
+"""A component's settings against the constructor of its class: names, types and units, all before anything starts."""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
+from datetime import date, datetime
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import pydantic
+
+from afspm.experiment.document import Document
+from afspm.experiment.findings import Findings, closest, nearest
+from afspm.experiment.sections import report
+
+_KINDS_WITHOUT_NAME = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
+_TYPES = pydantic.ConfigDict(arbitrary_types_allowed=True)
+
+
+def check(
+    component: type, settings: Mapping[str, Any], path: tuple[str, ...], document: Document, findings: Findings
+) -> dict[str, Any]:
+    """The settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong."""
+    parameters = {name: p for name, p in _parameters(component).items() if p.kind not in _KINDS_WITHOUT_NAME}
+    takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in _parameters(component).values())
+    kinds = _annotations(component)
+    checked: dict[str, Any] = {}
+    unknown: list[str] = []
+    for name, value in settings.items():
+        if name in parameters:
+            annotation = kinds.get(name, Any)
+            checked[name] = _value(annotation, value, (*path, name), document, findings)
+        elif takes_any:
+            checked[name] = jsonable(value, document.folder_of(*path, name))
+        else:
+            unknown.append(name)
+            findings.error(
+                f"[{'.'.join(path)}] has no setting {name!r}", document.place(*path, name), nearest(name, parameters)
+            )
+    _report_missing(parameters, settings, unknown, path, document, findings)
+    return checked
+
+
+def jsonable(value: Any, folder: Path) -> Any:
+    """`value` in JSON's own types; a relative path is one beside the experiment file."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, Path):
+        return str(value if value.is_absolute() else folder / value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return jsonable(asdict(value), folder)
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item, folder) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [jsonable(item, folder) for item in value]
+    if isinstance(value, datetime | date):
+        return value.isoformat()
+    return value
+
+
+def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document, findings: Findings) -> Any:
+    folder = document.folder_of(*path)
+    if _is_object(value):
+        return jsonable(value, folder)  # an intermediary class of the user, made by the process itself
+    try:
+        adapter = pydantic.TypeAdapter(annotation, config=None if _has_own_config(annotation) else _TYPES)
+    except pydantic.PydanticUndefinedAnnotation:
+        return jsonable(value, folder)
+    try:
+        return jsonable(adapter.validate_python(value), folder)
+    except pydantic.ValidationError as error:
+        for one in error.errors(include_url=False):
+            report(one, path, document, findings)
+        return jsonable(value, folder)
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, dict) and isinstance(value.get("class"), str)
+
+
+def _has_own_config(annotation: Any) -> bool:
+    inner = typing.get_origin(annotation) or annotation
+    return isinstance(inner, type) and (
+        is_dataclass(inner) or issubclass(inner, pydantic.BaseModel) or typing.is_typeddict(inner)
+    )
+
+
+def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
+    try:
+        return inspect.signature(component).parameters
+    except (TypeError, ValueError):
+        return {}
+
+
+def _annotations(component: type) -> dict[str, Any]:
+    """Of the constructor that is in force, resolved; unresolvable ones (imported for typing only) are left out."""
+    init = component.__init__  # type: ignore[misc]
+    try:
+        return typing.get_type_hints(init, include_extras=True)
+    except Exception:
+        return {n: a for n, a in getattr(init, "__annotations__", {}).items() if not isinstance(a, str)}
+
+
+def _report_missing(
+    parameters: Mapping[str, inspect.Parameter],
+    settings: Mapping[str, Any],
+    unknown: list[str],
+    path: tuple[str, ...],
+    document: Document,
+    findings: Findings,
+) -> None:
+    for name, parameter in parameters.items():
+        if parameter.default is not inspect.Parameter.empty or name in settings:
+            continue
+        if closest(name, unknown, 0.7):
+            continue  # the misspelt key has been reported with this name as the hint
+        findings.error(f"[{'.'.join(path)}] lacks its setting {name!r}", document.place(*path))

@@ -1,0 +1,110 @@
+"""What is to be started, as launch lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Any
+
+from afspm.errors import ConfigError
+from afspm.experiment import wiring
+from afspm.experiment.experiment import Start
+from afspm.experiment.findings import nearest
+from afspm.experiment.parts import Part, Role
+from afspm.runtime.launch import Launch, Sockets
+
+if TYPE_CHECKING:
+    from afspm.experiment.experiment import Experiment
+    from afspm.experiment.resolved import Resolved
+
+_ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
+
+
+def starts(
+    experiment: Experiment, take_address: Callable[[], str], only: Collection[str], without: Collection[str]
+) -> list[Start]:
+    """The processes chosen, translator and scheduler first; clock and folders are still to be added."""
+    resolved = experiment.resolved
+    chosen = _chosen(experiment.component_names, only, without)
+    links = {name: resolved.net.links[name] for name in chosen}
+    _require_addresses(resolved, links, chosen)
+    addresses = resolved.net.addresses(take_address)
+    parts = sorted(
+        (part for part in resolved.parts.components if part.name in chosen),
+        key=lambda part: _ORDER.index(resolved.roles[part.name]),
+    )
+    return [_start(part, experiment, links[part.name], addresses) for part in parts]
+
+
+def _chosen(names: list[str], only: Collection[str], without: Collection[str]) -> set[str]:
+    for name in [*only, *without]:
+        if name not in names:
+            raise ConfigError(f"there is no component {name!r}", hint=nearest(name, names))
+    return {name for name in names if (not only or name in only) and name not in without}
+
+
+def _require_addresses(resolved: Resolved, links: Mapping[str, wiring.Links], chosen: set[str]) -> None:
+    """Between a process started here and one started elsewhere the address must be written down."""
+    missing = set()
+    for name, link in links.items():
+        for key in (link.publish, link.serve, link.control, *link.subscribe):
+            slot = resolved.net.slots.get(key or "")
+            if slot is not None and slot.address is None and slot.owner not in chosen:
+                missing.add(f"where [{slot.owner}] is to be reached by [{name}] ({slot.use})")
+    for slot in resolved.net.slots.values():
+        users = {
+            n for n, link in resolved.net.links.items() if f"{slot.owner}/{slot.use}" in (link.control, *link.subscribe)
+        }
+        if slot.address is None and slot.owner in chosen and users - chosen:
+            missing.add(f"where [{slot.owner}] is to be reached by [{min(users - chosen)}] ({slot.use})")
+    if missing:
+        raise ConfigError(
+            "a piecemeal start needs addresses in the file: " + "; ".join(sorted(missing)),
+            where=str(resolved.document.files[0]),
+            hint='e.g. publisher = "tcp://127.0.0.1:9000", see the reference on wiring',
+        )
+
+
+def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: Mapping[str, str]) -> Start:
+    resolved = experiment.resolved
+    wires, role = resolved.wires[part.name], resolved.roles[part.name]
+
+    def bound(key: str | None) -> str | None:
+        return None if key is None else addresses.get(key, key)
+
+    def met(key: str) -> str:
+        return wiring.connectable(addresses.get(key, key))
+
+    launch = Launch(
+        name=part.name,
+        class_=resolved.class_paths.get(part.name, ""),
+        settings={**resolved.settings[part.name], **(_for_scheduler(resolved) if role is Role.SCHEDULER else {})},
+        sockets=Sockets(
+            publish=bound(links.publish),
+            subscribe=tuple(met(source) for source in links.subscribe),
+            serve=bound(links.serve),
+            control=met(links.control) if links.control else None,
+        ),
+        envelopes=_envelopes(part, resolved),
+        problems=resolved.named_problems,
+        request_timeout_s=wires.request_timeout_s or resolved.control.request_timeout,
+        request_retries=_first(wires.request_retries, resolved.control.request_retries),
+        messages=resolved.messages.modules,
+        simulated=resolved.simulated,
+    )
+    folders = tuple(str(folder) for folder in resolved.document.folders)
+    return Start(launch, role, part.command, experiment.folder, folders)
+
+
+def _first(a: int | None, b: int) -> int:
+    return b if a is None else a
+
+
+def _envelopes(part: Part, resolved: Resolved) -> tuple[str, ...] | None:
+    """The prefixes said in the file, else those that the class declares, else all."""
+    wanted = part.own.get("envelopes", resolved.wires[part.name].envelopes)
+    return resolved.declared[part.name].listens if wanted is None else tuple(wanted)
+
+
+def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
+    """The sections that the scheduler enforces, as settings of its constructor."""
+    return {}

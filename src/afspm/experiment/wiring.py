@@ -1,0 +1,249 @@
+"""Who binds and who connects where: what the file says, and free addresses for what it leaves open.
+
+Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's,
+every component to the scheduler's; a component that publishes has an address of its own, to which those connect that
+listen to what it publishes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from afspm.experiment.classes import Declared
+from afspm.experiment.findings import Findings, Place
+from afspm.experiment.known import WIRE_KEYS, Wire
+from afspm.experiment.parts import Part, Role, wire_of
+
+_ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+|inproc://\S+)")
+LOOPBACK = ("127.", "localhost", "[::1]", "::1")
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One end that a process binds: the address the file gives, or None where it is left open."""
+
+    owner: str
+    use: str
+    address: str | None
+    place: Place
+
+
+@dataclass
+class Wires:
+    """What the wiring keys of one component say, as plain addresses."""
+
+    publish: str | None = None
+    subscribe: list[str] | None = None
+    envelopes: list[str] | None = None
+    control: str | None = None
+    serve: str | None = None
+    cache_in: str | None = None
+    cache_out: str | None = None
+    request_timeout_s: float | None = None
+    request_retries: int | None = None
+    cache_logic: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Links:
+    """Every socket of one process; an open address is a `Slot`'s key "owner/use" until it is given one."""
+
+    publish: str | None = None
+    subscribe: tuple[str, ...] = ()
+    serve: str | None = None
+    control: str | None = None
+
+
+@dataclass
+class Net:
+    """All slots and links of an experiment."""
+
+    slots: dict[str, Slot] = field(default_factory=dict)
+    links: dict[str, Links] = field(default_factory=dict)
+
+    def addresses(self, take: Callable[[], str]) -> dict[str, str]:
+        """Every slot's key with the address bound there, open ones filled by `take()`."""
+        return {key: slot.address or take() for key, slot in self.slots.items()}
+
+
+def read_wires(part: Part, placed: Callable[..., Place], findings: Findings) -> Wires:
+    """What the wiring keys of a component mean; reports what doesn't fit them."""
+    wires = Wires()
+    for key, kinds in WIRE_KEYS.items():
+        if key not in part.own:
+            continue
+        value, place = part.own[key], placed(part.name, key)
+        if isinstance(value, str) and _ADDRESS.fullmatch(value):
+            _apply_address(wires, key, value)
+        elif wire_of(value) in kinds:
+            _apply_table(wires, value)
+        elif isinstance(value, str):
+            findings.error(f"[{part.name}] {key} = {value!r} is neither an address nor one of the tables above", place)
+        elif wire_of(value) is not None:
+            findings.error(f"[{part.name}] {key} is a {_kind(value)}, not a {kinds[0].value}", place)
+        else:
+            findings.error(f"[{part.name}] {key} is {value!r}, not a {kinds[0].value}", place)
+    return wires
+
+
+def _kind(table: Any) -> str:
+    wire = wire_of(table)
+    return wire.value if wire else "table"
+
+
+def _apply_address(wires: Wires, key: str, address: str) -> None:
+    match key:
+        case "subscriber":
+            wires.subscribe = [address]
+        case "control_client":
+            wires.control = address
+        case "publisher":
+            wires.publish = address
+        case "control_server" | "router":
+            wires.serve = address
+        case "pubsubcache":
+            wires.cache_out = address
+
+
+def _apply_table(wires: Wires, table: Mapping[str, Any]) -> None:
+    match wire_of(table):
+        case Wire.PUBLISHER:
+            wires.publish = table.get("url")
+        case Wire.SUBSCRIBER:
+            _add_subscriber(wires, table)
+        case Wire.COMBINED:
+            for one in table.get("subs", ()):
+                if isinstance(one, dict):
+                    _add_subscriber(wires, one)
+        case Wire.CLIENT:
+            wires.control = table.get("url")
+            _apply_timeouts(wires, table)
+        case Wire.SERVER:
+            wires.serve = table.get("url")
+        case Wire.ROUTER:
+            wires.serve, wires.control = table.get("router_url"), table.get("server_url")
+            _apply_timeouts(wires, table)
+        case Wire.CACHE:
+            wires.cache_out, wires.cache_in = table.get("url"), table.get("sub_url")
+            logic = table.get("update_cache_kwargs")
+            wires.cache_logic = logic.get("cache_logic") if isinstance(logic, dict) else None
+
+
+def _add_subscriber(wires: Wires, table: Mapping[str, Any]) -> None:
+    urls = table.get("sub_url", ())
+    wires.subscribe = [*(wires.subscribe or ()), *([urls] if isinstance(urls, str) else urls)]
+    topics = table.get("topics_to_sub")
+    if topics is not None:
+        wires.envelopes = [*(wires.envelopes or ()), *([topics] if isinstance(topics, str) else topics)]
+
+
+def _apply_timeouts(wires: Wires, table: Mapping[str, Any]) -> None:
+    timeout_ms, retries = table.get("request_timeout_ms"), table.get("request_retries")
+    if isinstance(timeout_ms, int | float):
+        wires.request_timeout_s = timeout_ms / 1000
+    if isinstance(retries, int):
+        wires.request_retries = retries
+
+
+def is_address(text: str) -> bool:
+    """Whether this is an address as ZeroMQ writes it."""
+    return _ADDRESS.fullmatch(text) is not None
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only this computer can reach what is bound here."""
+    if not address.startswith("tcp://"):
+        return True
+    return address.removeprefix("tcp://").startswith(LOOPBACK)
+
+
+def reaches(connect: str, bind: str) -> bool:
+    """Whether a connection to one address ends at what is bound at the other (a wildcard means any host)."""
+    if connect == bind:
+        return True
+    a, b = _ADDRESS.fullmatch(connect), _ADDRESS.fullmatch(bind)
+    if not a or not b or a[3] is None or a[3] != b[3]:
+        return False
+    here = {"127.0.0.1", "localhost", "[::1]"}
+    return b[2] in {"*", "0.0.0.0", "[::]"} or {a[2], b[2]} <= here
+
+
+def connectable(bind: str) -> str:
+    """How a peer on the same computer connects to what is bound: a wildcard is no address to connect to."""
+    return re.sub(r"^tcp://(\*|0\.0\.0\.0)(?=:)", "tcp://127.0.0.1", bind)
+
+
+def connect(
+    parts: Sequence[Part],
+    roles: Mapping[str, Role],
+    declared: Mapping[str, Declared],
+    wires: Mapping[str, Wires],
+    placed: Callable[..., Place],
+) -> Net:
+    """Fill in what the wiring keys leave out."""
+    net = Net()
+    scheduler = next((p.name for p in parts if roles.get(p.name) is Role.SCHEDULER), None)
+    translator = next((p.name for p in parts if roles.get(p.name) is Role.TRANSLATOR), None)
+    above = wires[scheduler] if scheduler else Wires()
+
+    def slot(owner: str, use: str, address: str | None, key: str) -> str:
+        net.slots[f"{owner}/{use}"] = Slot(owner, use, address, placed(owner, key))
+        return f"{owner}/{use}"
+
+    if translator:
+        own = wires[translator]
+        data = slot(translator, "publish", own.publish or above.cache_in, "publisher")
+        asked = slot(translator, "serve", own.serve or above.control, "control_server")
+        net.links[translator] = Links(publish=data, serve=asked)
+    if scheduler:
+        out = slot(scheduler, "publish", above.cache_out, "pubsubcache")
+        router = slot(scheduler, "serve", above.serve, "router")
+        source, target = above.cache_in, above.control
+        if translator:
+            source = source or f"{translator}/publish"
+            target = target or f"{translator}/serve"
+        net.links[scheduler] = Links(out, (source,) if source else (), router, target)
+    others = [p for p in parts if roles.get(p.name) is Role.COMPONENT]
+    for part in others:
+        if wires[part.name].publish or declared[part.name].publishes:
+            slot(part.name, "publish", wires[part.name].publish, "publisher")
+    for part in others:
+        own = wires[part.name]
+        publish = f"{part.name}/publish"
+        net.links[part.name] = Links(
+            publish=publish if publish in net.slots else None,
+            subscribe=_sources(part, own, scheduler, above, declared, net),
+            control=own.control or (f"{scheduler}/serve" if scheduler else None),
+        )
+    return net
+
+
+def _sources(
+    part: Part, own: Wires, scheduler: str | None, above: Wires, declared: Mapping[str, Declared], net: Net
+) -> tuple[str, ...]:
+    """Where a component subscribes: as said, else at the scheduler and at those who publish what it listens to."""
+    if own.subscribe is not None:
+        # a publisher of the scheduler's own (rescans in the published form) is its one publisher here
+        extra = {above.publish: f"{scheduler}/publish"} if scheduler and above.publish else {}
+        return tuple(dict.fromkeys(extra.get(url, url) for url in own.subscribe))
+    sources = [f"{scheduler}/publish"] if scheduler else []
+    wanted = part.own.get("listens_to")
+    prefixes = own.envelopes if own.envelopes is not None else declared[part.name].listens
+    for other, said in declared.items():
+        slot = f"{other}/publish"
+        if other == part.name or slot not in net.slots or slot in sources:
+            continue
+        if isinstance(wanted, list):
+            if other in wanted:
+                sources.append(slot)
+        elif other != scheduler and said.publishes and _overlap(said.publishes, prefixes):
+            sources.append(slot)
+    return tuple(sources)
+
+
+def _overlap(published: Collection[str], prefixes: Collection[str] | None) -> bool:
+    """Whether any envelope of the one is wanted by the other; no prefixes means all are."""
+    return prefixes is None or any(e.startswith(p) or p.startswith(e) for e in published for p in prefixes)
