@@ -10,7 +10,7 @@ from afspm.model.enums import (
     Problem,
     ScopeState,
 )
-from afspm.model.geometry import Frame, Region
+from afspm.model.geometry import Frame, Region, RegionChange
 from afspm.model.packet import Packet, PacketHeader
 from afspm.model.problems import ProblemNames
 from afspm.model.scan import Scan, ScanParameters, ScanSet
@@ -31,6 +31,7 @@ __all__ = [
     "Problem",
     "ProblemNames",
     "Region",
+    "RegionChange",
     "Request",
     "Response",
     "Scan",

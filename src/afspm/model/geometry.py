@@ -98,3 +98,28 @@ class Region:
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
         turned: NDArray[np.float64] = offsets @ np.array([[cos, sin], [-sin, cos]])
         return turned
+
+
+@dataclass(frozen=True)
+class RegionChange:
+    """Part of a region, as a request may give it: None is not to be changed. In m and rad, before turning."""
+
+    left_m: float | None = None
+    low_m: float | None = None
+    width_m: float | None = None
+    height_m: float | None = None
+    angle_rad: float | None = None
+
+    def onto(self, region: Region) -> Region:
+        """`region` with what is given here changed.
+
+        Raises:
+            InvalidValue: that is no region.
+        """
+        (left, low), (width, height) = region.top_left_m, region.size_m
+        return Region.from_top_left(
+            (left if self.left_m is None else self.left_m, low if self.low_m is None else self.low_m),
+            (width if self.width_m is None else self.width_m, height if self.height_m is None else self.height_m),
+            region.angle_rad if self.angle_rad is None else self.angle_rad,
+            region.frame,
+        )

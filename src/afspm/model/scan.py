@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import InvalidValue
-from afspm.model.geometry import Region
+from afspm.model.geometry import Region, RegionChange
 
 if TYPE_CHECKING:
     import xarray
@@ -22,18 +22,31 @@ class ScanParameters:
     """Where a scan is taken and in how many pixels. In a request, None is not to be changed.
 
     Attributes:
-        region: the rectangle that is scanned.
+        region: the rectangle that is scanned; in a request perhaps only a part of what describes it.
         shape: pixels as (rows, columns), the order of numpy.
         unit: of the values of a scan; None for the microscope's own.
     """
 
-    region: Region | None = None
+    region: Region | RegionChange | None = None
     shape: tuple[int, int] | None = None
     unit: str | None = None
 
     def __post_init__(self) -> None:
         if self.shape is not None and min(self.shape) < 1:
             raise InvalidValue(f"a scan of {self.shape[0]} rows and {self.shape[1]} columns has no pixels")
+
+    def onto(self, current: ScanParameters) -> ScanParameters:
+        """What is in force after these were asked for while `current` were.
+
+        Raises:
+            InvalidValue: a part of a region is asked for where there is no region yet, or the result is none.
+        """
+        region = current.region if self.region is None else self.region
+        if isinstance(region, RegionChange):
+            if not isinstance(current.region, Region):
+                raise InvalidValue("a part of a region was given, and there is none to change", hint="give it whole")
+            region = region.onto(current.region)
+        return ScanParameters(region, self.shape or current.shape, self.unit or current.unit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,43 @@
+"""The wire format: model objects and messages to and from the bytes that travel between processes."""
+
+from __future__ import annotations
+
+from afspm.wire.codec import Buffer, decode, encode, header
+from afspm.wire.frames import (
+    BEAT,
+    CLOSING,
+    KILL,
+    decode_packet,
+    decode_parameter,
+    decode_request,
+    decode_response,
+    encode_packet,
+    encode_request,
+    encode_response,
+    encode_subject,
+    encode_time,
+)
+from afspm.wire.messages import known_messages, message_of, message_type, register
+
+__all__ = [
+    "BEAT",
+    "CLOSING",
+    "KILL",
+    "Buffer",
+    "decode",
+    "decode_packet",
+    "decode_parameter",
+    "decode_request",
+    "decode_response",
+    "encode",
+    "encode_packet",
+    "encode_request",
+    "encode_response",
+    "encode_subject",
+    "encode_time",
+    "header",
+    "known_messages",
+    "message_of",
+    "message_type",
+    "register",
+]

@@ -1,0 +1,214 @@
+"""Model objects and messages to and from bytes, by the name of the message."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import Message
+
+from afspm import model
+from afspm.errors import AfspmError, InvalidValue, UnitError, WireError
+from afspm.units import convert as convert_unit
+from afspm.wire import convert
+from afspm.wire.generated import analysis_pb2, control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire.messages import message_type, parse
+from afspm.wire.split import doubles, nested, packed, split
+
+Buffer = bytes | memoryview
+
+_VALUES_OF_SCAN = 4
+_DATA_OF_SPECTRUM = 4
+_VALUES_OF_DATA = 5
+
+
+def encode(thing: Any) -> tuple[str, bytes]:
+    """A model object, or any message, as (name of the message, bytes).
+
+    Raises:
+        InvalidValue: it is neither.
+    """
+    if isinstance(thing, Message):
+        return thing.DESCRIPTOR.name, thing.SerializeToString()
+    encoder = _ENCODERS.get(type(thing))
+    if encoder is None:
+        raise InvalidValue(f"a {type(thing).__name__} can't be sent", hint="send a Scan, a Spectrum, … or a message")
+    return encoder(thing)
+
+
+def decode(name: str, payload: Buffer) -> Any:
+    """The message `name` as a model object, where there is one for it, else as the generated message itself.
+
+    A scan's values are a view of `payload`.
+
+    Raises:
+        WireError: the bytes are no such message, or say what can't be.
+    """
+    decoder = _DECODERS.get(name)
+    try:
+        return parse(message_type(name), payload) if decoder is None else decoder(payload)
+    except (InvalidValue, UnitError) as error:
+        raise WireError(f"a {name} that makes no sense: {error}") from error
+
+
+def header(name: str, payload: Buffer) -> model.PacketHeader:
+    """What the envelope of a message may depend on; its values are not touched.
+
+    Raises:
+        WireError: the bytes are no such message.
+    """
+    reader = _HEADERS.get(name)
+    if reader is None:
+        message_type(name)
+        return model.PacketHeader(name)
+    try:
+        return reader(payload)
+    except AfspmError as error:
+        raise WireError(f"a {name} that makes no sense: {error}") from error
+
+
+def _encode_scan(scan: model.Scan) -> tuple[str, bytes]:
+    message = scan_pb2.Scan2d(
+        params=convert.scan_parameters_to_wire(
+            model.ScanParameters(scan.region, scan.shape if scan.values.size else None)
+        ),
+        channel=scan.channel,
+    )
+    message.params.data.units = scan.unit
+    if scan.time_ns is not None:
+        message.timestamp.CopyFrom(convert.timestamp(scan.time_ns))
+    if scan.filename:
+        message.filename = scan.filename
+    if not scan.values.size:
+        return "Scan2d", message.SerializeToString()
+    return "Scan2d", b"".join((message.SerializeToString(), *packed(scan.values, _VALUES_OF_SCAN)))
+
+
+def _decode_scan(payload: Buffer) -> model.Scan:
+    rest, chunks = split(payload, _VALUES_OF_SCAN)
+    message = parse(scan_pb2.Scan2d, rest)
+    values = doubles(chunks)
+    shape = message.params.data.shape
+    if values.size and values.size != shape.x * shape.y:
+        raise WireError(f"a scan of {shape.x} x {shape.y} pixels with {values.size} values")
+    region = convert.whole_region(convert.spatial_from_wire(message.params.spatial))
+    if region is None:
+        raise WireError("a scan that does not say where it was taken")
+    return model.Scan(
+        region,
+        message.channel,
+        message.params.data.units,
+        values.reshape(shape.y, shape.x) if values.size else np.empty((0, 0)),
+        convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
+        message.filename,
+    )
+
+
+def _scan_header(payload: Buffer) -> model.PacketHeader:
+    message = parse(scan_pb2.Scan2d, split(payload, _VALUES_OF_SCAN)[0])
+    spatial = message.params.spatial
+    size_m = None
+    if spatial.roi.HasField("size"):
+        unit = spatial.length_units or "m"
+        size_m = (convert_unit(spatial.roi.size.x, unit, "m"), convert_unit(spatial.roi.size.y, unit, "m"))
+    stamp = convert.time_ns(message.timestamp) if message.HasField("timestamp") else None
+    return model.PacketHeader("Scan2d", message.channel, size_m, None, stamp)
+
+
+def _encode_spectrum(spectrum: model.Spectrum) -> tuple[str, bytes]:
+    message = spectroscopy_pb2.Spec1d(type=spectrum.kind)
+    if spectrum.position_m is not None:
+        message.position.CopyFrom(convert.position_to_wire(model.ProbePosition(spectrum.position_m)))
+    if spectrum.filename:
+        message.filename = spectrum.filename
+    if spectrum.time_ns is not None:
+        message.timestamp.CopyFrom(convert.timestamp(spectrum.time_ns))
+    data = spectroscopy_pb2.SpecData(
+        num_variables=len(spectrum.names),
+        data_per_variable=spectrum.values.shape[0],
+        names=spectrum.names,
+        units=spectrum.units,
+    )
+    inner = b"".join((data.SerializeToString(), *packed(spectrum.values, _VALUES_OF_DATA)))
+    return "Spec1d", message.SerializeToString() + nested(inner, _DATA_OF_SPECTRUM)
+
+
+def _decode_spectrum(payload: Buffer) -> model.Spectrum:
+    rest, inner = split(payload, _DATA_OF_SPECTRUM)
+    message = parse(spectroscopy_pb2.Spec1d, rest)
+    data_rest, chunks = split(b"".join(inner), _VALUES_OF_DATA)
+    data = parse(spectroscopy_pb2.SpecData, data_rest)
+    values = doubles(chunks)
+    if values.size != data.num_variables * data.data_per_variable:
+        raise WireError(
+            f"a spectrum of {data.num_variables} variables of {data.data_per_variable} values each with {values.size}"
+        )
+    position = convert.position_from_wire(message.position).xy_m if message.HasField("position") else None
+    return model.Spectrum(
+        position,
+        message.type,
+        tuple(data.names),
+        tuple(data.units),
+        values.reshape(data.data_per_variable, data.num_variables),
+        convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
+        message.filename,
+    )
+
+
+def _spectrum_header(payload: Buffer) -> model.PacketHeader:
+    message = parse(spectroscopy_pb2.Spec1d, split(payload, _DATA_OF_SPECTRUM)[0])
+    stamp = convert.time_ns(message.timestamp) if message.HasField("timestamp") else None
+    return model.PacketHeader("Spec1d", kind=message.type, time_ns=stamp)
+
+
+def _regions_header(payload: Buffer) -> model.PacketHeader:
+    message = parse(analysis_pb2.SpatialROIWithScoreList, payload)
+    return model.PacketHeader("SpatialROIWithScoreList", message.channel)
+
+
+def _points_header(payload: Buffer) -> model.PacketHeader:
+    message = parse(analysis_pb2.SpatialPointWithScoreList, payload)
+    return model.PacketHeader("SpatialPointWithScoreList", message.channel)
+
+
+def _plain_encoder(name: str, to_wire: Callable[[Any], Message]) -> Callable[[Any], tuple[str, bytes]]:
+    return lambda thing: (name, to_wire(thing).SerializeToString())
+
+
+def _published_parameters(payload: Buffer) -> model.ScanParameters:
+    parameters = convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, payload))
+    if isinstance(parameters.region, model.RegionChange):  # published is what is in force: no angle means none
+        whole = convert.whole_region(parameters.region)
+        parameters = model.ScanParameters(whole or parameters.region, parameters.shape, parameters.unit)
+    return parameters
+
+
+_ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
+    model.Scan: _encode_scan,
+    model.Spectrum: _encode_spectrum,
+    model.ScanParameters: _plain_encoder("ScanParameters2d", convert.scan_parameters_to_wire),
+    model.Feedback: _plain_encoder("ZCtrlParameters", convert.feedback_to_wire),
+    model.ProbePosition: _plain_encoder("ProbePosition", convert.position_to_wire),
+    model.ScopeStatus: _plain_encoder("ScopeStateMsg", convert.status_to_wire),
+    model.ControlState: _plain_encoder("ControlState", convert.control_state_to_wire),
+    model.Parameter: _plain_encoder("ParameterMsg", convert.parameter_to_wire),
+}
+
+_DECODERS: dict[str, Callable[[Buffer], Any]] = {
+    "Scan2d": _decode_scan,
+    "Spec1d": _decode_spectrum,
+    "ScanParameters2d": _published_parameters,
+    "ZCtrlParameters": lambda payload: convert.feedback_from_wire(parse(feedback_pb2.ZCtrlParameters, payload)),
+    "ProbePosition": lambda payload: convert.position_from_wire(parse(spectroscopy_pb2.ProbePosition, payload)),
+    "ScopeStateMsg": lambda payload: convert.status_from_wire(parse(control_pb2.ScopeStateMsg, payload)),
+    "ControlState": lambda payload: convert.control_state_from_wire(parse(control_pb2.ControlState, payload)),
+    "ParameterMsg": lambda payload: convert.parameter_from_wire(parse(control_pb2.ParameterMsg, payload)),
+}
+
+_HEADERS: dict[str, Callable[[Buffer], model.PacketHeader]] = {
+    "Scan2d": _scan_header,
+    "Spec1d": _spectrum_header,
+    "SpatialROIWithScoreList": _regions_header,
+    "SpatialPointWithScoreList": _points_header,
+}

@@ -1,0 +1,210 @@
+"""Model objects to and from the messages of the contract. Only here do units and corners of the wire matter.
+
+We send metres, degrees and full presence; any unit and any absence is read.
+"""
+
+from __future__ import annotations
+
+import math
+
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from afspm import model
+from afspm.errors import InvalidValue
+from afspm.units import convert
+from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+
+LENGTH_UNIT = "m"
+ANGLE_UNIT = "deg"
+_NS = 1_000_000_000
+
+
+def timestamp(time_ns: int) -> Timestamp:
+    return Timestamp(seconds=time_ns // _NS, nanos=time_ns % _NS)
+
+
+def time_ns(stamp: Timestamp) -> int:
+    return int(stamp.seconds) * _NS + stamp.nanos
+
+
+def spatial_to_wire(region: model.Region | model.RegionChange) -> scan_pb2.SpatialAspects:
+    spatial = scan_pb2.SpatialAspects(length_units=LENGTH_UNIT, angular_units=ANGLE_UNIT)
+    if isinstance(region, model.Region):
+        (left, low), (width, height) = region.top_left_m, region.size_m
+        region = model.RegionChange(left, low, width, height, region.angle_rad)
+    roi = spatial.roi
+    if region.left_m is not None:
+        roi.top_left.x = region.left_m
+    if region.low_m is not None:
+        roi.top_left.y = region.low_m
+    if region.width_m is not None:
+        roi.size.x = region.width_m
+    if region.height_m is not None:
+        roi.size.y = region.height_m
+    if region.angle_rad is not None:
+        roi.angle = math.degrees(region.angle_rad)
+    return spatial
+
+
+def spatial_from_wire(spatial: scan_pb2.SpatialAspects) -> model.RegionChange | None:
+    """What the message says of the region, in SI; None if nothing.
+
+    Raises:
+        UnitError: a unit that is none of length or angle.
+    """
+    if not spatial.HasField("roi"):
+        return None
+    roi = spatial.roi
+    unit = spatial.length_units or "m"
+    angle_unit = spatial.angular_units or "deg"
+
+    def metres(holder: str, axis: str) -> float | None:
+        if not roi.HasField(holder) or not getattr(roi, holder).HasField(axis):
+            return None
+        return convert(float(getattr(getattr(roi, holder), axis)), unit, "m")
+
+    angle = convert(roi.angle, angle_unit, "rad") if roi.HasField("angle") else None
+    return model.RegionChange(
+        metres("top_left", "x"), metres("top_left", "y"), metres("size", "x"), metres("size", "y"), angle
+    )
+
+
+def whole_region(change: model.RegionChange | None) -> model.Region | None:
+    """The region, if the message gives all of it; an angle that is not given is zero.
+
+    Raises:
+        InvalidValue: it is none.
+    """
+    if change is None:
+        return None
+    left, low, width, height = change.left_m, change.low_m, change.width_m, change.height_m
+    if left is None or low is None or width is None or height is None:
+        return None
+    return model.Region.from_top_left((left, low), (width, height), change.angle_rad or 0.0)
+
+
+def scan_parameters_to_wire(parameters: model.ScanParameters) -> scan_pb2.ScanParameters2d:
+    message = scan_pb2.ScanParameters2d()
+    if parameters.region is not None:
+        message.spatial.CopyFrom(spatial_to_wire(parameters.region))
+    if parameters.shape is not None:
+        message.data.shape.y, message.data.shape.x = parameters.shape
+    if parameters.unit is not None:
+        message.data.units = parameters.unit
+    return message
+
+
+def scan_parameters_from_wire(message: scan_pb2.ScanParameters2d) -> model.ScanParameters:
+    """With a RegionChange where the region, its angle included, is not given whole.
+
+    Raises:
+        InvalidValue, UnitError: values that make no sense.
+    """
+    change = spatial_from_wire(message.spatial)
+    _finite(change)
+    region = whole_region(change) if change is not None and change.angle_rad is not None else None
+    shape = None
+    if message.data.HasField("shape"):
+        if not (message.data.shape.HasField("x") and message.data.shape.HasField("y")):
+            raise InvalidValue("the number of pixels is given along one axis only", hint="give both")
+        shape = (message.data.shape.y, message.data.shape.x)
+    return model.ScanParameters(region or change, shape, message.data.units or None)
+
+
+def _finite(change: model.RegionChange | None) -> None:
+    if change is None:
+        return
+    for name, value in vars(change).items():
+        if value is not None and not math.isfinite(value):
+            raise InvalidValue(f"{name.rsplit('_', 1)[0]} of the region is {value}")
+    if any(size is not None and size <= 0 for size in (change.width_m, change.height_m)):
+        raise InvalidValue(f"the region's size ({change.width_m} m, {change.height_m} m) must be above zero")
+
+
+def feedback_to_wire(feedback: model.Feedback) -> feedback_pb2.ZCtrlParameters:
+    return feedback_pb2.ZCtrlParameters(
+        feedbackOn=feedback.on,
+        proportionalGain=feedback.proportional_gain,
+        integralGain=feedback.integral_gain,
+        setPoint=feedback.setpoint,
+    )
+
+
+def feedback_from_wire(message: feedback_pb2.ZCtrlParameters) -> model.Feedback:
+    """Raises InvalidValue for numbers that are not finite."""
+    for name in ("proportionalGain", "integralGain", "setPoint"):
+        if not math.isfinite(getattr(message, name)):
+            raise InvalidValue(f"{name} is {getattr(message, name)}")
+    return model.Feedback(
+        message.feedbackOn if message.HasField("feedbackOn") else None,
+        message.proportionalGain if message.HasField("proportionalGain") else None,
+        message.integralGain if message.HasField("integralGain") else None,
+        message.setPoint if message.HasField("setPoint") else None,
+    )
+
+
+def position_to_wire(position: model.ProbePosition) -> spectroscopy_pb2.ProbePosition:
+    message = spectroscopy_pb2.ProbePosition(units=LENGTH_UNIT)
+    message.point.x, message.point.y = position.xy_m
+    return message
+
+
+def position_from_wire(message: spectroscopy_pb2.ProbePosition) -> model.ProbePosition:
+    """Raises InvalidValue where a coordinate is missing or not finite, UnitError for units that are no lengths."""
+    if not (message.point.HasField("x") and message.point.HasField("y")):
+        raise InvalidValue("a probe position needs x and y")
+    unit = message.units or "m"
+    xy_m = convert(message.point.x, unit, "m"), convert(message.point.y, unit, "m")
+    if not all(map(math.isfinite, xy_m)):
+        raise InvalidValue(f"the probe position is {xy_m}")
+    return model.ProbePosition(xy_m)
+
+
+def status_to_wire(status: model.ScopeStatus) -> control_pb2.ScopeStateMsg:
+    return control_pb2.ScopeStateMsg(scope_state=int(status.state), scan_paused=status.paused)  # type: ignore[arg-type]
+
+
+def status_from_wire(message: control_pb2.ScopeStateMsg) -> model.ScopeStatus:
+    """A state that a newer peer has and we don't know is UNDEFINED."""
+    number = message.scope_state
+    known = number in model.ScopeState._value2member_map_
+    state = model.ScopeState(number) if known else model.ScopeState.UNDEFINED
+    return model.ScopeStatus(state, message.scan_paused if message.HasField("scan_paused") else None)
+
+
+def control_state_to_wire(state: model.ControlState) -> control_pb2.ControlState:
+    return control_pb2.ControlState(
+        control_mode=int(state.mode),  # type: ignore[arg-type]
+        client_in_control_id=state.holder,
+        problems_set=state.problems,  # type: ignore[arg-type]
+    )
+
+
+def control_state_from_wire(message: control_pb2.ControlState) -> model.ControlState:
+    number = message.control_mode
+    known = number in model.ControlMode._value2member_map_
+    return model.ControlState(
+        model.ControlMode(number) if known else model.ControlMode.UNDEFINED,
+        message.client_in_control_id or None,
+        tuple(sorted({int(problem) for problem in message.problems_set})),
+    )
+
+
+def parameter_to_wire(parameter: model.Parameter) -> control_pb2.ParameterMsg:
+    return control_pb2.ParameterMsg(parameter=parameter.name, value=parameter.value, units=parameter.unit)
+
+
+def parameter_from_wire(message: control_pb2.ParameterMsg) -> model.Parameter:
+    if not message.parameter:
+        raise InvalidValue("a parameter without a name")
+    return model.Parameter(
+        message.parameter,
+        message.value if message.HasField("value") else None,
+        message.units if message.HasField("units") else None,
+    )
+
+
+def action_from_wire(message: control_pb2.ActionMsg) -> str:
+    if not message.action:
+        raise InvalidValue("an action without a name")
+    return message.action

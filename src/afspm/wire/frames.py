@@ -1,0 +1,169 @@
+"""Packets, requests and responses as the frames that travel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from afspm.errors import AfspmError, WireError
+from afspm.model import ControlRequest, ControlResponse, Packet, Parameter, Request, Response
+from afspm.wire import convert
+from afspm.wire.codec import Buffer, encode
+from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire.messages import parse
+
+KILL: Final = b"KILL"
+BEAT: Final = b"\x00"
+CLOSING: Final = b"\x01"
+LONGEST_ID = 200
+LONGEST_ENVELOPE = 1000
+
+
+def encode_time(time_ns: int) -> bytes:
+    """The third frame of a packet."""
+    return convert.timestamp(time_ns).SerializeToString()
+
+
+def encode_packet(packet: Packet) -> list[Buffer]:
+    """[envelope, message] and, where it is known, [timestamp]."""
+    frames: list[Buffer] = [packet.envelope.encode(), packet.payload]
+    if packet.time_ns is not None:
+        frames.append(encode_time(packet.time_ns))
+    return frames
+
+
+def decode_packet(frames: Sequence[Buffer]) -> Packet:
+    """A packet of two or three frames; its message is not looked into.
+
+    Raises:
+        WireError: it is none.
+    """
+    if not 2 <= len(frames) <= 3:
+        raise WireError(f"a packet of {len(frames)} frames instead of two or three")
+    if len(frames[0]) > LONGEST_ENVELOPE:
+        raise WireError(f"an envelope of {len(frames[0])} bytes")
+    try:
+        envelope = str(frames[0], "utf-8")
+    except UnicodeDecodeError:
+        raise WireError("an envelope that is not UTF-8 text") from None
+    time_ns = convert.time_ns(parse(Timestamp, frames[2])) if len(frames) == 3 else None
+    return Packet(envelope, frames[1], time_ns)
+
+
+def encode_request(request: Request) -> list[bytes]:
+    """[number, object, id]; the object's frame is there, if empty, since the id comes third."""
+    frames = [bytes([request.kind]), request.payload or encode_subject(request.subject)]
+    if request.id:
+        frames.append(request.id.encode())
+    elif not frames[1]:
+        frames.pop()
+    return frames
+
+
+def encode_subject(subject: Any) -> bytes:
+    """What a request is about, in bytes: one byte for a number, an ActionMsg for text, else the model object's."""
+    if subject is None:
+        return b""
+    if isinstance(subject, int):
+        return bytes([subject])
+    if isinstance(subject, str):
+        return control_pb2.ActionMsg(action=subject).SerializeToString()
+    return encode(subject)[1]
+
+
+def decode_request(frames: Sequence[Buffer]) -> Request:
+    """A request of one to three frames.
+
+    Raises:
+        WireError: it is none, with the `response` to answer: REP_CMD_NOT_SUPPORTED for a number that is unknown,
+            REP_PARAM_ERROR for a value that makes no sense, else REP_FAILURE.
+    """
+    if not 1 <= len(frames) <= 3:
+        raise WireError(f"a request of {len(frames)} frames instead of one to three")
+    if len(frames[0]) != 1:
+        raise WireError(f"a request whose first frame has {len(frames[0])} bytes instead of one")
+    kind = frames[0][0]
+    subject_of = _SUBJECTS.get(kind)
+    if subject_of is None:
+        raise WireError(f"there is no request {kind}", response=ControlResponse.CMD_NOT_SUPPORTED)
+    payload = bytes(frames[1]) if len(frames) > 1 else b""
+    request_id = _request_id(frames[2]) if len(frames) == 3 else ""
+    name = ControlRequest(kind).name
+    try:
+        return Request(kind, subject_of(payload), payload, request_id)
+    except WireError as error:
+        raise WireError(f"{name}: {error}", response=error.response) from error
+    except AfspmError as error:
+        raise WireError(f"{name}: {error}", response=ControlResponse.PARAM_ERROR) from error
+
+
+def _request_id(frame: Buffer) -> str:
+    if len(frame) > LONGEST_ID:
+        raise WireError(f"a request id of {len(frame)} bytes", hint=f"at most {LONGEST_ID}")
+    try:
+        return str(frame, "utf-8")
+    except UnicodeDecodeError:
+        raise WireError("a request id that is not UTF-8 text") from None
+
+
+def encode_response(response: Response) -> list[bytes]:
+    """[number] and, where there is any of it, [object, reason, id]."""
+    frames = [bytes([response.code]), response.payload, response.reason.encode(), response.id.encode()]
+    while len(frames) > 1 and not frames[-1]:
+        frames.pop()
+    return frames
+
+
+def decode_response(frames: Sequence[Buffer]) -> Response:
+    """A response of one to four frames.
+
+    Raises:
+        WireError: it is none.
+    """
+    if not 1 <= len(frames) <= 4 or len(frames[0]) != 1:
+        raise WireError(f"a response of {len(frames)} frames, the first of {len(frames[0]) if frames else 0} bytes")
+    payload = bytes(frames[1]) if len(frames) > 1 else b""
+    reason = str(frames[2], "utf-8", "replace") if len(frames) > 2 else ""
+    request_id = str(frames[3], "utf-8", "replace") if len(frames) > 3 else ""
+    return Response(frames[0][0], payload, reason, request_id)
+
+
+def decode_parameter(payload: Buffer) -> Parameter:
+    """The object of a successful REQ_PARAM: the value in force.
+
+    Raises:
+        WireError: it is none.
+    """
+    try:
+        return convert.parameter_from_wire(parse(control_pb2.ParameterMsg, payload))
+    except AfspmError as error:
+        raise WireError(f"the answer holds no parameter: {error}") from error
+
+
+def _nothing(payload: bytes) -> None:
+    if payload:
+        raise WireError(f"an object of {len(payload)} bytes where there should be none")
+
+
+def _number(payload: bytes) -> int:
+    if len(payload) != 1:
+        raise WireError(f"an object of {len(payload)} bytes instead of one number")
+    return payload[0]
+
+
+_SUBJECTS: dict[int, Callable[[bytes], Any]] = {
+    ControlRequest.ACTION: lambda p: convert.action_from_wire(parse(control_pb2.ActionMsg, p)),
+    ControlRequest.PARAM: lambda p: convert.parameter_from_wire(parse(control_pb2.ParameterMsg, p)),
+    ControlRequest.SET_SCAN_PARAMS: lambda p: convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, p)),
+    ControlRequest.SET_ZCTRL_PARAMS: lambda p: convert.feedback_from_wire(parse(feedback_pb2.ZCtrlParameters, p)),
+    ControlRequest.SET_PROBE_POS: lambda p: convert.position_from_wire(parse(spectroscopy_pb2.ProbePosition, p)),
+    ControlRequest.REQUEST_CTRL: _number,
+    ControlRequest.RELEASE_CTRL: _nothing,
+    ControlRequest.ADD_EXP_PRBLM: _number,
+    ControlRequest.RMV_EXP_PRBLM: _number,
+    ControlRequest.SET_CONTROL_MODE: _number,
+    ControlRequest.END_EXPERIMENT: _nothing,
+    ControlRequest.ACTION_SUPPORT: lambda p: convert.action_from_wire(parse(control_pb2.ActionMsg, p)),
+}

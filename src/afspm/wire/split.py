@@ -1,0 +1,105 @@
+"""Takes the numbers of a message out of its bytes, so that an array is a view of the buffer and never a list.
+
+A packed `repeated double` is tag, length, then little-endian float64 values: what lies between can be handed to numpy
+as it is, and the rest of the message, small, to the Protocol Buffers library.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import WireError
+
+_VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
+
+
+def split(buffer: bytes | memoryview, field: int) -> tuple[bytes, list[memoryview]]:
+    """A serialised message without the top-level field number `field`, and the contents of that field.
+
+    Returns:
+        The rest of the message in bytes, and the contents as views in the order they came: usually one.
+
+    Raises:
+        WireError: the bytes are no message.
+    """
+    view = memoryview(buffer)
+    if view.format != "B":
+        view = view.cast("B")
+    rest: list[memoryview] = []
+    found: list[memoryview] = []
+    end, at, kept_from = len(view), 0, 0
+    while at < end:
+        start = at
+        tag, at = _varint(view, at)
+        wire_type = tag & 7
+        if wire_type == _LENGTH:
+            length, at = _varint(view, at)
+        elif wire_type == _VARINT:
+            _, stop = _varint(view, at)
+            length = stop - at
+        elif wire_type == _FIXED64:
+            length = 8
+        elif wire_type == _FIXED32:
+            length = 4
+        else:
+            raise WireError(f"byte {start} begins a field of the unknown kind {wire_type}")
+        if at + length > end:
+            raise WireError(f"the message breaks off: the field at byte {start} is longer than what is left")
+        if tag >> 3 == field and wire_type in (_LENGTH, _FIXED64):
+            found.append(view[at : at + length])
+            rest.append(view[kept_from:start])
+            kept_from = at + length
+        at += length
+    if not found:
+        return bytes(view), found
+    rest.append(view[kept_from:])
+    return b"".join(rest), found
+
+
+def doubles(chunks: list[memoryview]) -> NDArray[np.float64]:
+    """The contents of a `repeated double` as an array, shape (n,): a view where it came in one piece.
+
+    Raises:
+        WireError: the length is no multiple of eight bytes.
+    """
+    if not chunks:
+        return np.empty(0)
+    data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
+    if len(data) % 8:
+        raise WireError(f"values of {len(data)} bytes are no float64 numbers")
+    return np.frombuffer(data, "<f8")
+
+
+def packed(values: NDArray[np.float64], field: int) -> tuple[bytes, memoryview]:
+    """An array as the field number `field`: its tag and length, and its values as bytes (a view where possible)."""
+    data = np.ascontiguousarray(values, "<f8").reshape(-1).data.cast("B")
+    return bytes([field << 3 | _LENGTH]) + _as_varint(len(data)), data
+
+
+def nested(payload: bytes, field: int) -> bytes:
+    """A serialised message as the field number `field` of another."""
+    return bytes([field << 3 | _LENGTH]) + _as_varint(len(payload)) + payload
+
+
+def _varint(view: memoryview, at: int) -> tuple[int, int]:
+    """The number at byte `at`, and where the next thing begins."""
+    value = shift = 0
+    end = len(view)
+    while at < end and shift < 64:
+        byte = view[at]
+        at += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, at
+        shift += 7
+    raise WireError("the message breaks off in a number")
+
+
+def _as_varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)

@@ -1,0 +1,200 @@
+"""Arrays without lists, envelopes, users' own messages, and bytes that are none."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afspm import wire
+from afspm.errors import InvalidValue, WireError
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Parameter,
+    ProbePosition,
+    Region,
+    RegionChange,
+    Request,
+    Response,
+    Scan,
+    ScanParameters,
+    Spectrum,
+)
+from afspm.wire.frames import encode_subject
+
+SCAN = Scan(
+    Region((1e-6, -2e-6), (2e-6, 1e-6), 0.25), "Height", "m", np.arange(12.0).reshape(3, 4), 1_700_000_000_000_000_001
+)
+
+
+def test_a_scans_values_are_a_view_of_the_buffer() -> None:
+    payload = bytearray(wire.encode(SCAN)[1])
+    scan = wire.decode("Scan2d", memoryview(payload))
+    at = bytes(payload).index(np.float64(5.0).tobytes())
+    payload[at : at + 8] = np.float64(-5.0).tobytes()
+    assert scan.values[1, 1] == -5.0
+
+
+def test_a_scan_survives_whatever_the_layout_of_its_array() -> None:
+    values = np.arange(24.0).reshape(4, 6)[::-1, ::2]
+    scan = Scan(SCAN.region, "Height", "m", values)
+    np.testing.assert_array_equal(wire.decode("Scan2d", wire.encode(scan)[1]).values, values)
+
+
+def test_values_that_a_peer_sends_in_pieces_are_put_together() -> None:
+    """Protocol Buffers allow a repeated field in several packed pieces, and unpacked."""
+    empty = wire.encode(Scan(SCAN.region, "Height", "m", np.empty((0, 0))))[1]
+    from afspm.wire.generated.scan_pb2 import Scan2d
+
+    message = Scan2d.FromString(empty)
+    message.params.data.shape.x, message.params.data.shape.y = 3, 1
+    one = bytes([4 << 3 | 2, 8]) + np.float64(1.0).tobytes()
+    two = bytes([4 << 3 | 1]) + np.float64(2.0).tobytes()
+    scan = wire.decode("Scan2d", one + message.SerializeToString() + two + one)
+    np.testing.assert_array_equal(scan.values, [[1.0, 2.0, 1.0]])
+
+
+def test_the_header_of_a_scan_is_read_without_its_values() -> None:
+    header = wire.header("Scan2d", wire.encode(SCAN)[1])
+    assert (header.channel, header.size_m, header.time_ns) == ("Height", (2e-6, 1e-6), 1_700_000_000_000_000_001)
+
+
+def test_a_spectrum_survives_a_round_trip() -> None:
+    spectrum = Spectrum((1e-9, 2e-9), "IV", ("Bias", "Current"), ("V", "A"), np.arange(6.0).reshape(3, 2), 5, "a.dat")
+    again = wire.decode("Spec1d", wire.encode(spectrum)[1])
+    np.testing.assert_array_equal(again["Current"], [1.0, 3.0, 5.0])
+    assert (again.position_m, again.kind, again.units) == ((1e-9, 2e-9), "IV", ("V", "A"))
+    assert wire.header("Spec1d", wire.encode(spectrum)[1]).kind == "IV"
+
+
+@pytest.mark.parametrize("unit", ["px", "V", "nonsense"])
+def test_a_length_in_a_unit_of_another_kind_is_refused_with_the_reason(unit: str) -> None:
+    from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as Message
+
+    message = Message(units=unit)
+    message.point.x = message.point.y = 1.0
+    with pytest.raises(WireError, match=unit) as refused:
+        wire.decode_request([bytes([ControlRequest.SET_PROBE_POS]), message.SerializeToString()])
+    assert refused.value.response == ControlResponse.PARAM_ERROR
+
+
+def test_only_the_fields_that_are_present_are_set() -> None:
+    payload = encode_subject(ScanParameters(RegionChange(width_m=3e-6)))
+    request = wire.decode_request([bytes([ControlRequest.SET_SCAN_PARAMS]), payload])
+    current = ScanParameters(SCAN.region, (3, 4), "m")
+    changed = request.subject.onto(current)
+    assert changed.region.size_m == (3e-6, 1e-6)
+    assert changed.region.top_left_m == pytest.approx(SCAN.region.top_left_m)
+    assert (changed.region.angle_rad, changed.shape) == (0.25, (3, 4))
+
+
+@pytest.mark.parametrize(
+    "subject",
+    [
+        Feedback(setpoint=float("nan")),
+        Feedback(integral_gain=float("inf")),
+        ProbePosition((float("nan"), 0.0)),
+        ScanParameters(RegionChange(width_m=0.0)),
+        ScanParameters(RegionChange(left_m=float("inf"))),
+    ],
+)
+def test_values_that_make_no_sense_are_refused(subject: object) -> None:
+    kind = {Feedback: 4, ProbePosition: 5, ScanParameters: 3}[type(subject)]  # type: ignore[index]
+    with pytest.raises(WireError) as refused:
+        wire.decode_request([bytes([kind]), encode_subject(subject)])
+    assert refused.value.response == ControlResponse.PARAM_ERROR
+
+
+def test_an_unknown_request_is_not_supported() -> None:
+    with pytest.raises(WireError) as refused:
+        wire.decode_request([b"\x63"])
+    assert refused.value.response == ControlResponse.CMD_NOT_SUPPORTED
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [[], [b""], [b"\x06"], [b"\x06", b"\x01\x02"], [b"\x07", b"x"], [b"\x01", b""], [b"\x01", b"\xff"], [b"ab"]],
+)
+def test_requests_that_break_off_are_refused(frames: list[bytes]) -> None:
+    with pytest.raises(WireError):
+        wire.decode_request(frames)
+
+
+def test_a_response_carries_reason_and_id() -> None:
+    response = Response(ControlResponse.PARAM_ERROR, b"", "tip-bias-voltage: 12 V is above 10 V", "a/1/2")
+    assert wire.decode_response(wire.encode_response(response)) == response
+
+
+def test_a_parameter_without_a_value_asks_for_it() -> None:
+    request = wire.decode_request(wire.encode_request(Request(ControlRequest.PARAM, Parameter("scan-speed"), id="1")))
+    assert request.subject == Parameter("scan-speed")
+
+
+@pytest.mark.parametrize(
+    ("envelope", "message"),
+    [
+        ("Scan2d", "Scan2d"),
+        ("Scan2d_2000.0_Height Retrace", "Scan2d"),
+        ("Scan2d_2000.0_a_channel_with_underscores", "Scan2d"),
+        ("ScanParameters2d", "ScanParameters2d"),
+    ],
+)
+def test_the_message_of_an_envelope(envelope: str, message: str) -> None:
+    assert wire.message_of(envelope) == message
+
+
+@pytest.mark.parametrize("envelope", ["", "Scan", "Scan2", "Scan2dx", "Nobody_knows", "_", "KILL"])
+def test_an_envelope_of_no_message(envelope: str) -> None:
+    with pytest.raises(WireError):
+        wire.message_of(envelope)
+
+
+def test_users_may_add_a_message_type() -> None:
+    file = descriptor_pb2.FileDescriptorProto(name="crystal_test.proto", package="lab", syntax="proto3")
+    message = file.message_type.add(name="CrystalAngle")
+    message.field.add(name="angle", number=1, type=1, label=1)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    angle = message_factory.GetMessageClass(pool.FindMessageTypeByName("lab.CrystalAngle"))
+    wire.register(angle)
+    assert wire.register(angle) is angle
+    name, payload = wire.encode(angle(angle=0.5))
+    assert wire.decode(wire.message_of(name), payload).angle == 0.5
+    assert wire.header(name, payload).message == "CrystalAngle"
+
+
+def test_what_is_no_message_cannot_be_sent() -> None:
+    with pytest.raises(InvalidValue, match="dict"):
+        wire.encode({})
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_a_message_or_a_wire_error(data: bytes) -> None:
+    for name in ("Scan2d", "Spec1d", "ScanParameters2d", "ControlState", "ScopeStateMsg", "SpatialROIWithScoreList"):
+        for read in (wire.decode, wire.header):
+            with contextlib.suppress(WireError):
+                read(name, data)
+
+
+@given(st.integers(0, 10_000), st.integers(0, 255))
+def test_a_damaged_scan_is_a_scan_or_a_wire_error(at: int, byte: int) -> None:
+    payload = bytearray(wire.encode(SCAN)[1])
+    payload[at % len(payload)] = byte
+    try:
+        scan = wire.decode("Scan2d", bytes(payload))
+    except WireError:
+        return
+    assert scan.values.ndim == 2
+
+
+@given(st.lists(st.binary(max_size=40), max_size=5))
+def test_any_frames_are_understood_or_refused(frames: list[bytes]) -> None:
+    for read in (wire.decode_request, wire.decode_response, wire.decode_packet):
+        with contextlib.suppress(WireError):
+            read(frames)

@@ -1,0 +1,134 @@
+"""The reference bytes of the wire format, in both directions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf import json_format
+
+from afspm import model, wire
+from afspm.model import ControlRequest, ControlResponse
+from afspm.wire.messages import message_type
+
+GOLDEN = json.loads((Path(__file__).parents[3] / "proto" / "golden.json").read_text(encoding="utf-8"))
+AS_MODEL = {"Scan2d", "Spec1d", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ScopeStateMsg", "ControlState"}
+
+
+def each(kind: str) -> Any:
+    return pytest.mark.parametrize("entry", GOLDEN[kind], ids=lambda entry: entry.get("name") or entry["envelope"])
+
+
+def parsed(name: str, payload: bytes) -> Any:
+    return message_type(name).FromString(payload)
+
+
+@each("messages")
+def test_a_peers_bytes_say_what_they_should(entry: Any) -> None:
+    expected = json_format.ParseDict(entry["fields"], message_type(entry["type"])(), ignore_unknown_fields=False)
+    assert parsed(entry["type"], bytes.fromhex(entry["hex"])) == expected
+
+
+@each("messages")
+def test_our_messages_are_the_reference_bytes(entry: Any) -> None:
+    message = json_format.ParseDict(entry["fields"], message_type(entry["type"])())
+    assert message.SerializeToString(deterministic=True).hex() == entry["hex"]
+
+
+@pytest.mark.parametrize(
+    "entry", [e for e in GOLDEN["messages"] if e["type"] in AS_MODEL], ids=lambda entry: entry["name"]
+)
+def test_model_objects_survive_a_round_trip(entry: Any) -> None:
+    """What we make of a peer's message and send on says the same in SI units, with the same presence."""
+    received = wire.decode(entry["type"], bytes.fromhex(entry["hex"]))
+    name, sent = wire.encode(received)
+    assert name == entry["type"]
+    original, ours = parsed(name, bytes.fromhex(entry["hex"])), parsed(name, sent)
+    assert _presence(ours) == _presence(original)
+    _same(wire.decode(name, sent), received)
+
+
+def _presence(message: Any) -> Any:
+    """Which fields are there, all the way down. Values are left out; empty scans keep no pixel count."""
+    return {
+        field.name: _presence(value) if field.message_type and not field.is_repeated else None
+        for field, value in message.ListFields()
+        if field.name != "shape"
+    }
+
+
+def _same(a: Any, b: Any) -> None:
+    assert type(a) is type(b)
+    for name, value in vars(a).items():
+        other = getattr(b, name)
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, other)
+        elif isinstance(value, model.Region):
+            np.testing.assert_allclose(value.corners_m(), other.corners_m(), rtol=1e-14)
+        else:
+            assert value == other
+
+
+def test_the_reference_scan_in_si_units() -> None:
+    entry = next(e for e in GOLDEN["messages"] if e["name"] == "scan 3x2")
+    scan = wire.decode("Scan2d", bytes.fromhex(entry["hex"]))
+    assert scan.region.top_left_m == pytest.approx((-250.5e-9, 125.25e-9))
+    assert scan.region.center_m == pytest.approx((749.5e-9, 875.25e-9))
+    assert scan.region.size_m == (2e-6, 1.5e-6)
+    assert scan.region.angle_rad == pytest.approx(np.radians(12.5))
+    assert (scan.channel, scan.unit, scan.filename) == ("Height Retrace", "nm", "C:\\data\\scan0001.ibw")
+    assert scan.time_ns == 1_767_225_600_123_456_000
+    np.testing.assert_array_equal(scan.values, [[0.0, 1.5, -2.25], [1e-09, 3e300, -0.0]])
+
+
+@each("requests")
+def test_requests(entry: Any) -> None:
+    frames = [bytes.fromhex(frame) for frame in entry["frames"]]
+    request = wire.decode_request(frames)
+    assert request.kind == ControlRequest[entry["request"].removeprefix("REQ_")]
+    if isinstance(entry["object"], int):
+        assert request.subject == entry["object"]
+    assert wire.encode_request(request) == frames
+    again = wire.decode_request(wire.encode_request(model.Request(request.kind, request.subject, id="exp/1/7")))
+    assert (again.kind, again.id) == (request.kind, "exp/1/7")
+    assert str(again.subject) == str(request.subject)
+
+
+@each("responses")
+def test_responses(entry: Any) -> None:
+    frames = [bytes.fromhex(frame) for frame in entry["frames"]]
+    response = wire.decode_response(frames)
+    assert response.code == entry["response"]
+    assert wire.encode_response(response) == frames
+    if "object" in entry:
+        assert wire.decode_parameter(response.payload) == model.Parameter("scan-speed", "1500.0", "nm/s")
+
+
+@each("published")
+def test_packets(entry: Any) -> None:
+    frames = [bytes.fromhex(frame) for frame in entry["frames"]]
+    packet = wire.decode_packet(frames)
+    assert packet.envelope == entry["envelope"]
+    assert wire.message_of(packet.envelope) == entry["type"]
+    assert [bytes(frame) for frame in wire.encode_packet(packet)] == frames
+
+
+def test_signals_and_heartbeats() -> None:
+    assert wire.KILL.hex() == GOLDEN["signals"][0]["frames"][0]
+    assert [wire.BEAT.hex(), wire.CLOSING.hex()] == [beat["frames"][0] for beat in GOLDEN["heartbeats"]]
+
+
+def test_our_enumerations_have_the_numbers_of_the_contract() -> None:
+    from afspm.wire.generated import control_pb2
+
+    for ours, theirs, prefix in (
+        (model.ScopeState, control_pb2.ScopeState, "SS_"),
+        (model.ControlMode, control_pb2.ControlMode, "CM_"),
+        (model.Problem, control_pb2.ExperimentProblem, "EP_"),
+        (ControlRequest, control_pb2.ControlRequest, "REQ_"),
+        (ControlResponse, control_pb2.ControlResponse, "REP_"),
+    ):
+        assert {prefix + member.name: int(member) for member in ours} == dict(theirs.items())
