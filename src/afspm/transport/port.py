@@ -135,11 +135,19 @@ class ServerPort(Protocol):
         Waits up to `timeout_s` real seconds (None: as long as it takes); returns early after `wake_up`.
         """
 
-    def reply(self, frames: Sequence[bytes]) -> None:
-        """Answer the request, with the frames of `wire.encode_response`. Never blocks."""
+    def reply(self, frames: Sequence[bytes] | None) -> None:
+        """Answer the request, with the frames of `wire.encode_response`. Never blocks.
 
-    def publish(self, envelope: str, payload: bytes) -> None:
-        """Publish; the time is the experiment's, made strictly increasing."""
+        None: not at all, as if the answer was lost (a fault that a simulated microscope may be told to have).
+        """
+
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
+        """Publish; the time is the experiment's, made strictly increasing.
+
+        Args:
+            time_ns: the time to publish it with. A restarted translator publishes again what may have been lost in
+                the kill, at the times of the first attempt, so that whoever has had it ignores it.
+        """
 
     def wake_up(self, incoming: Served | None = None) -> None:
         """End the `poll` under way, or the next; it returns `incoming` with what has arrived. From any thread."""
