@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, Literal
 
 from afspm.errors import AfspmError
@@ -60,11 +61,12 @@ class ChildProcess:
         first_line: str,
         tell: Callable[[ChildEvent], None],
         environment: Mapping[str, str],
+        folder: Path | None = None,
     ) -> None:
         self.name = name
         self._tell = tell
         try:
-            self._popen = _start(command, environment)
+            self._popen = _start(command, environment, folder)
         except (OSError, ValueError) as error:
             raise AfspmError(
                 f"{command[0]} can't be started: {error}", where=name, hint="is it installed and executable?"
@@ -120,13 +122,15 @@ class ChildProcess:
                 self._tell(Printed(self.name, self.pid, stream, text))
 
 
-def _start(command: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+def _start(
+    command: Sequence[str], environment: Mapping[str, str], folder: Path | None
+) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        bufsize=-1,
+        cwd=folder,
         env={**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", **environment},
         start_new_session=sys.platform != "win32",
         creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),

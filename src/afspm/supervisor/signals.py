@@ -1,0 +1,53 @@
+"""Ctrl-C and its relatives, as events of the supervisor's poller."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+
+@dataclass(frozen=True, slots=True)
+class Signalled:
+    """Somebody wants the run to end."""
+
+    number: int
+
+    @property
+    def name(self) -> str:
+        return "Ctrl-C" if self.number == signal.SIGINT else signal.Signals(self.number).name
+
+
+# SIGBREAK is Windows' Ctrl-Break and the closing of its console, SIGHUP that of a POSIX terminal
+_NAMES = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
+
+
+@contextmanager
+def told(tell: Callable[[Signalled], None], wakeup_fd: int) -> Iterator[None]:
+    """While in this block, signals that end a program are told instead; `wakeup_fd` is written to with each.
+
+    A signal that is ignored already (SIGHUP under nohup) stays ignored. Away from the main thread Python gives no
+    signals: then this does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        tell(Signalled(number))
+
+    before = {}
+    for number in (getattr(signal, name) for name in _NAMES if hasattr(signal, name)):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            before[number] = signal.signal(number, handle)
+    # Windows runs handlers only when the main thread comes back from waiting: this is what brings it back
+    fd_before = signal.set_wakeup_fd(wakeup_fd, warn_on_full_buffer=False)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(fd_before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

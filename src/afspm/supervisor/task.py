@@ -1,0 +1,56 @@
+"""What the supervisor is to run: one process of an experiment, whatever its language."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from afspm.experiment import Role, Start
+from afspm.runtime.launch import Launch
+
+HOST = "afspm.runtime.host"
+GUARD = "afspm.runtime.guard"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One process to start, to watch, and to start again.
+
+    Attributes:
+        launch: the line for its standard input; the heartbeat's address is the supervisor's to add.
+        command: the program and its arguments.
+        role: what it is in the experiment; without scheduler or translator nothing can go on.
+        folder: where to start it; None: where we are.
+        environment: what it gets besides our own environment.
+    """
+
+    launch: Launch
+    command: tuple[str, ...]
+    role: Role = Role.COMPONENT
+    folder: Path | None = None
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.launch.name
+
+    @property
+    def essential(self) -> bool:
+        """Whether the experiment can't go on without it."""
+        return self.role is not Role.COMPONENT
+
+
+def from_start(start: Start) -> Task:
+    """A task of what the experiment file says: Python classes by our host, other languages by our guard."""
+    ours = (sys.executable, "-m", HOST) if not start.command else (sys.executable, "-m", GUARD, *start.command)
+    before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
+    return Task(
+        launch=start.launch,
+        command=ours,
+        role=start.role,
+        folder=start.folder if start.command else None,
+        environment={"PYTHONPATH": os.pathsep.join(before)} if before else {},
+    )
