@@ -1,0 +1,45 @@
+# Two commands: `make demo` runs the main job, `make test` passes the tests. Both set up .venv by themselves.
+
+PYTHON ?= python3
+BIN := .venv/bin
+SETUP := .venv/.made
+
+.PHONY: demo test check bench soak simulate clean
+.DEFAULT_GOAL := demo
+
+$(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
+	@echo "Setting up .venv …"
+	@$(PYTHON) tools/bootstrap.py
+	@touch $@
+
+## the paper's control transfer: a night of scans, a tip that changes, and its repair
+demo: $(SETUP)
+	@$(BIN)/afspm run experiments/tip_repair/experiment.toml
+
+## all tests
+test: $(SETUP)
+	@$(BIN)/pytest -n 2 --dist loadgroup
+
+## style, types, and who may import whom
+check: $(SETUP)
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+## speed, beside bare pyzmq: a table, and build/bench.json
+bench: $(SETUP)
+	@$(BIN)/python -m benchmarks
+
+## a million malformed requests and packets
+soak: $(SETUP)
+	@$(BIN)/python -m benchmarks.soak
+
+## a long deterministic simulation: make simulate HOURS=100000 SEED=1
+HOURS ?= 20000
+SEED ?= 1
+simulate: $(SETUP)
+	@$(BIN)/python -m afspm.testing.longrun --hours $(HOURS) --seed $(SEED)
+
+clean:
+	rm -rf .venv build runs

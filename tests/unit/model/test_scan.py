@@ -1,0 +1,73 @@
+"""Scans and spectra as people hold them."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+import pytest
+
+from afspm.errors import InvalidValue
+from afspm.model import ProblemNames, Region, Scan, ScanSet, Spectrum
+from afspm.model.picture import png
+
+REGION = Region.from_top_left((0.0, 1e-6), (3e-6, 2e-6))
+SCAN = Scan(REGION, "Height", "m", np.arange(12.0).reshape(3, 4), 1_767_225_600_000_000_000, "a.nc")
+
+
+def test_xarray_has_coordinates_in_metres() -> None:
+    array = SCAN.to_xarray()
+    np.testing.assert_allclose(array.x, [0, 1e-6, 2e-6, 3e-6])
+    np.testing.assert_allclose(array.y, [1e-6, 2e-6, 3e-6])
+    assert (array.name, array.attrs["units"]) == ("Height", "m")
+    assert float(array.sel(x=1e-6, y=3e-6, method="nearest")) == SCAN.values[2, 1]
+
+
+def test_a_set_of_scans_is_a_mapping_by_channel() -> None:
+    scans = ScanSet([SCAN, Scan(REGION, "Phase", "deg", SCAN.values)], ["tip repair"])
+    assert list(scans) == ["Height", "Phase"]
+    assert scans["Phase"].unit == "deg"
+    assert scans.first is SCAN
+    assert set(scans.to_xarray()) == {"Height", "Phase"}
+    with pytest.raises(KeyError, match="Height, Phase"):
+        scans["Heigth"]
+
+
+def test_a_scan_shows_itself_in_a_notebook() -> None:
+    shown = Scan(REGION, "<b>", "m", SCAN.values)._repr_html_()
+    assert "&lt;b&gt;" in shown
+    assert "data:image/png;base64," in shown
+    assert "no values" in Scan(REGION, "Height", "m", np.empty((0, 0)))._repr_html_()
+
+
+def test_the_picture_is_a_png_with_the_highest_values_brightest() -> None:
+    data = png(np.array([[0.0, 1.0], [np.nan, 0.5]]))
+    assert data.startswith(b"\x89PNG")
+    at = data.index(b"IDAT") + 4
+    pixels = np.frombuffer(zlib.decompressobj().decompress(data[at:]), np.uint8).reshape(2, 7)[:, 1:].reshape(2, 2, 3)
+    assert pixels[0, 0].sum() < pixels[1, 1].sum() < pixels[0, 1].sum()
+    assert (pixels[1, 0] == 128).all()
+
+
+def test_a_spectrum_gives_its_variables_by_name() -> None:
+    spectrum = Spectrum((0.0, 0.0), "IV", ("Bias", "Current"), ("V", "A"), np.array([[-1.0, 2.0], [1.0, 4.0]]), 0)
+    np.testing.assert_array_equal(spectrum["Current"], [2.0, 4.0])
+    assert spectrum.to_xarray().Current.sel(Bias=1.0) == 4.0
+    assert "polyline" in spectrum._repr_html_()
+    with pytest.raises(InvalidValue, match="fit together"):
+        Spectrum(None, "IV", ("Bias",), ("V", "A"), np.zeros((2, 2)))
+
+
+def test_problems_are_known_by_many_spellings() -> None:
+    names = ProblemNames({"sample-worn": 17})
+    for spelling in ("tip-shape-changed", "EP_TIP_SHAPE_CHANGED", "Tip shape changed", 1):
+        assert names.number(spelling) == 1
+    assert (names.number("sample_worn"), names.name(17)) == (17, "sample-worn")
+    with pytest.raises(InvalidValue, match="did you mean 'sample-worn'"):
+        names.number("sample-wron")
+
+
+@pytest.mark.parametrize("named", [{"a": 3}, {"a": 256}, {"thermal-drift": 9}, {"a": 9, "b": 9}])
+def test_a_problem_needs_a_name_and_number_of_its_own(named: dict[str, int]) -> None:
+    with pytest.raises(InvalidValue):
+        ProblemNames(named)

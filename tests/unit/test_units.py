@@ -1,0 +1,69 @@
+"""Units are exact where they can be, and refused where they make no sense."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afspm.errors import UnitError
+from afspm.units import convert, parse_quantity, same_kind, si
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "expected"),
+    [
+        ("1500 nm", "m", 1.5e-6),
+        ("2.5um", "m", 2.5e-6),
+        ("2.5 µm", "m", 2.5e-6),
+        ("3 Å", "m", 3e-10),
+        ("15 min", "s", 900.0),
+        ("-2 mV", "V", -0.002),
+        ("10 nm/s", "m/s", 1e-8),
+        ("1 um/ms", "m/s", 1e-3),
+        ("7", "m", 7.0),
+        (7, "m", 7.0),
+        ("50 %", "", 0.5),
+        ("90 deg", "rad", math.pi / 2),
+        ("325 kHz", "Hz", 325e3),
+    ],
+)
+def test_quantities_in_si(text: str, unit: str, expected: float) -> None:
+    assert si(text, unit) == expected
+
+
+def test_other_units_are_known_as_well() -> None:
+    assert si("1 inch", "m") == pytest.approx(0.0254)
+    assert si("1 eV/nm", "N") == pytest.approx(1.602e-10, rel=1e-3)
+
+
+@pytest.mark.parametrize("text", ["5 flurb", "nm", "", "5 V", "five nm", "5 nm nm", "1e400000 x", True])
+def test_what_is_no_length_is_refused(text: str) -> None:
+    with pytest.raises(UnitError):
+        si(text, "m")
+
+
+def test_arrays_are_converted_as_a_whole() -> None:
+    np.testing.assert_array_equal(convert(np.array([1.0, 2.0]), "um", "nm"), [1000.0, 2000.0])
+
+
+@given(st.floats(-1e6, 1e6), st.sampled_from(["nm", "um", "pm", "mm", "Å"]))
+def test_there_and_back_is_the_same(value: float, unit: str) -> None:
+    assert convert(convert(value, unit, "m"), "m", unit) == pytest.approx(value, rel=1e-15)
+
+
+def test_kinds() -> None:
+    assert same_kind("nm", "inch")
+    assert not same_kind("nm", "V")
+    assert not same_kind("nm", "flurb")
+    assert parse_quantity("-1e-3 nA") == (-1e-3, "nA")
+
+
+def test_common_units_need_no_heavy_library() -> None:
+    code = "import sys, afspm.units as u; u.si('2 um/s', 'm/s'); sys.exit('pint' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
