@@ -75,7 +75,12 @@ def _parse(text: str, file: Path, findings: Findings) -> dict[str, Any] | None:
             if match[2]:
                 line = int(match[2])
                 what += f" at column {match[3]}"
-        findings.error(f"not valid TOML: {what}", Place(str(file), line))
+        twice = re.fullmatch(r"Cannot declare \((.*?),?\) twice", what.split(" at column")[0])
+        if twice:
+            name = twice[1].replace("'", "").replace(", ", ".")
+            findings.error(f"[{name}] is there twice", Place(str(file), line), "two components need two names")
+        else:
+            findings.error(f"not valid TOML: {what}", Place(str(file), line))
         return None
 
 

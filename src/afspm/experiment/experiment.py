@@ -73,9 +73,13 @@ class Experiment:
     @cached_property
     def resolved(self) -> Resolved:
         """Classes imported, settings in SI, sections parsed, sockets connected."""
+        from afspm.experiment import checks
         from afspm.experiment.resolved import resolve
 
-        return resolve(self.parts, self._document, self._found)
+        resolved = resolve(self.parts, self._document, self._found)
+        if self._document.data:  # a file that can't be read has been reported, and has no parts that could be missing
+            checks.check(resolved)
+        return resolved
 
     def require_valid(self) -> None:
         """Raises ConfigError that lists all errors, if there are any."""

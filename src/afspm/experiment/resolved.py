@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from afspm.errors import InvalidValue
-from afspm.experiment import classes, sections, settings, wiring
+from afspm.experiment import abilities, classes, sections, settings, wiring
+from afspm.experiment.abilities import Abilities
 from afspm.experiment.classes import Declared
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
@@ -36,9 +38,29 @@ class Resolved:
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     wires: dict[str, Wires] = field(default_factory=dict)
     net: Net = field(default_factory=Net)
+    cache_envelopes: tuple[str, ...] = ()
+    own_mapping: bool = False
 
     def with_role(self, role: Role) -> list[Part]:
         return [part for part in self.parts.components if self.roles.get(part.name) is role]
+
+    @property
+    def keys_folder(self) -> Path | None:
+        """The folder of [security] keys, absolute."""
+        keys = self.security.keys
+        return None if keys is None else self.document.folder_of("security", "keys") / keys
+
+    def envelopes(self, part: Part) -> tuple[str, ...] | None:
+        """The prefixes a component subscribes to: as the file says, else as its class declares; None: all."""
+        wanted = part.own.get("envelopes", self.wires[part.name].envelopes)
+        if wanted is None:
+            return self.declared[part.name].listens
+        return (wanted,) if isinstance(wanted, str) else tuple(map(str, wanted))
+
+    def abilities(self, part: Part) -> Abilities | None:
+        """What a translator can do; None where that is not known before it runs."""
+        microscope = self.classes.get(part.name)
+        return None if microscope is None else abilities.of_class(microscope, self.settings[part.name])
 
     @property
     def simulated(self) -> bool:

@@ -46,6 +46,8 @@ class Control(Section):
     stop_scan_on_manual: bool = True
     request_timeout: PositiveDuration = 5.0
     request_retries: Annotated[int, Field(ge=0)] = 3
+    solved_by_hand: tuple[str, ...] = ()
+    """Problems that a person puts right: they may be flagged though no component solves them."""
     roles: Roles = Roles()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, is_dataclass
 from datetime import date, datetime
 from enum import Enum
@@ -25,8 +25,9 @@ def check(
     component: type, settings: Mapping[str, Any], path: tuple[str, ...], document: Document, findings: Findings
 ) -> dict[str, Any]:
     """The settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong."""
-    parameters = {name: p for name, p in _parameters(component).items() if p.kind not in _KINDS_WITHOUT_NAME}
-    takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in _parameters(component).values())
+    everything = _parameters(component)
+    parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME}
+    takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in everything.values())
     kinds = _annotations(component)
     checked: dict[str, Any] = {}
     unknown: list[str] = []
@@ -90,19 +91,37 @@ def _has_own_config(annotation: Any) -> bool:
 
 
 def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
-    try:
-        return inspect.signature(component).parameters
-    except (TypeError, ValueError):
-        return {}
+    """The parameters of the constructor; where it hands **settings on to its base class, those of that as well."""
+    found: dict[str, inspect.Parameter] = {}
+    for init in _constructors(component):
+        own = list(inspect.signature(init).parameters.values())[1:]  # without self
+        found = {p.name: p for p in own if p.name not in found} | found
+        found = {n: p for n, p in found.items() if p.kind is not inspect.Parameter.VAR_KEYWORD or p in own}
+    return found
+
+
+def _constructors(component: type) -> list[Callable[..., Any]]:
+    """`__init__` of the class, and of its bases for as long as each passes **keywords on."""
+    chain: list[Callable[..., Any]] = []
+    for base in component.__mro__:
+        init = vars(base).get("__init__")
+        if base is object or not inspect.isfunction(init):
+            continue
+        chain.append(init)
+        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in inspect.signature(init).parameters.values()):
+            break
+    return chain
 
 
 def _annotations(component: type) -> dict[str, Any]:
-    """Of the constructor that is in force, resolved; unresolvable ones (imported for typing only) are left out."""
-    init = component.__init__  # type: ignore[misc]
-    try:
-        return typing.get_type_hints(init, include_extras=True)
-    except Exception:
-        return {n: a for n, a in getattr(init, "__annotations__", {}).items() if not isinstance(a, str)}
+    """Of every parameter, resolved; those that can't be (imported for typing only) are left out."""
+    kinds: dict[str, Any] = {}
+    for init in reversed(_constructors(component)):
+        try:
+            kinds |= typing.get_type_hints(init, include_extras=True)
+        except NameError:
+            kinds |= {n: a for n, a in init.__annotations__.items() if not isinstance(a, str)}
+    return kinds
 
 
 def _report_missing(

@@ -84,10 +84,11 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
             serve=bound(links.serve),
             control=met(links.control) if links.control else None,
         ),
-        envelopes=_envelopes(part, resolved),
+        envelopes=resolved.envelopes(part),
         problems=resolved.named_problems,
         request_timeout_s=wires.request_timeout_s or resolved.control.request_timeout,
         request_retries=_first(wires.request_retries, resolved.control.request_retries),
+        keys=_keys(resolved, links, addresses),
         messages=resolved.messages.modules,
         simulated=resolved.simulated,
     )
@@ -95,14 +96,24 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
     return Start(launch, role, part.command, experiment.folder, folders)
 
 
+def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str]) -> dict[str, str] | None:
+    """The folder of the keys, and whose key to expect at each address; see `afspm.transport.keys.from_launch`."""
+    if resolved.keys_folder is None:
+        return None
+    owners = {wiring.connectable(addresses[key]): slot.owner for key, slot in resolved.net.slots.items()}
+    keys = {"folder": str(resolved.keys_folder)}
+    for key in (links.control, *links.subscribe):
+        if key is None:
+            continue
+        target = wiring.connectable(addresses.get(key, key))
+        owner = owners.get(target) or next((o for bind, o in owners.items() if wiring.reaches(target, bind)), None)
+        if owner is not None:
+            keys[target] = owner
+    return keys
+
+
 def _first(a: int | None, b: int) -> int:
     return b if a is None else a
-
-
-def _envelopes(part: Part, resolved: Resolved) -> tuple[str, ...] | None:
-    """The prefixes said in the file, else those that the class declares, else all."""
-    wanted = part.own.get("envelopes", resolved.wires[part.name].envelopes)
-    return resolved.declared[part.name].listens if wanted is None else tuple(wanted)
 
 
 def _for_scheduler(resolved: Resolved) -> dict[str, Any]:

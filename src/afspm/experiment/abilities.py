@@ -1,0 +1,47 @@
+"""What a microscope can do, as far as its class tells before it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from afspm.errors import AfspmError
+from afspm.model import names
+
+
+@dataclass(frozen=True)
+class Abilities:
+    """The generic names of actions, and of parameters with their SI unit (None: it depends)."""
+
+    actions: frozenset[str]
+    parameters: Mapping[str, str | None]
+
+
+def of_class(microscope: type, settings: Mapping[str, Any]) -> Abilities | None:
+    """The abilities of a `Microscope` class with these settings; None where the class does not tell."""
+    from afspm.microscopes.microscope import Microscope
+    from afspm.microscopes.parameters import ParameterTable
+
+    if not issubclass(microscope, Microscope):
+        return None
+    marks = (getattr(getattr(microscope, name), "_afspm_action", None) for name in dir(microscope))
+    actions = {mark.name for mark in marks if mark is not None} | set(settings.get("actions") or {})
+    try:
+        table = ParameterTable.from_toml(microscope.parameters_file)
+        table = table.extended(settings.get("parameters") or {}, where="the experiment file")
+    except (AfspmError, AttributeError):
+        return None  # the microscope itself will say what is wrong with its table
+    return Abilities(frozenset(actions), {name: table[name].si_unit for name in table})
+
+
+def base() -> dict[str, str | None]:
+    """The base parameters and the extensions of ours with their SI units, where nothing better is known."""
+    ours = {
+        names.PULSE_VOLTAGE: "V",
+        names.PULSE_DURATION: "s",
+        names.CRASH_SPEED: "m/s",
+        names.CRASH_DEPTH: "m",
+        names.SPEC_KIND: None,
+    }
+    return {**names.BASE_PARAMETERS, **ours}

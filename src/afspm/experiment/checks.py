@@ -1,0 +1,319 @@
+"""What must hold between the parts of an experiment: who is there, who talks to whom, who solves what."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.errors import InvalidValue
+from afspm.experiment import wiring
+from afspm.experiment.findings import closest, nearest
+from afspm.experiment.known import WIRE_SETTINGS
+from afspm.experiment.parts import Role, wire_of
+from afspm.experiment.resolved import Resolved
+
+# What translators and schedulers publish by themselves; scans and spectra continue with their kind.
+PUBLISHED: Final = (
+    "Scan2d",
+    "Spec1d",
+    "ScopeStateMsg",
+    "ControlState",
+    "ScanParameters2d",
+    "ZCtrlParameters",
+    "ProbePosition",
+)
+CONTINUED: Final = ("Scan2d", "Spec1d")
+_WORD = re.compile(r"[A-Za-z_][\w-]*")
+
+
+def check(resolved: Resolved) -> None:
+    """Run every check; what is found goes to `resolved.findings`."""
+    for one in CHECKS:
+        one(resolved)
+
+
+def check_roles(resolved: Resolved) -> None:
+    """One scheduler, one translator, and no two names that only differ in upper and lower case."""
+    whole = resolved.document.place()
+    for role in (Role.SCHEDULER, Role.TRANSLATOR):
+        having = resolved.with_role(role)
+        if not having and len(resolved.roles) == len(resolved.parts.components) and _all_loaded(resolved):
+            hint = {
+                Role.SCHEDULER: 'add [scheduler] with component = true and class = "Scheduler"',
+                Role.TRANSLATOR: 'add e.g. [microscope] with component = true and class = "Simulator"',
+            }[role]
+            resolved.findings.error(f"there is no {role.value}", whole, hint)
+        for extra in having[1:]:
+            resolved.findings.error(
+                f"[{extra.name}] is a second {role.value} beside [{having[0].name}]", extra.place, "one is enough"
+            )
+    seen: dict[str, str] = {}
+    for part in resolved.parts.components:
+        other = seen.setdefault(part.name.casefold(), part.name)
+        if other != part.name:
+            resolved.findings.error(
+                f"[{part.name}] and [{other}] are the same name but for upper and lower case",
+                part.place,
+                "their files would be the same on some computers",
+            )
+
+
+def _all_loaded(resolved: Resolved) -> bool:
+    """A class that can't be loaded may be the one that is looked for."""
+    return all(part.command or part.name in resolved.classes for part in resolved.parts.components)
+
+
+def check_commands(resolved: Resolved) -> None:
+    """The program of a command can be found."""
+    for part in resolved.parts.components:
+        if part.command and not _program(part.command[0], resolved.document.folders[0]):
+            resolved.findings.error(
+                f"[{part.name}] there is no program {part.command[0]!r}",
+                resolved.document.place(part.name, "command"),
+                "give its path, or install it",
+            )
+
+
+def _program(name: str, folder: Path) -> bool:
+    return shutil.which(name) is not None or (folder / name).is_file()
+
+
+def check_intermediaries(resolved: Resolved) -> None:
+    """Each intermediary table of a known kind has settings that the kind knows, and addresses where they belong."""
+    names = [*resolved.parts.variables, *resolved.parts.intermediaries]
+    for name, table in resolved.parts.intermediaries.items():
+        kind = wire_of(table)
+        if kind is None:
+            continue
+        for key, value in table.items():
+            place = resolved.document.place(name, key)
+            if key != "class" and key not in WIRE_SETTINGS[kind]:
+                hint = nearest(key, WIRE_SETTINGS[kind])
+                resolved.findings.error(f"[{name}] a {kind.value} has no setting {key!r}", place, hint)
+            elif key.endswith("url"):
+                for url in value if isinstance(value, list) else [value]:
+                    if not isinstance(url, str) or not wiring.is_address(url):
+                        near = closest(str(url), names, 0.7)
+                        hint = f"did you mean {near!r}?" if near else 'as in "tcp://127.0.0.1:9000"'
+                        resolved.findings.error(f"[{name}] {key} = {url!r} is not an address", place, hint)
+
+
+def check_addresses(resolved: Resolved) -> None:
+    """No address is bound twice; none is open to the network without keys; every connection has somebody at its end."""
+    bound: dict[str, wiring.Slot] = {}
+    secure = resolved.security.keys is not None or resolved.security.insecure
+    for slot in resolved.net.slots.values():
+        if slot.address is None:
+            continue
+        for address, other in bound.items():
+            if wiring.reaches(slot.address, address) or wiring.reaches(address, slot.address):
+                resolved.findings.error(
+                    f"[{slot.owner}] and [{other.owner}] both bind {slot.address} ({slot.use}, {other.use})", slot.place
+                )
+        bound[slot.address] = slot
+        if not wiring.is_loopback(slot.address) and not secure:
+            resolved.findings.error(
+                f"[{slot.owner}] binds {slot.address}, which other computers can reach, without keys",
+                slot.place,
+                'make keys with `afspm keys` and set [security] keys = "keys"; or say [security] insecure = true',
+            )
+    for name, links in resolved.net.links.items():
+        for target in (links.control, *links.subscribe):
+            if target and target not in resolved.net.slots and not any(wiring.reaches(target, b) for b in bound):
+                resolved.findings.error(
+                    f"[{name}] connects to {target}, which nobody binds",
+                    resolved.document.place(name),
+                    nearest(target, bound, 0.8),
+                )
+
+
+def check_self_subscription(resolved: Resolved) -> None:
+    """Nobody listens to itself: each packet would be the cause of the next."""
+    for name, links in resolved.net.links.items():
+        own = resolved.net.slots.get(links.publish or "")
+        if own is None or resolved.roles[name] is not Role.COMPONENT:
+            continue
+        key = f"{own.owner}/{own.use}"
+        if key in links.subscribe or (own.address and any(wiring.reaches(s, own.address) for s in links.subscribe)):
+            resolved.findings.error(f"[{name}] subscribes to itself", resolved.document.place(name, "subscriber"))
+
+
+def check_listens_to(resolved: Resolved) -> None:
+    """`listens_to` names others that publish."""
+    publishers = {slot.owner for slot in resolved.net.slots.values() if slot.use == "publish"}
+    for part in resolved.parts.components:
+        wanted = part.own.get("listens_to", [])
+        for i, other in enumerate(wanted if isinstance(wanted, list) else [wanted]):
+            place = resolved.document.place(part.name, "listens_to", i)
+            if other == part.name:
+                resolved.findings.error(f"[{part.name}] subscribes to itself", place)
+            elif other not in resolved.roles:
+                resolved.findings.error(
+                    f"[{part.name}] listens_to: there is no component {other!r}", place, nearest(str(other), publishers)
+                )
+            elif other not in publishers:
+                resolved.findings.error(f"[{part.name}] listens to [{other}], which publishes nothing", place)
+
+
+def check_problems(resolved: Resolved) -> None:
+    """Problems named by components exist, and each that is flagged is solved by somebody."""
+    solved = {_number(resolved, p) for said in resolved.declared.values() for p in said.solves}
+    solved |= {_number(resolved, p) for p in resolved.control.solved_by_hand}
+    for name, said in resolved.declared.items():
+        place = resolved.document.place(name)
+        for verb, problems in (("solves", said.solves), ("flags", said.flags)):
+            for problem in problems:
+                number = _number(resolved, problem)
+                if number is None:
+                    hint = nearest(problem, resolved.problems) + ", or name it under [problems]"
+                    resolved.findings.error(f"[{name}] {verb} {problem!r}, which is no problem", place, hint)
+                elif verb == "flags" and number not in solved:
+                    resolved.findings.error(
+                        f"[{name}] flags {problem!r}, which nobody solves: the experiment would stand still",
+                        place,
+                        "add a component that solves it, or [control] solved_by_hand",
+                    )
+    for i, problem in enumerate(resolved.control.solved_by_hand):
+        if _number(resolved, problem) is None:
+            place = resolved.document.place("control", "solved_by_hand", i)
+            resolved.findings.error(f"{problem!r} is no problem", place, nearest(problem, resolved.problems))
+
+
+def _number(resolved: Resolved, problem: str) -> int | None:
+    try:
+        return resolved.problems.number(problem)
+    except InvalidValue:
+        return None
+
+
+def check_envelopes(resolved: Resolved) -> None:
+    """Every envelope subscribed to is published by somebody."""
+    published = {*PUBLISHED, *(e for said in resolved.declared.values() for e in said.publishes)}
+    named = set(resolved.cache_envelopes)
+    for part in resolved.parts.components:
+        for i, prefix in enumerate(resolved.envelopes(part) or ()):
+            key = next((k for k in ("envelopes", "subscriber") if k in part.own), "class")
+            place = resolved.document.place(part.name, key, *([i] if key == "envelopes" else []))
+            if _is_published(prefix, published | named):
+                continue
+            hint = nearest(prefix, published | named)
+            what = f"[{part.name}] subscribes to {prefix!r}, which nobody publishes"
+            if resolved.own_mapping:
+                resolved.findings.warning(what + ", unless the mapping of [cache] makes it", place, hint)
+            else:
+                resolved.findings.error(what, place, hint)
+
+
+def _is_published(prefix: str, published: set[str]) -> bool:
+    """A prefix fits what it begins; scans and spectra continue with their kind."""
+    return any(name.startswith(prefix) for name in published) or any(
+        prefix == name or prefix.startswith(name + "_") for name in CONTINUED
+    )
+
+
+def check_clock(resolved: Resolved) -> None:
+    """Only a simulation's time may be other than real."""
+    table = resolved.parts.sections.get("clock", {})
+    if not resolved.with_role(Role.TRANSLATOR) or resolved.simulated:
+        return
+    if resolved.clock.speed != 1.0:
+        resolved.findings.error(
+            f"[clock] speed = {resolved.clock.speed:g} on a microscope that is not simulated",
+            resolved.document.place("clock", "speed"),
+            "time can't be made faster there: leave it out",
+        )
+    if "start" in table:
+        resolved.findings.error(
+            "[clock] start on a microscope that is not simulated", resolved.document.place("clock", "start")
+        )
+
+
+def check_names_of_people(resolved: Resolved) -> None:
+    """Roles name components, or people who have a key."""
+    names = {part.name for part in resolved.parts.components}
+    keys = resolved.keys_folder
+    if keys is not None:
+        names |= {file.stem for file in (keys / "public").glob("*.key")}
+    any_role = False
+    for role, members in resolved.control.roles:
+        for i, member in enumerate(members or ()):
+            any_role = True
+            if member not in names:
+                place = resolved.document.place("control", "roles", role, i)
+                what = f"[control.roles] {role}: there is no {member!r} among components and keys"
+                resolved.findings.error(what, place, nearest(member, names))
+    if any_role and keys is None:
+        resolved.findings.warning(
+            "[control.roles] without keys: whoever takes the name has the role",
+            resolved.document.place("control", "roles"),
+            "make keys with `afspm keys` and set [security] keys",
+        )
+    if keys is not None and not keys.is_dir():
+        resolved.findings.error(
+            f"[security] keys: there is no folder {str(keys)!r}", resolved.document.place("security", "keys"),
+            "`afspm keys` makes it"
+        )  # fmt: skip
+
+
+def check_likely_typos(resolved: Resolved) -> None:
+    """A text that is nearly a variable's name was probably meant to be it."""
+    names = [*resolved.parts.variables, *resolved.parts.intermediaries]
+    for part in resolved.parts.components:
+        for path, text in _texts(part.settings, (part.name,)):
+            near = closest(text, names, 0.85) if _WORD.fullmatch(text) and len(text) > 3 else None
+            if near:
+                resolved.findings.warning(
+                    f"[{part.name}] {path[1]} = {text!r} is nearly the name of a variable",
+                    resolved.document.place(*path),
+                    f"did you mean {near!r}?",
+                )
+
+
+def _texts(value: Any, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    if isinstance(value, str):
+        yield path, value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _texts(item, (*path, key))
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            yield from _texts(item, (*path, i))
+
+
+def check_needs(resolved: Resolved) -> None:
+    """The microscope has the actions and parameters that components say they need, where it tells before it runs."""
+    for part in resolved.with_role(Role.TRANSLATOR):
+        has = resolved.abilities(part)
+        if has is None:
+            continue
+        for name, said in resolved.declared.items():
+            for kind, needed, offered in (
+                ("action", said.needs_actions, has.actions),
+                ("parameter", said.needs_parameters, has.parameters),
+            ):
+                for one in needed:
+                    if one not in offered:
+                        resolved.findings.error(
+                            f"[{name}] needs the {kind} {one!r}, which [{part.name}] does not have",
+                            resolved.document.place(name),
+                            nearest(one, offered),
+                        )
+
+
+CHECKS: Final[tuple[Callable[[Resolved], None], ...]] = (
+    check_roles,
+    check_commands,
+    check_intermediaries,
+    check_addresses,
+    check_self_subscription,
+    check_listens_to,
+    check_problems,
+    check_envelopes,
+    check_clock,
+    check_names_of_people,
+    check_likely_typos,
+    check_needs,
+)
