@@ -122,7 +122,9 @@ def check_addresses(resolved: Resolved) -> None:
             )
     for name, links in resolved.net.links.items():
         for target in (links.control, *links.subscribe):
-            if target and target not in resolved.net.slots and not any(wiring.reaches(target, b) for b in bound):
+            if target is None or target in resolved.net.slots or not wiring.is_address(target):
+                continue  # what is no address has been reported as such
+            if not any(wiring.reaches(target, b) for b in bound):
                 resolved.findings.error(
                     f"[{name}] connects to {target}, which nobody binds",
                     resolved.document.place(name),

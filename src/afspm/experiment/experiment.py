@@ -65,6 +65,11 @@ class Experiment:
         """All processes of the experiment: translator and scheduler too, in the order of the file."""
         return [part.name for part in self.parts.components]
 
+    @property
+    def keys_folder(self) -> Path | None:
+        """The folder of [security] keys, absolute; None: no keys are used."""
+        return self.resolved.keys_folder
+
     def check(self) -> list[Finding]:
         """Everything that is wrong or doubtful; nothing is started. Errors first, then by line."""
         self.resolved  # noqa: B018  (finds what there is to find)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, TypeVar
 import pydantic
 from pydantic import Field
 
+from afspm.errors import AfspmError
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
 from afspm.units import Duration
@@ -89,6 +90,8 @@ def report(
         findings.error(f"{shown} is not a setting", place, nearest(str(location[-1]), known))
     elif error["type"] == "missing":
         findings.error(f"{shown} is missing", place)
+    elif isinstance(cause := error.get("ctx", {}).get("error"), AfspmError):
+        findings.error(f"{shown} = {error['input']!r}: {cause.what}", place, cause.hint)
     else:
         said = error["msg"].removeprefix("Value error, ")
         said = said[:1].lower() + said[1:]

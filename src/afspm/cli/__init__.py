@@ -1,0 +1,19 @@
+"""The command `afspm`."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Entry point. An error of ours is told in its own words; a traceback is kept for what nobody foresaw."""
+    from afspm.cli.app import app
+    from afspm.errors import AfspmError
+
+    try:
+        app()
+    except AfspmError as error:
+        print(f"afspm: {error}", file=sys.stderr)  # noqa: T201
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,19 @@
+"""All commands. Each module imports what it works with inside its function, so that any command starts fast."""
+
+from __future__ import annotations
+
+import typer
+
+from afspm.cli import check, graph, keys
+
+app = typer.Typer(
+    name="afspm",
+    help="Automate scanning probe microscopes: run experiments of several components that share one microscope.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("check")(check.check)
+app.command("graph")(graph.graph)
+app.command("keys")(keys.keys)

@@ -1,0 +1,17 @@
+"""Arguments that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Files = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FILE [OVERLAY…]",
+        help="The experiment file; each further file is laid over it and needs to hold only what differs.",
+        show_default=False,
+    ),
+]

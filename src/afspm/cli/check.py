@@ -1,0 +1,58 @@
+"""`afspm check`: every error of an experiment file, before anything starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.cli.arguments import Files
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from afspm.experiment import Experiment, Finding
+
+
+def check(
+    files: Files,
+    expanded: Annotated[bool, typer.Option("--expanded", help="Print the whole file as it is in force.")] = False,
+) -> None:
+    """Find every error of an experiment file, before anything starts.
+
+    Says file, line, what is wrong and what would be right. Ends with 1 if there are errors; warnings are only told.
+    """
+    from rich.console import Console
+
+    from afspm.experiment import load
+
+    experiment = load(*files)
+    findings = experiment.check()
+    console = Console(stderr=expanded, highlight=False)
+    show(findings, console)
+    if expanded:
+        typer.echo(experiment.expanded(), nl=False)
+    console.print(_summary(experiment, findings), markup=False, soft_wrap=True)
+    if any(finding.is_error for finding in findings):
+        raise typer.Exit(1)
+
+
+def show(findings: Sequence[Finding], console: Console) -> None:
+    """Print findings, one a paragraph, coloured where the terminal can."""
+    from rich.text import Text
+
+    for finding in findings:
+        colour = "bold red" if finding.is_error else "yellow"
+        line = Text.assemble((str(finding.place), "bold"), ": ", (f"{finding.level.value}: ", colour), finding.what)
+        if finding.hint:
+            line.append(f"\n    {finding.hint}", "dim")
+        console.print(line, soft_wrap=True)  # a wrapped line could not be clicked or searched
+
+
+def _summary(experiment: Experiment, findings: Sequence[Finding]) -> str:
+    errors = sum(finding.is_error for finding in findings)
+    warnings = len(findings) - errors
+    count = len(experiment.component_names)
+    told = [f"{n} {word}{'s' if n != 1 else ''}" for n, word in ((errors, "error"), (warnings, "warning")) if n]
+    return f"{experiment.name}: {count} process{'es' if count != 1 else ''}, {', '.join(told) or 'nothing wrong'}"
