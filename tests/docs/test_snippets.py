@@ -1,0 +1,90 @@
+"""Every snippet of the README and the docs runs.
+
+On each page, in the order of the page and in one empty folder:
+
+- ```python and ```toml blocks whose first line is a comment with a file name (`# sharpness.py`) become that file;
+- other ```python blocks are executed, sharing their names;
+- other ```toml blocks must be TOML;
+- ```console blocks: each line after `$ ` is run by the shell and must succeed; the lines below it must come in its output,
+  in this order, where … stands for anything.
+
+Blocks of other kinds (```text, ```sh …) are only shown.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "experiments").rglob("*.md"))]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FILE_NAME = re.compile(r"# ([\w./-]+\.(?:py|toml|proto))\n")
+
+
+@dataclass
+class Snippet:
+    kind: str
+    text: str
+    line: int
+
+
+def snippets(page: Path) -> list[Snippet]:
+    text = page.read_text(encoding="utf-8")
+    return [Snippet(m[1], m[2], text[: m.start()].count("\n") + 2) for m in BLOCK.finditer(text)]
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_snippet_runs(page: Path, tmp_path: Path) -> None:
+    names: dict[str, Any] = {"__name__": "__main__"}
+    for snippet in snippets(page):
+        where = f"{page.relative_to(ROOT)}:{snippet.line}"
+        file_name = FILE_NAME.match(snippet.text)
+        if file_name and snippet.kind in ("python", "toml"):
+            (tmp_path / file_name[1]).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / file_name[1]).write_text(snippet.text, encoding="utf-8")
+        elif snippet.kind == "python":
+            exec(compile("\n" * (snippet.line - 1) + snippet.text, str(page), "exec"), names)
+        elif snippet.kind == "toml":
+            tomllib.loads(snippet.text)
+        elif snippet.kind == "console":
+            run_console(snippet.text, tmp_path, where)
+
+
+def run_console(text: str, folder: Path, where: str) -> None:
+    bin_folder = Path(sys.executable).parent
+    environment = {**os.environ, "PATH": f"{bin_folder}{os.pathsep}{os.environ['PATH']}", "COLUMNS": "120"}
+    for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
+        command, _, expected = part.partition("\n")
+        if not (folder / "experiments").exists() and "experiments/" in command:
+            (folder / "experiments").symlink_to(ROOT / "experiments")
+        done = subprocess.run(
+            command, shell=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=200, check=False
+        )
+        output = done.stdout + done.stderr
+        assert done.returncode == 0, f"{where}: {command} failed:\n{output}"
+        at = 0
+        for line in filter(None, map(str.strip, expected.splitlines())):
+            pattern = ".*?".join(re.escape(piece) for piece in line.split("…"))
+            found = re.compile(pattern).search(output, at)
+            assert found, f"{where}: {line!r} does not come in the output of {command}:\n{output}"
+            at = found.end()
+
+
+def test_the_pages_are_found() -> None:
+    assert len(PAGES) > 5
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_within_the_project_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\((?!https?:|#|mailto:)([^)#]+)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}, which is not there"
