@@ -1,0 +1,114 @@
+"""What a request asks to be set, as generic parameters: only the fields that are present (wire format).
+
+The messages are read here as they came, since a model object can't say that only the x of a position was given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from google.protobuf.message import DecodeError, Message
+
+from afspm.errors import Refused
+from afspm.microscopes.parameters import FEEDBACK_ON, ParameterTable, Value
+from afspm.model import ControlRequest, ControlResponse, names
+from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One value as the peer gave it; a text is parsed by the parameter's own type."""
+
+    name: str
+    value: str | float | bool
+    unit: str | None
+
+
+def _scan_parameters(message: scan_pb2.ScanParameters2d) -> Iterator[Asked]:
+    spatial, roi, shape = message.spatial, message.spatial.roi, message.data.shape
+    length, angle = spatial.length_units or None, spatial.angular_units or None
+    for name, part, axis, unit in (
+        (names.SCAN_TOP_LEFT_X, roi.top_left, "x", length),
+        (names.SCAN_TOP_LEFT_Y, roi.top_left, "y", length),
+        (names.SCAN_SIZE_X, roi.size, "x", length),
+        (names.SCAN_SIZE_Y, roi.size, "y", length),
+        (names.SCAN_ANGLE, roi, "angle", angle),
+        (names.SCAN_RESOLUTION_X, shape, "x", None),
+        (names.SCAN_RESOLUTION_Y, shape, "y", None),
+    ):
+        if part.HasField(axis):
+            yield Asked(name, getattr(part, axis), unit)
+
+
+def _feedback(message: feedback_pb2.ZCtrlParameters) -> Iterator[Asked]:
+    for name, field in (
+        (FEEDBACK_ON, "feedbackOn"),
+        (names.ZCTRL_PGAIN, "proportionalGain"),
+        (names.ZCTRL_IGAIN, "integralGain"),
+        (names.ZCTRL_SETPOINT, "setPoint"),
+    ):
+        if message.HasField(field):
+            value = getattr(message, field)
+            yield Asked(name, value if isinstance(value, bool) else _shortest(value), None)
+
+
+def _probe_position(message: spectroscopy_pb2.ProbePosition) -> Iterator[Asked]:
+    for name, axis in ((names.PROBE_POS_X, "x"), (names.PROBE_POS_Y, "y")):
+        if message.point.HasField(axis):
+            yield Asked(name, getattr(message.point, axis), message.units or None)
+
+
+def _parameter(message: control_pb2.ParameterMsg) -> Iterator[Asked]:
+    if message.HasField("value"):
+        yield Asked(message.parameter, message.value, message.units or None)
+
+
+def _shortest(number: float) -> float:
+    """The decimal number that was meant by a float32: 0.1, not 0.10000000149011612."""
+    return float(str(np.float32(number)))
+
+
+_READERS = {
+    ControlRequest.SET_SCAN_PARAMS: (scan_pb2.ScanParameters2d, _scan_parameters),
+    ControlRequest.SET_ZCTRL_PARAMS: (feedback_pb2.ZCtrlParameters, _feedback),
+    ControlRequest.SET_PROBE_POS: (spectroscopy_pb2.ProbePosition, _probe_position),
+    ControlRequest.PARAM: (control_pb2.ParameterMsg, _parameter),
+}
+
+
+def asked_for(kind: int, payload: bytes) -> list[Asked]:
+    """What a request to set something asks for; empty if it only gets.
+
+    Raises:
+        Refused: PARAM_ERROR: the object is not what belongs to the request.
+    """
+    message_class, reader = _READERS[ControlRequest(kind)]
+    message: Message = message_class()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        reason = f"the object of the request is not a {message.DESCRIPTOR.name}: {error}"
+        raise Refused(ControlResponse.PARAM_ERROR, reason) from error
+    return list(reader(message))  # type: ignore[operator]
+
+
+def wanted_values(asked: list[Asked], table: ParameterTable) -> dict[str, Value]:
+    """What is asked for in SI, each value checked by itself.
+
+    Raises:
+        Refused: PARAM_NOT_SUPPORTED or PARAM_ERROR.
+    """
+    values: dict[str, Value] = {}
+    for one in asked:
+        spec = table.find(one.name)
+        if spec.read_only:
+            raise Refused(ControlResponse.PARAM_ERROR, f"{spec.name} can be asked for, not set")
+        if isinstance(one.value, str):
+            values[spec.name] = spec.parse(one.value, one.unit)
+        elif isinstance(one.value, bool):
+            values[spec.name] = spec.checked(one.value)
+        else:
+            values[spec.name] = spec.checked(spec.from_unit(one.value, one.unit))
+    return values

@@ -1,0 +1,218 @@
+"""`Microscope`: what one writes for a new controller. Everything else is done by the `Translator`, once for all."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+from afspm.clock import Clock
+from afspm.errors import AfspmError, Refused
+from afspm.microscopes.parameters import ParameterTable, Value
+from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
+
+if TYPE_CHECKING:
+    from afspm.runtime.process import Context
+
+MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
+
+
+class ControllerLost(AfspmError):
+    """The controller can't be reached: the translator says so to who asks, and connects again."""
+
+    code = "controller-lost"
+
+
+LOST = (ControllerLost, ConnectionError, TimeoutError)
+"""What says that the controller is gone, and not that it refuses."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """One generic action of a microscope.
+
+    Attributes:
+        name: the generic name, e.g. "start-scan".
+        do: begins it and returns at once; what it leads to is seen by `Microscope.status`.
+        state: what the microscope is in from the moment that it is accepted, until `status` says otherwise.
+        while_busy: it may be asked for while the microscope is not free.
+        interrupts: the states that it breaks off.
+    """
+
+    name: str
+    do: Callable[[], None]
+    state: ScopeState | None = None
+    while_busy: bool = False
+    interrupts: frozenset[ScopeState] = frozenset()
+
+    @property
+    def only_stops(self) -> bool:
+        """It is nothing to do unless what it interrupts is running."""
+        return self.name in (names.STOP_SCAN, names.STOP_SPEC)
+
+
+def _nothing() -> None:
+    raise NotImplementedError
+
+
+_KNOWN = {
+    action.name: action
+    for action in (
+        Action(names.START_SCAN, _nothing, ScopeState.SCANNING),
+        Action(names.START_SPEC, _nothing, ScopeState.SPEC),
+        Action(names.STOP_SCAN, _nothing, None, while_busy=True, interrupts=frozenset({ScopeState.SCANNING})),
+        Action(names.STOP_SPEC, _nothing, None, while_busy=True, interrupts=frozenset({ScopeState.SPEC})),
+        # the way out must always be open
+        Action(names.RETRACT, _nothing, None, while_busy=True, interrupts=MEASURING),
+    )
+}
+
+Method = TypeVar("Method", bound=Callable[[Any], None])
+
+
+def action(name: str, *, state: ScopeState | None = None, while_busy: bool | None = None) -> Callable[[Method], Method]:
+    """Marks a method of a `Microscope` as the generic action `name`.
+
+    Args:
+        state: what the microscope is in from the moment that it is accepted; known for the base actions.
+        while_busy: it may be asked for while the microscope is not free; known for the base actions.
+    """
+    known = _KNOWN.get(name, Action(name, _nothing))
+    mark = replace(
+        known,
+        state=known.state if state is None else state,
+        while_busy=known.while_busy if while_busy is None else while_busy,
+    )
+
+    def marked(method: Method) -> Method:
+        method._afspm_action = mark  # type: ignore[attr-defined]
+        return method
+
+    return marked
+
+
+class Microscope(ABC):
+    """A microscope behind its controller. Write the abstract methods and an `@action` for each action::
+
+        class Mine(Microscope):
+            def connect(self): self.link = Link(self.address)
+            def status(self): return ScopeStatus(ScopeState.SCANNING if self.link.busy() else ScopeState.FREE)
+            def get(self, vendor): return self.link.read(vendor)
+            def set(self, values): self.link.write(values)
+            def results(self): return sorted(self.folder.glob("*.dat"))
+            def load(self, result): return read_dat(result)
+
+            @action(names.START_SCAN)
+            def start_scan(self): self.link.send("scan")
+
+    and beside it `parameters.toml`, the table of parameters by their generic names. All methods are called from one
+    thread and return soon: whatever takes long is begun and then seen by `status`. What they raise becomes the
+    response, its text the reason.
+
+    Args:
+        parameters: rows added to the table or changed in it by the experiment file.
+        actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
+            parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`).
+        poll_period_s: the controller is looked at this often, in real seconds.
+        result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds.
+
+    Attributes:
+        clock, log: of the experiment; given before `connect`.
+        run_dir: the folder of this run.
+        memory: a dict of JSON values, kept on disk: saved with every request and result, there after a restart.
+    """
+
+    parameters_file: ClassVar[Path]
+    max_pixels: ClassVar[int] = 4096 * 4096
+    memory_is_all: ClassVar[bool] = False
+    """The microscope has no state outside of `memory` (a simulated one): nothing was done that is not in there."""
+
+    clock: Clock
+    log: logging.Logger
+    run_dir: Path
+    memory: dict[str, Any]
+
+    def __init__(
+        self,
+        *,
+        parameters: Mapping[str, Mapping[str, Any]] | None = None,
+        actions: Mapping[str, Mapping[str, Any]] | None = None,
+        poll_period_s: float = 0.1,
+        result_timeout_s: float = 10.0,
+    ) -> None:
+        table = ParameterTable.from_toml(self.parameters_file)
+        self.table = table.extended(parameters or {}, where="the experiment file")
+        self.added_actions = dict(actions or {})
+        self.poll_period_s = poll_period_s
+        self.result_timeout_s = result_timeout_s
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Reach the controller. Called at the start, and again after a `ControllerLost`."""
+
+    def close(self) -> None:  # noqa: B027 (many have nothing to close)
+        """Let go of the controller. The tip stays as it is."""
+
+    @abstractmethod
+    def status(self) -> ScopeStatus:
+        """What the controller is doing now."""
+
+    @abstractmethod
+    def get(self, vendor: str) -> Value:
+        """The value of a parameter, by the vendor's name, in the vendor's unit."""
+
+    @abstractmethod
+    def set(self, values: Mapping[str, Value]) -> None:
+        """Set parameters together, by the vendor's names, in the vendor's units. All or none, if it can be."""
+
+    @abstractmethod
+    def results(self) -> Sequence[str]:
+        """The finished scans and spectra that there are, oldest first: as a rule the names of the controller's files.
+
+        The translator remembers which it has published, also over a restart.
+        """
+
+    @abstractmethod
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        """Read one of `results`: every channel of a scan, or a spectrum, with the parameters it was taken with.
+
+        Raises:
+            FileError: it is not (yet) whole; asked for again until `result_timeout_s` is over.
+        """
+
+    def command(self, text: str) -> None:
+        """Send a command that the experiment file added to the controller as it is."""
+        raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{type(self).__name__} can't be sent commands as a text")
+
+    def next_change_s(self) -> float | None:
+        """The experiment time at which something is known to change by itself; None if nothing is known."""
+        return None
+
+    def read(self, wanted: Collection[str]) -> dict[str, Value]:
+        """The values of parameters by their generic names, in SI.
+
+        To be written only where a table can't say how the controller has it (a frame given by its centre …).
+        """
+        return {name: self.table[name].from_vendor(self.get(self.table[name].vendor)) for name in wanted}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        """Set parameters by their generic names, in SI; the counterpart of `read`."""
+        self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in values.items()})
+
+    def own_actions(self) -> dict[str, Action]:
+        """The methods marked with `@action`, by name."""
+        found = {}
+        for attribute in dir(type(self)):
+            mark = getattr(getattr(type(self), attribute), "_afspm_action", None)
+            if isinstance(mark, Action):
+                found[mark.name] = replace(mark, do=getattr(self, attribute))
+        return found
+
+    def run_process(self, context: Context) -> int:
+        """Be the translator of an experiment (what the host calls)."""
+        from afspm.microscopes.translator import run_translator
+
+        return run_translator(self, context)

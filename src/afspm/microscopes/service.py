@@ -1,0 +1,209 @@
+"""Answers requests: checks everything first, then has the microscope do it, then checks what came of it."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from afspm.errors import AfspmError, ConfigError, Refused
+from afspm.microscopes.changes import asked_for, wanted_values
+from afspm.microscopes.in_force import FRAME, MOVES, check_together, of_message
+from afspm.microscopes.microscope import LOST, Action, Microscope
+from afspm.microscopes.parameters import Value, refuse_value
+from afspm.microscopes.sequence import Sequence, Step
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState
+from afspm.units import parse_quantity
+from afspm.wire import encode
+
+_ANNOUNCED = {
+    ControlRequest.SET_SCAN_PARAMS: "ScanParameters2d",
+    ControlRequest.SET_ZCTRL_PARAMS: "ZCtrlParameters",
+    ControlRequest.SET_PROBE_POS: "ProbePosition",
+}
+_SETTERS = (*_ANNOUNCED, ControlRequest.PARAM)
+
+
+@dataclass
+class Answer:
+    """What a request comes to.
+
+    Attributes:
+        response: to send.
+        steps: to publish after it.
+        announce: messages to publish even if nothing in them changed: the peer waits for them.
+    """
+
+    response: Response
+    steps: list[Step] = field(default_factory=list)
+    announce: tuple[str, ...] = ()
+
+
+class Service:
+    """Answers requests to one microscope.
+
+    Args:
+        sequence: says whether the microscope is free, and in which order peers hear of it.
+        about_to_act: called right before anything is done that can't be taken back.
+    """
+
+    def __init__(
+        self,
+        microscope: Microscope,
+        sequence: Sequence,
+        about_to_act: Callable[[Request], None],
+        log: logging.Logger,
+    ) -> None:
+        self._microscope = microscope
+        self._table = microscope.table
+        self._sequence = sequence
+        self._about_to_act = about_to_act
+        self._log = log
+        self.actions = microscope.own_actions() | self._added_actions(microscope.added_actions)
+
+    def answer(self, request: Request) -> Answer:
+        """The answer to a request, whatever is wrong with it or with the controller."""
+        try:
+            return self._dispatch(request)
+        except Refused as refused:
+            return Answer(Response(refused.response, reason=refused.reason, id=request.id))
+        except LOST:
+            raise
+        except Exception as error:
+            # an error of the controller, or of its own translator, must not end the process: it is the reason
+            self._log.exception("%s failed", ControlRequest(request.kind).name)
+            code = _failure(request)
+            return Answer(Response(code, reason=f"{type(error).__name__}: {error}", id=request.id))
+
+    def _dispatch(self, request: Request) -> Answer:
+        if request.kind == ControlRequest.ACTION_SUPPORT:
+            self._find_action(request.subject)
+            return Answer(Response(ControlResponse.SUCCESS, id=request.id))
+        if request.kind == ControlRequest.ACTION:
+            return self._act(request)
+        if request.kind in _SETTERS:
+            asked = asked_for(request.kind, request.payload)
+            if asked:
+                return self._set(request, wanted_values(asked, self._table))
+            if request.kind == ControlRequest.PARAM:
+                return Answer(self._told(request))
+            return Answer(Response(ControlResponse.SUCCESS, id=request.id))
+        reason = f"{ControlRequest(request.kind).name} is not for a translator"
+        raise Refused(ControlResponse.CMD_NOT_SUPPORTED, reason)
+
+    def _told(self, request: Request) -> Response:
+        asked: Parameter = request.subject
+        spec = self._table.find(asked.name)
+        text, unit = spec.told(self._microscope.read([spec.name])[spec.name], asked.unit)
+        payload = encode(Parameter(spec.name, text, unit or None))[1]
+        return Response(ControlResponse.SUCCESS, payload, id=request.id)
+
+    def _set(self, request: Request, values: Mapping[str, Value]) -> Answer:
+        self._refuse_if_busy(all(self._table[name].while_busy for name in values))
+        self._apply(values, lambda: self._about_to_act(request))
+        steps = self._sequence.begin(ScopeState.MOVING) if MOVES & values.keys() else []
+        if request.kind == ControlRequest.PARAM:
+            announce = tuple(message for message in _ANNOUNCED.values() if set(of_message(message)) & values.keys())
+            return Answer(self._told(request), steps, announce)
+        announce = (_ANNOUNCED[ControlRequest(request.kind)],)
+        return Answer(Response(ControlResponse.SUCCESS, id=request.id), steps, announce)
+
+    def _apply(self, values: Mapping[str, Value], about_to_act: Callable[[], None]) -> None:
+        """Set the values, or change nothing.
+
+        Raises:
+            Refused: PARAM_ERROR: they do not fit together, or the controller made something else of them.
+        """
+        before = self._microscope.read({*values, *(name for name in FRAME if name in self._table)})
+        check_together({**before, **values}, self._table, self._microscope.max_pixels)
+        former = {name: before[name] for name in values}
+        about_to_act()
+        try:
+            self._microscope.write(values)
+            after = self._microscope.read(values)
+        except LOST:
+            raise
+        except Exception:
+            with contextlib.suppress(Exception):  # the first error is the one to tell
+                self._microscope.write(former)
+            raise
+        for name, value in values.items():
+            spec = self._table[name]
+            if not spec.same(after[name], value):
+                self._microscope.write(former)
+                made, asked = spec.quantity(after[name]), spec.quantity(value)
+                raise refuse_value(name, f"the controller made {made} of {asked}; nothing was changed")
+
+    def _act(self, request: Request) -> Answer:
+        action = self._find_action(request.subject)
+        state = self._sequence.said.state
+        done = Answer(Response(ControlResponse.SUCCESS, id=request.id))
+        if action.only_stops and state not in action.interrupts:
+            return done
+        self._refuse_if_busy(action.while_busy)
+        self._about_to_act(request)
+        action.do()
+        if state in action.interrupts:
+            done.steps = self._sequence.interrupt()
+        elif action.state is not None:
+            done.steps = self._sequence.begin(action.state)
+        return done
+
+    def _find_action(self, name: str) -> Action:
+        if name not in self.actions:
+            near = difflib.get_close_matches(name[:100], self.actions, n=1)
+            hint = f", perhaps {near[0]!r}" if near else ""
+            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"this microscope has no action {name[:100]!r}{hint}")
+        return self.actions[name]
+
+    def _refuse_if_busy(self, allowed: bool) -> None:
+        state = self._sequence.said.state
+        if state is not ScopeState.FREE and not allowed:
+            raise Refused(ControlResponse.NOT_FREE, f"the microscope is not free: SS_{state.name}")
+
+    def _added_actions(self, given: Mapping[str, Any]) -> dict[str, Action]:
+        added = {}
+        for name, what in given.items():
+            where = f"actions.{name}"
+            if isinstance(what, Mapping) and set(what) == {"command"}:
+                added[name] = Action(name, _bound(self._microscope.command, str(what["command"])))
+            elif isinstance(what, Mapping) and set(what) == {"set"} and isinstance(what["set"], Mapping):
+                values = self._values_from_file(what["set"], where)
+                moves = ScopeState.MOVING if MOVES & values.keys() else None
+                added[name] = Action(name, _bound(self._apply, values, _already_said), moves)
+            else:
+                hint = '{ set = { "<parameter>" = <value> } } or { command = "<text>" }'
+                raise ConfigError(f"{what!r} is not an action", where=where, hint=hint)
+        return added
+
+    def _values_from_file(self, given: Mapping[str, Any], where: str) -> dict[str, Value]:
+        values: dict[str, Value] = {}
+        try:
+            for name, value in given.items():
+                spec = self._table.find(name)
+                if isinstance(value, str) and spec.type in ("float", "int"):
+                    number, unit = parse_quantity(value)
+                    value = spec.from_unit(number, unit or spec.unit)
+                elif not isinstance(value, bool | str):
+                    value = spec.from_unit(value, spec.unit)
+                values[name] = spec.checked(value)
+        except AfspmError as error:
+            raise ConfigError(str(error), where=where) from error
+        return values
+
+
+def _bound(function: Callable[..., None], *arguments: Any) -> Callable[[], None]:
+    return lambda: function(*arguments)
+
+
+def _already_said() -> None:
+    """The request behind an action was written down before the action began."""
+
+
+def _failure(request: Request) -> ControlResponse:
+    if request.kind == ControlRequest.ACTION:
+        return ControlResponse.ACTION_ERROR
+    return ControlResponse.PARAM_ERROR

@@ -1,0 +1,264 @@
+"""`Translator`: the process between the scheduler and one microscope. It is the same for every microscope.
+
+One loop waits for requests and for the moment to look at the controller again; whatever is seen to have changed there
+is published, whoever changed it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from afspm import wire
+from afspm.clock import Clock
+from afspm.errors import AfspmError, FileError, WireError
+from afspm.microscopes import in_force
+from afspm.microscopes.ledger import Ledger
+from afspm.microscopes.microscope import LOST, ControllerLost, Microscope
+from afspm.microscopes.outbox import Outbox
+from afspm.microscopes.parameters import Value
+from afspm.microscopes.sequence import Complain, Deliver, Discard, Say, Step
+from afspm.microscopes.sequence import Sequence as StateSequence
+from afspm.microscopes.service import Service
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus
+from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.memory import Memory
+from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
+
+if TYPE_CHECKING:
+    from afspm.runtime.process import Context
+
+_RECONNECT_S = 1.0
+
+
+class Translator:
+    """Answers requests to a microscope and publishes what happens at it.
+
+    Args:
+        microscope: already made with its settings, not yet connected.
+        port: to the network.
+        memory: kept over a restart.
+        run_dir: the folder of the run.
+    """
+
+    def __init__(
+        self, microscope: Microscope, port: ServerPort, memory: Memory, run_dir: Path, log: logging.Logger
+    ) -> None:
+        self.microscope = microscope
+        self._port = port
+        self._memory = memory
+        self._log = log
+        self._clock: Clock = port.clock
+        microscope.clock, microscope.log, microscope.run_dir = port.clock, log, run_dir
+        microscope.memory = memory.setdefault("microscope", {})
+        self._kept: dict[str, Any] = memory.setdefault("translator", {"said": 0, "ledger": {}, "outbox": {}})
+        said = ScopeStatus(ScopeState(self._kept["said"]))
+        self._sequence = StateSequence(said, microscope.result_timeout_s)
+        self._ledger = Ledger(self._kept["ledger"], all_or_nothing=microscope.memory_is_all)
+        self._outbox = Outbox(microscope, self._kept["outbox"], self._stamp, log)
+        self._service = Service(microscope, self._sequence, self._about_to_act, log)
+        self._values: dict[str, Value] = {}
+        self._connected = self._started = False
+        self._retry_at_s = 0.0
+        self._last_ns = int(self._kept.get("last_ns", 0))
+        self._acting: Request | None = None
+
+    def run(self) -> ExitCode:
+        """Until the parent has gone or wants us to stop."""
+        try:
+            while True:
+                self.look()
+                for arrived in self._port.poll(self.wait_s()):
+                    if isinstance(arrived, ParentGone):
+                        return ExitCode.ORPHAN
+                    self.handle(arrived)
+        finally:
+            self.microscope.close()
+            self._port.close()
+
+    def handle(self, arrived: RequestReceived | SubscriberJoined) -> None:
+        """One thing that came over the network."""
+        if isinstance(arrived, RequestReceived):
+            self._on_request(arrived.frames)
+        elif self._connected:
+            self._publish_all()
+
+    def wait_s(self) -> float:
+        """Real seconds until the controller should be looked at again."""
+        if not self._connected:
+            return max(0.0, self._retry_at_s - self._clock.monotonic_s())
+        wait_s = self.microscope.poll_period_s
+        now_s = self._clock.now_s()
+        for at_s in (self.microscope.next_change_s(), self._sequence.deadline_s()):
+            if at_s is not None:
+                wait_s = min(wait_s, self._clock.real_s(at_s - now_s))
+        return max(0.0, wait_s)
+
+    # --- looking at the controller ---
+
+    def look(self) -> None:
+        """See what has changed at the controller and publish it."""
+        try:
+            if self._connected or self._connect():
+                self._observe()
+        except (*LOST, AfspmError) as error:
+            self._lose(error)
+
+    def _connect(self) -> bool:
+        if self._clock.monotonic_s() < self._retry_at_s:
+            return False
+        self.microscope.connect()
+        self._connected = True
+        if not self._started:
+            self._started = True
+            for packet in self._outbox.start():
+                self._port.publish(*packet)
+            self._save()
+        self._values = self._read()
+        self._publish_all()
+        return True
+
+    def _lose(self, error: Exception) -> None:
+        self._log.error("the controller is not there: %s", error)
+        self._connected = False
+        self._retry_at_s = self._clock.monotonic_s() + _RECONNECT_S
+        if self._sequence.said.state is not ScopeState.UNDEFINED:
+            # what it was doing is remembered: it may still be at it when it is found again
+            self._publish(ScopeStatus(ScopeState.UNDEFINED))
+
+    def _observe(self, announce: Sequence[str] = ()) -> None:
+        values = self._read()
+        before, self._values = in_force.messages(self._values), values
+        for name, thing in in_force.messages(values).items():
+            if name in announce or before.get(name) != thing:
+                self._publish(thing)
+        # the state first: a result that comes in between then waits for the next look, and is not lost
+        status = self.microscope.status()
+        self._play(self._sequence.observe(status, self._outbox.look(), self._clock.now_s()))
+
+    def _read(self) -> dict[str, Value]:
+        """What is in force; differences below the controller's precision are none."""
+        table = self.microscope.table
+        values = self.microscope.read(in_force.watched(table))
+        old = self._values
+        return {
+            name: old[name] if name in old and table[name].same(old[name], value) else value
+            for name, value in values.items()
+        }
+
+    def _play(self, steps: Sequence[Step]) -> None:
+        for step in steps:
+            if isinstance(step, Say):
+                self._kept["said"] = int(step.status.state)
+                self._publish(step.status)
+            elif isinstance(step, Deliver):
+                self._deliver()
+            elif isinstance(step, Discard):
+                self._outbox.discard()
+            elif isinstance(step, Complain):
+                self._log.error("%s", step.text)
+        if steps:
+            self._save()
+
+    def _deliver(self) -> None:
+        packets = self._outbox.take()
+        self._save()  # before anything is out: a restart then publishes the same again, not anew
+        for packet in packets:
+            self._port.publish(*packet)
+
+    # --- requests ---
+
+    def _on_request(self, frames: Sequence[bytes]) -> None:
+        try:
+            request = wire.decode_request(frames)
+        except WireError as error:
+            self._reply(Response(error.response, reason=str(error)))
+            return
+        known = self._ledger.outcome(request)
+        if known is not None:
+            self._reply(known)
+            return
+        try:
+            self._answer(request)
+        except LOST as error:
+            self._lose(error)
+            reason = f"the controller can't be reached: {error}"
+            self._finish(request, Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id))
+
+    def _answer(self, request: Request) -> None:
+        if not self._connected:
+            raise ControllerLost("it is being looked for")
+        if not _only_asks(request):
+            self._observe()  # whether it is free is decided by what it does now, not at the last look
+        answer = self._service.answer(request)
+        self._finish(request, answer.response)
+        self._play(answer.steps)
+        if answer.response.ok and (answer.steps or answer.announce):
+            self._observe(answer.announce)
+
+    def _about_to_act(self, request: Request) -> None:
+        self._acting = request
+        self._ledger.begin(request)
+        if request.id and not self.microscope.memory_is_all:
+            self._save()
+
+    def _finish(self, request: Request, response: Response) -> None:
+        """Write down what came of a request before anybody hears of it, and answer."""
+        if self._acting is request:
+            self._acting = None
+            if response.code == ControlResponse.PARAM_ERROR:
+                self._ledger.forget(request)  # nothing was changed
+            else:
+                self._ledger.finish(request, response)
+            self._save()
+        self._reply(response)
+
+    def _reply(self, response: Response) -> None:
+        if response.code != ControlResponse.SUCCESS:
+            self._log.info("refused, %s: %s", ControlResponse(response.code).name, response.reason)
+        self._port.reply(wire.encode_response(response))
+
+    def _save(self) -> None:
+        try:
+            self._memory.save()
+        except FileError as error:  # a full disk must not stop the tip from being looked after
+            self._log.critical("a restart would lose what was done and said until now: %s", error)
+
+    # --- publishing ---
+
+    def _publish_all(self) -> None:
+        """Everything in force, for a scheduler that has just come."""
+        for thing in in_force.messages(self._values).values():
+            self._publish(thing)
+        if self._sequence.said.state is not ScopeState.UNDEFINED:
+            self._publish(self._sequence.said)
+
+    def _publish(self, thing: in_force.Published | ScopeStatus) -> None:
+        name, payload = wire.encode(thing)
+        self._port.publish(name, payload, self._stamp(1)[0])
+
+    def _stamp(self, count: int) -> list[int]:
+        """Strictly increasing times for so many packets, ns."""
+        first = max(self._clock.now_ns(), self._last_ns + 1)
+        self._last_ns = first + count - 1
+        self._kept["last_ns"] = self._last_ns
+        return list(range(first, first + count))
+
+
+def _only_asks(request: Request) -> bool:
+    if request.kind == ControlRequest.PARAM:
+        return isinstance(request.subject, Parameter) and request.subject.value is None
+    return request.kind == ControlRequest.ACTION_SUPPORT
+
+
+def run_translator(microscope: Microscope, context: Context, make: Callable[..., Translator] = Translator) -> int:
+    """What the host runs: the sockets, the memory and the translator itself."""
+    from afspm.transport.zmq_server import ZmqServerPort
+
+    launch = context.launch
+    memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None)
+    port = ZmqServerPort(launch, context.clock)
+    context.when_stopping(lambda: port.wake_up(ParentGone()))
+    return make(microscope, port, memory, Path(launch.run_dir or "."), context.log).run()
