@@ -1,0 +1,77 @@
+"""Asks the scheduler."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import zmq
+
+from afspm import wire
+from afspm.errors import WireError
+from afspm.transport.complaints import Complaints
+from afspm.transport.frames import readable
+from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
+from afspm.transport.network import Network
+from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
+
+
+class ControlClient:
+    """A component's connection to the scheduler: the same bytes as a REQ socket, without its lock step.
+
+    Args:
+        name: of the component. Restarted, it is the same client to the scheduler.
+    """
+
+    def __init__(self, network: Network, name: str, address: str, complaints: Complaints) -> None:
+        self._complaints = complaints
+        self._address = address
+        self._scheduler_is_ours = False
+        self.socket = network.socket(zmq.DEALER)
+        self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
+        # a request is for the scheduler that is there now, not for one that may come later
+        self.socket.setsockopt(zmq.IMMEDIATE, 1)
+        self.monitor = Monitor(self.socket, CONNECTED | DISCONNECTED)
+        network.connect(self.socket, address)
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        """Ask; dropped while there is no scheduler."""
+        try:
+            self.socket.send_multipart([b"", *frames], zmq.NOBLOCK)
+        except zmq.Again:
+            return
+
+    def receive(self) -> list[Incoming]:
+        """Answers, and the scheduler's coming and going."""
+        found: list[Incoming] = []
+        while readable(self.socket):
+            frames = self.socket.recv_multipart(zmq.NOBLOCK)
+            try:
+                found.append(self._interpret(frames))
+            except WireError as error:
+                self._complaints.say(f"dropped a reply from {self._address}: {error}")
+        for event in self.monitor.drain():
+            if event.kind == CONNECTED:
+                self._greet()
+                found.append(ControlConnected())
+            else:
+                found.append(ControlDisconnected())
+        return found
+
+    def _interpret(self, frames: list[bytes]) -> Incoming:
+        if len(frames) < 2 or frames[0]:
+            raise WireError("there is no empty frame before it")
+        response = wire.decode_response(frames[1:])
+        self._scheduler_is_ours = self._scheduler_is_ours or bool(response.id)
+        return ReplyReceived(response)
+
+    def _greet(self) -> None:
+        """Say our name to a scheduler that was restarted: it may be waiting for us, who are in control.
+
+        Only to ours, known by its answers: for one of version 1 a message without a request might be its last.
+        """
+        if self._scheduler_is_ours:
+            self.send([])
+
+    def close(self) -> None:
+        self.monitor.close()
+        self.socket.close()

@@ -1,0 +1,154 @@
+"""One process's access to ZeroMQ: the context, what all of its sockets have in common, and what is let in."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import zmq
+
+from afspm.errors import TransportError
+
+if TYPE_CHECKING:
+    from afspm.transport.keys import Keys
+
+MAX_PACKET_BYTES = 256 * 1024 * 1024
+"""Of a published packet: a scan of 4096² in one channel is half of that."""
+MAX_REQUEST_BYTES = 1024 * 1024
+"""Of each frame of a request or response, and of a subscription."""
+QUEUE_LENGTH = 4000
+"""Messages waiting for one peer; a publisher drops what is more, so that nobody who stands still fills our memory."""
+
+_LINGER_MS = 200
+# A peer that is frozen or cut off is found within seconds and not when the system gives up on it after hours.
+_ALIVE_CHECK_MS, _ALIVE_TIMEOUT_MS = 2_000, 8_000
+_RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
+_HANDSHAKE_MS = 5_000
+
+
+class Network:
+    """Makes sockets, binds and connects them: to this computer only, or with keys, or after `insecure` was said.
+
+    Args:
+        keys: of this process. With keys every connection is encrypted, and whose it is is known.
+        insecure: bind and connect to other computers without keys. Anyone there can then move the tip.
+    """
+
+    def __init__(self, keys: Keys | None = None, *, insecure: bool = False) -> None:
+        self.keys = keys
+        self._insecure = insecure
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._authenticator = None
+        if keys is not None:
+            from afspm.transport.zap import Authenticator
+
+            self._authenticator = Authenticator(self._context, keys.peers)
+
+    @classmethod
+    def from_launch(cls, name: str, entries: Mapping[str, str] | None) -> Network:
+        """As the launch line of the process `name` says.
+
+        Args:
+            entries: `{"folder": the folder of certificates, "<address>": "<name of whoever binds it>", …}`, or
+                `{"insecure": "true"}`; None: this computer only, without keys.
+        """
+        if not entries:
+            return cls()
+        from afspm.transport.keys import from_launch
+
+        return cls(from_launch(name, entries), insecure=str(entries.get("insecure", "")).lower() == "true")
+
+    def socket(self, kind: int, *, max_bytes: int = MAX_REQUEST_BYTES) -> zmq.Socket[bytes]:
+        """A socket with the house's limits; frames over `max_bytes` end the connection that they come by."""
+        socket = self._context.socket(kind)
+        for option, value in (
+            (zmq.LINGER, _LINGER_MS),
+            (zmq.SNDHWM, QUEUE_LENGTH),
+            (zmq.RCVHWM, QUEUE_LENGTH),
+            (zmq.MAXMSGSIZE, max_bytes),
+            (zmq.HEARTBEAT_IVL, _ALIVE_CHECK_MS),
+            (zmq.HEARTBEAT_TIMEOUT, _ALIVE_TIMEOUT_MS),
+            (zmq.HEARTBEAT_TTL, _ALIVE_TIMEOUT_MS),
+            (zmq.RECONNECT_IVL, _RECONNECT_MS),
+            (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
+            (zmq.HANDSHAKE_IVL, _HANDSHAKE_MS),
+        ):
+            socket.setsockopt(option, value)
+        return socket
+
+    def bind(self, socket: zmq.Socket[bytes], address: str) -> str:
+        """Bind; returns the address with the port that was found, where `address` asks for any (port 0).
+
+        Raises:
+            TransportError: the address is taken or malformed, or would be open to others without keys.
+        """
+        self._guard(address)
+        if self.keys is not None:
+            socket.setsockopt(zmq.CURVE_SERVER, 1)
+            socket.setsockopt(zmq.CURVE_SECRETKEY, self.keys.secret)
+            socket.setsockopt(zmq.ZAP_DOMAIN, b"afspm")
+        try:
+            socket.bind(address)
+        except zmq.ZMQError as error:
+            raise TransportError(f"can't bind: {error}", where=address, hint=_bind_hint(error)) from error
+        return socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
+
+    def connect(self, socket: zmq.Socket[bytes], address: str) -> None:
+        """Connect, and again whenever the connection is lost.
+
+        Raises:
+            TransportError: the address is malformed, or is another computer's and there are no keys.
+        """
+        self._guard(address)
+        if self.keys is not None:
+            socket.setsockopt(zmq.CURVE_SERVERKEY, self.keys.server_key(address))
+            socket.setsockopt(zmq.CURVE_PUBLICKEY, self.keys.public)
+            socket.setsockopt(zmq.CURVE_SECRETKEY, self.keys.secret)
+        try:
+            socket.connect(address)
+        except zmq.ZMQError as error:
+            raise TransportError(f"can't connect: {error}", where=address) from error
+
+    def close(self) -> None:
+        """Close all sockets, once what was sent has gone out or a fraction of a second has passed."""
+        if self._context.closed:
+            return
+        if self._authenticator is not None:
+            self._authenticator.close()
+        self._context.destroy(linger=_LINGER_MS)
+
+    def _guard(self, address: str) -> None:
+        if self.keys is None and not self._insecure and not is_local(address):
+            raise TransportError(
+                "this address can be reached from other computers, and there are no keys",
+                where=address,
+                hint="make keys with `afspm keys`, or use 127.0.0.1; "
+                "insecure = true lets anyone on the network move the tip",
+            )
+
+
+def is_local(address: str) -> bool:
+    """Whether only processes of this computer can be at `address`."""
+    scheme, _, rest = address.partition("://")
+    if scheme in ("ipc", "inproc"):
+        return True
+    if scheme != "tcp":
+        return False
+    # "source;destination" connects from a given address; both have to be local
+    for end in rest.split(";"):
+        host = end.rpartition(":")[0].strip("[]")
+        if host == "localhost":
+            continue
+        try:
+            if not ipaddress.ip_address(host).is_loopback:
+                return False
+        except ValueError:
+            return False
+    return True
+
+
+def _bind_hint(error: zmq.ZMQError) -> str:
+    if error.errno == zmq.EADDRINUSE:
+        return "another program uses this port: an earlier experiment that still runs?"
+    return ""

@@ -1,0 +1,95 @@
+"""Publishes, and gives those who come late what they missed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+
+import zmq
+
+from afspm import wire
+from afspm.model import Packet
+from afspm.transport.frames import readable, send_payload
+from afspm.transport.network import Network
+from afspm.transport.replay import Marker, is_reserved, spelled_out
+
+History = Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
+"""(who, prefixes, since_ns) -> what was published under these and is newer, oldest first."""
+
+
+class Publisher:
+    """A publishing socket that sees who subscribes.
+
+    A subscriber of ours is sent what it missed under a topic of its own (see `replay`), so that no one else is sent
+    it again, and from then on everything, without a gap. A subscriber of version 1 is sent what was kept as ordinary
+    packets, which all of that version see.
+
+    Args:
+        history: what was published before; asked when somebody subscribes.
+    """
+
+    def __init__(self, network: Network, address: str, history: History) -> None:
+        self._history = history
+        self.socket = network.socket(zmq.XPUB)
+        self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
+        self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
+        self.address = network.bind(self.socket, address)
+
+    def publish(self, packet: Packet) -> None:
+        """Send to all who subscribed to the packet's envelope. Never blocks."""
+        socket = self.socket
+        socket.send(packet.envelope.encode(), zmq.SNDMORE)
+        if packet.time_ns is None:
+            send_payload(socket, packet.payload, 0)
+        else:
+            send_payload(socket, packet.payload, zmq.SNDMORE)
+            socket.send(wire.encode_time(packet.time_ns))
+
+    def kill(self) -> None:
+        """The experiment has ended: tell everyone to close."""
+        self.socket.send(wire.KILL)
+
+    def serve(self) -> int:
+        """Take in who subscribed and who left; returns how many joined."""
+        joined = 0
+        plain: dict[object, list[bytes]] = {}
+        while readable(self.socket):
+            frame = self.socket.recv(zmq.NOBLOCK, copy=False)
+            subscription = frame.bytes
+            if subscription[:1] == b"\1":
+                joined += self._subscribed(subscription[1:], frame, plain)
+            elif subscription[:1] == b"\0" and not is_reserved(subscription[1:]):
+                for prefix in spelled_out([subscription[1:]]):
+                    self.socket.setsockopt(zmq.UNSUBSCRIBE, prefix)
+            # anything else is no subscription: nobody has a reason to send that here
+        for prefixes in plain.values():
+            # all of one peer's prefixes together: peers of version 1 lose what comes out of order
+            for packet in self._history(None, tuple(str(p, "utf-8", "replace") for p in prefixes), -1):
+                self.publish(packet)
+        return joined + len(plain)
+
+    def _subscribed(self, subscription: bytes, frame: zmq.Frame, plain: dict[object, list[bytes]]) -> int:
+        marker = Marker.decode(subscription)
+        if marker is not None:
+            self._replay(marker)
+            return 1
+        # our own subscribers repeat their prefixes by themselves when a connection is made again, before they can say
+        # what they have: they are subscribed by the marker, and only by it, so that they miss nothing
+        if not is_reserved(subscription) and frame.get("Socket-Type") != "XSUB":
+            for prefix in spelled_out([subscription]):
+                self.socket.setsockopt(zmq.SUBSCRIBE, prefix)
+            plain.setdefault(frame.get(zmq.SRCFD), []).append(subscription)
+        return 0
+
+    def _replay(self, marker: Marker) -> None:
+        socket, topic = self.socket, marker.topic
+        # in this mode a subscription is for the one peer whose message was received last
+        socket.setsockopt(zmq.SUBSCRIBE, topic)
+        for prefix in spelled_out(prefix.encode() for prefix in marker.prefixes):
+            socket.setsockopt(zmq.SUBSCRIBE, prefix)
+        for packet in self._history(topic, marker.prefixes, marker.since_ns):
+            socket.send(topic, zmq.SNDMORE)
+            socket.send(packet.envelope.encode(), zmq.SNDMORE)
+            send_payload(socket, packet.payload, zmq.SNDMORE)
+            socket.send(b"" if packet.time_ns is None else wire.encode_time(packet.time_ns))
+        socket.send(topic)
+        socket.setsockopt(zmq.UNSUBSCRIBE, topic)

@@ -1,0 +1,110 @@
+"""Answers requests, one at a time, and publishes: a translator's side of the network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import zmq
+
+from afspm.clock import Clock
+from afspm.errors import ConfigError
+from afspm.transport.frames import readable, user_of
+from afspm.transport.history import Published
+from afspm.transport.network import Network
+from afspm.transport.port import RequestReceived, Served, SubscriberJoined
+from afspm.transport.publisher import Publisher
+from afspm.transport.wakeup import WakeUp
+
+
+class ZmqServerPort:
+    """See `transport.port.ServerPort`.
+
+    A REP socket: it gives back whatever the requester put before the empty frame, so that a scheduler of ours can
+    number its requests, and one of version 1 need not.
+
+    Args:
+        serve: the address to answer requests on.
+        publish: the address to publish on.
+        allowed: with keys, the only one whose requests are answered (the scheduler); None: whoever is let in.
+
+    Raises:
+        TransportError: an address can't be used.
+    """
+
+    def __init__(
+        self, network: Network, clock: Clock, *, serve: str, publish: str | None, allowed: str | None = None
+    ) -> None:
+        self._network = network
+        self._clock = clock
+        self._allowed = allowed
+        self._asked = False
+        self._closed = False
+        self._wake_up: WakeUp[Served] = WakeUp()
+        self._published = Published(clock)
+        self._publisher = None if publish is None else Publisher(network, publish, self._published)
+        self._socket = network.socket(zmq.REP)
+        self.serve_address = network.bind(self._socket, serve)
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self._wake_up.fileno(), zmq.POLLIN)
+        if self._publisher is not None:
+            self._poller.register(self._publisher.socket, zmq.POLLIN)
+
+    @property
+    def clock(self) -> Clock:
+        return self._clock
+
+    @property
+    def publish_address(self) -> str | None:
+        """Where others can subscribe to what we publish, with the port that was found."""
+        return self._publisher.address if self._publisher else None
+
+    def poll(self, timeout_s: float | None) -> list[Served]:
+        timeout_ms = None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
+        found: list[Served] = []
+        for ready, _ in self._poller.poll(timeout_ms):
+            if ready is self._socket:
+                found += self._request()
+            elif isinstance(ready, int):
+                found += self._wake_up.take()
+            elif self._publisher is not None and self._publisher.serve():
+                found.append(SubscriberJoined())
+        return found
+
+    def _request(self) -> list[Served]:
+        """The next request, if the last one was answered."""
+        while not self._asked and readable(self._socket):
+            first = self._socket.recv(zmq.NOBLOCK, copy=False)
+            rest = self._socket.recv_multipart(zmq.NOBLOCK) if first.more else []
+            user = user_of(first) if self._network.keys is not None else None
+            self._asked = True
+            if self._allowed is None or self._network.keys is None or user == self._allowed:
+                return [RequestReceived([first.bytes, *rest], user)]
+            self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])
+        return []
+
+    def reply(self, frames: Sequence[bytes]) -> None:
+        if self._asked:
+            self._asked = False
+            self._socket.send_multipart(frames, zmq.NOBLOCK)
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        if self._publisher is None:
+            raise ConfigError("there is no address to publish on", hint="publish = address")
+        self._publisher.publish(self._published.stamp(envelope, payload))
+
+    def kill(self) -> None:
+        """Tell those who subscribed that the experiment has ended."""
+        if self._publisher is not None:
+            self._publisher.kill()
+
+    def wake_up(self, incoming: Served | None = None) -> None:
+        self._wake_up.post(incoming)
+
+    def close(self) -> None:
+        """The network is the port's own: it is closed too."""
+        if not self._closed:
+            self._closed = True
+            self._network.close()
+            self._wake_up.close()

@@ -1,0 +1,128 @@
+"""Receives what one publisher publishes: each packet once, and what was missed before anything newer."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import zmq
+
+from afspm import wire
+from afspm.errors import WireError
+from afspm.model import Packet
+from afspm.transport.complaints import Complaints
+from afspm.transport.frames import payload_of, readable, receive
+from afspm.transport.monitor import CONNECTED, Monitor
+from afspm.transport.network import MAX_PACKET_BYTES, Network
+from afspm.transport.port import CaughtUp, Incoming, Killed, PacketReceived
+from afspm.transport.replay import Marker, topic
+
+_MOST_ENVELOPES = 10_000
+_BATCH = 256
+
+
+class Subscriber:
+    """A connection to one publisher, ours or of version 1.
+
+    Args:
+        name: of this component.
+        prefixes: of the envelopes wanted; None for all. The signal KILL always comes.
+        since_ns: what is not newer is known already.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        name: str,
+        address: str,
+        prefixes: Sequence[str] | None,
+        complaints: Complaints,
+        *,
+        since_ns: int = -1,
+    ) -> None:
+        self._name = name
+        self.address = address
+        self._prefixes = _with_kill(prefixes)
+        self._complaints = complaints
+        self._newest_ns = since_ns
+        self._newest_of: dict[str, int] = {}
+        self._started_ns = since_ns
+        self._nonces = itertools.count()
+        self._marker: Marker | None = None
+        # unlike SUB, XSUB takes what is sent to it under any topic, and lets the marker through as it is
+        self.socket = network.socket(zmq.XSUB, max_bytes=MAX_PACKET_BYTES)
+        self.monitor = Monitor(self.socket, CONNECTED)
+        for prefix in self._prefixes:
+            self.socket.send(b"\1" + prefix.encode())
+        network.connect(self.socket, address)
+
+    def receive(self) -> list[Incoming]:
+        """What has come, a batch at a time: the rest is still there for the next call."""
+        for _ in self.monitor.drain():
+            self._ask_for_missed()
+        found: list[Incoming] = []
+        while len(found) < _BATCH and readable(self.socket):
+            frames = receive(self.socket)
+            try:
+                incoming = self._interpret(frames)
+            except WireError as error:
+                self._complaints.say(f"dropped a packet from {self.address}: {error}")
+                continue
+            if incoming is not None:
+                found.append(incoming)
+        return found
+
+    def _ask_for_missed(self) -> None:
+        """A connection was made, the first or another: say what we have, and be sent the rest."""
+        self._forget_marker()
+        self._marker = Marker(topic(self._name, next(self._nonces)), self._newest_ns, self._prefixes)
+        self.socket.send(b"\1" + self._marker.encode())
+
+    def _forget_marker(self) -> None:
+        """Else the socket would ask for the same again when the connection is next made."""
+        if self._marker is not None:
+            self.socket.send(b"\0" + self._marker.encode())
+            self._marker = None
+
+    def _interpret(self, frames: list[zmq.Frame]) -> Incoming | None:
+        first = frames[0].bytes
+        if first[:1] == b"\0":
+            if self._marker is None or first != self._marker.topic:
+                return None  # of an earlier connection
+            if len(frames) == 1:
+                self._forget_marker()
+                return CaughtUp(self.address)
+            frames = frames[1:]
+            first = frames[0].bytes
+        elif len(frames) == 1 and first == wire.KILL:
+            return Killed()
+        # the timestamp that is empty is none
+        tail = [frame.bytes for frame in frames[2:] if len(frame)]
+        packet = wire.decode_packet([first, payload_of(frames[1]) if len(frames) > 1 else b"", *tail])
+        return PacketReceived(packet, self.address) if self._is_new(packet) else None
+
+    def _is_new(self, packet: Packet) -> bool:
+        time_ns = packet.time_ns
+        if time_ns is None:
+            return True
+        known = self._newest_of
+        if time_ns <= known.get(packet.envelope, self._started_ns):
+            return False
+        known[packet.envelope] = time_ns
+        if time_ns > self._newest_ns:
+            self._newest_ns = time_ns
+        if len(known) > _MOST_ENVELOPES:
+            del known[next(iter(known))]
+        return True
+
+    def close(self) -> None:
+        self.monitor.close()
+        self.socket.close()
+
+
+def _with_kill(prefixes: Sequence[str] | None) -> tuple[str, ...]:
+    if prefixes is None or "" in prefixes:
+        return ("",)
+    kill = wire.KILL.decode()
+    covered = any(kill.startswith(prefix) for prefix in prefixes)
+    return tuple(prefixes) if covered else (*prefixes, kill)

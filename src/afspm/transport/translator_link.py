@@ -1,0 +1,73 @@
+"""The scheduler's connection to the translator's control socket."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import zmq
+
+from afspm.transport.complaints import Complaints
+from afspm.transport.frames import readable
+from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
+from afspm.transport.network import Network
+
+_LONGEST_NUMBER = 18
+
+
+class LinkUp(NamedTuple):
+    """The translator can be asked."""
+
+
+class LinkDown(NamedTuple):
+    """The translator's connection is gone."""
+
+
+class LinkReply(NamedTuple):
+    """The translator's answer to the request that was sent as `number`, as frames for `wire.decode_response`."""
+
+    number: int
+    frames: Sequence[bytes]
+
+
+LinkEvent = LinkUp | LinkDown | LinkReply
+
+
+class TranslatorLink:
+    """Asks the translator, ours or of version 1: a REP socket gives back the number that stands before the empty frame,
+    so that a late answer is never taken for another's.
+    """
+
+    def __init__(self, network: Network, address: str, complaints: Complaints) -> None:
+        self._complaints = complaints
+        self._address = address
+        self.socket = network.socket(zmq.DEALER)
+        # nothing waits for a translator that is gone, to be carried out when it is back
+        self.socket.setsockopt(zmq.IMMEDIATE, 1)
+        self.monitor = Monitor(self.socket, CONNECTED | DISCONNECTED)
+        network.connect(self.socket, address)
+
+    def send(self, number: int, frames: Sequence[bytes]) -> bool:
+        """Ask; False if there is no translator to ask."""
+        try:
+            self.socket.send_multipart([b"%d" % number, b"", *frames], zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def receive(self) -> list[LinkEvent]:
+        """Answers, and the translator's coming and going."""
+        found: list[LinkEvent] = []
+        while readable(self.socket):
+            frames = self.socket.recv_multipart(zmq.NOBLOCK)
+            if len(frames) < 3 or frames[1] or not frames[0].isdigit() or len(frames[0]) > _LONGEST_NUMBER:
+                self._complaints.say(f"dropped a malformed answer from {self._address}")
+                continue
+            found.append(LinkReply(int(frames[0]), frames[2:]))
+        for event in self.monitor.drain():
+            found.append(LinkUp() if event.kind == CONNECTED else LinkDown())
+        return found
+
+    def close(self) -> None:
+        self.monitor.close()
+        self.socket.close()

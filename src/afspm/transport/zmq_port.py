@@ -1,0 +1,123 @@
+"""The port of a component over ZeroMQ: one poller for all of its sockets."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+
+import zmq
+
+from afspm.clock import Clock
+from afspm.errors import ConfigError
+from afspm.transport.complaints import Complaints
+from afspm.transport.control_client import ControlClient
+from afspm.transport.history import Published
+from afspm.transport.network import Network
+from afspm.transport.port import Incoming
+from afspm.transport.publisher import Publisher
+from afspm.transport.subscriber import Subscriber
+from afspm.transport.wakeup import WakeUp
+
+Drain = Callable[[], list[Incoming]]
+
+
+class ZmqPort:
+    """See `transport.port.Port`.
+
+    Args:
+        name: of the component.
+        clock: of the experiment.
+        subscribe: addresses of the publishers to listen to.
+        envelopes: prefixes of what to listen to; None: all.
+        control: the scheduler's address for requests.
+        publish: the address to publish on.
+
+    Raises:
+        TransportError: an address can't be used.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        name: str,
+        clock: Clock,
+        *,
+        subscribe: Sequence[str] = (),
+        envelopes: Sequence[str] | None = None,
+        control: str | None = None,
+        publish: str | None = None,
+    ) -> None:
+        self._network = network
+        self._name = name
+        self._clock = clock
+        self._wake_up: WakeUp[Incoming] = WakeUp()
+        self._closed = False
+        complaints = Complaints(logging.getLogger("afspm.transport"), clock)
+        self._publisher = None
+        self._published = Published(clock)
+        self._control = None
+        self._drains: dict[zmq.Socket[bytes], Drain] = {}
+        if publish is not None:
+            self._publisher = Publisher(network, publish, self._published)
+            self._drains[self._publisher.socket] = self._serve
+        if control is not None:
+            self._control = ControlClient(network, name, control, complaints)
+            self._listen(self._control)
+        for address in subscribe:
+            self._listen(Subscriber(network, name, address, envelopes, complaints))
+        self._poller = zmq.Poller()
+        for socket in self._drains:
+            self._poller.register(socket, zmq.POLLIN)
+        self._poller.register(self._wake_up.fileno(), zmq.POLLIN)
+
+    def _listen(self, source: ControlClient | Subscriber) -> None:
+        self._drains[source.socket] = source.receive
+        self._drains[source.monitor.socket] = source.receive
+
+    @property
+    def clock(self) -> Clock:
+        return self._clock
+
+    @property
+    def publish_address(self) -> str | None:
+        """Where others can subscribe to what we publish, with the port that was found."""
+        return self._publisher.address if self._publisher else None
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        if self._control is None:
+            raise ConfigError(
+                "this component was given no scheduler to ask", where=self._name, hint="control = address"
+            )
+        self._control.send(frames)
+
+    def poll(self, timeout_s: float | None) -> list[Incoming]:
+        # rounded up: woken up before the deadline, the caller would only come back
+        timeout_ms = None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
+        found: list[Incoming] = []
+        for ready, _ in self._poller.poll(timeout_ms):
+            # a descriptor is the wake-up's; everything else is a socket
+            found += self._wake_up.take() if isinstance(ready, int) else self._drains[ready]()
+        return found
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        if self._publisher is None:
+            raise ConfigError(
+                "this component was given no address to publish on", where=self._name, hint="publish = address"
+            )
+        self._publisher.publish(self._published.stamp(envelope, payload))
+
+    def wake_up(self, incoming: Incoming | None = None) -> None:
+        self._wake_up.post(incoming)
+
+    def close(self) -> None:
+        """The network is the port's own: it is closed too."""
+        if not self._closed:
+            self._closed = True
+            self._network.close()
+            self._wake_up.close()
+
+    def _serve(self) -> list[Incoming]:
+        if self._publisher is not None:
+            self._publisher.serve()
+        return []
