@@ -27,9 +27,9 @@ class Published:
         self._last: dict[str, Packet] = {}
         self._newest_ns = 0
 
-    def stamp(self, envelope: str, payload: bytes) -> Packet:
-        """A packet that is newer than all before it, now remembered."""
-        self._newest_ns = max(self._clock.now_ns(), self._newest_ns + 1)
+    def stamp(self, envelope: str, payload: bytes, time_ns: int | None = None) -> Packet:
+        """A packet that is newer than all before it, now remembered; `time_ns`: a time that was given out already."""
+        self._newest_ns = max(self._clock.now_ns() if time_ns is None else time_ns, self._newest_ns + 1)
         packet = Packet(envelope, payload, self._newest_ns)
         self._packets.append(packet)
         self._bytes += len(payload)

@@ -26,6 +26,10 @@ class WakeUp(Generic[T]):
         """The descriptor that becomes readable when `post` was called."""
         return self._reader.fileno()
 
+    def writer_fileno(self) -> int:
+        """The descriptor that `signal.set_wakeup_fd` may write to."""
+        return self._writer.fileno()
+
     def post(self, item: T | None = None) -> None:
         """Wake the poller up, with something to take or for nothing."""
         if item is not None:

@@ -89,10 +89,10 @@ class ZmqServerPort:
             self._asked = False
             self._socket.send_multipart(frames, zmq.NOBLOCK)
 
-    def publish(self, envelope: str, payload: bytes) -> None:
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
         if self._publisher is None:
             raise ConfigError("there is no address to publish on", hint="publish = address")
-        self._publisher.publish(self._published.stamp(envelope, payload))
+        self._publisher.publish(self._published.stamp(envelope, payload, time_ns))
 
     def kill(self) -> None:
         """Tell those who subscribed that the experiment has ended."""

@@ -1,0 +1,143 @@
+"""Heartbeats: a thread in every process that says it is alive and for how long it has been busy, and who listens."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import zmq
+
+from afspm.transport.frames import readable
+from afspm.transport.network import Network
+from afspm.transport.wakeup import WakeUp
+from afspm.wire import BEAT, CLOSING
+
+
+class Heartbeat(NamedTuple):
+    """What one beat said.
+
+    Attributes:
+        name: of the process.
+        closing: it ends on purpose; no more beats will come.
+        step_age_s: for how long the current step has been running; 0 when idle. None if the process did not say.
+        longest_step_s: how long a step may take; None if the process did not say.
+    """
+
+    name: str
+    closing: bool
+    step_age_s: float | None = None
+    longest_step_s: float | None = None
+
+
+class HeartbeatSender:
+    """Beats from a thread of its own, so that a process that is busy is not taken for dead.
+
+    The first beat goes out as soon as somebody listens.
+
+    Args:
+        address: the listener's.
+        period_s: real seconds between beats.
+        step_age_s: for how long the current step has been running; called in the thread.
+        longest_step_s: how long a step may take; called in the thread.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        address: str,
+        period_s: float,
+        step_age_s: Callable[[], float],
+        longest_step_s: Callable[[], float],
+    ) -> None:
+        self._period_ms = max(1, round(period_s * 1000.0))
+        self._step_age_s = step_age_s
+        self._longest_step_s = longest_step_s
+        self._stop: WakeUp[None] = WakeUp()
+        # XPUB, since it sees the listener subscribe: a beat sent before that would be lost
+        self._socket = network.socket(zmq.XPUB)
+        network.connect(self._socket, address)
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._stop.fileno(), zmq.POLLIN)
+        while True:
+            ready = dict(poller.poll(self._period_ms))
+            while readable(self._socket):
+                self._socket.recv(zmq.NOBLOCK)
+            if self._stop.fileno() in ready:
+                break
+            self._send(BEAT)
+        self._send(CLOSING)
+        self._socket.close()
+
+    def _send(self, beat: bytes) -> None:
+        ages = (self._step_age_s(), self._longest_step_s())
+        self._socket.send_multipart([beat, *(f"{age_s:.3f}".encode() for age_s in ages)])
+
+    def close(self) -> None:
+        """Say that we are closing on purpose, and stop. Before the network is closed; safe to repeat."""
+        if self._thread.is_alive():
+            self._stop.post()
+            self._thread.join()
+            self._stop.close()
+
+
+class HeartbeatListener:
+    """Listens to the heartbeats of several processes, each at an address of its own: nobody can beat for another.
+
+    Args:
+        wake_up: ends a `poll` under way; taking what was posted is left to its owner.
+    """
+
+    def __init__(self, wake_up: WakeUp[Any] | None = None, *, network: Network | None = None) -> None:
+        self._network = network or Network()
+        self._names: dict[zmq.Socket[bytes], str] = {}
+        self._poller = zmq.Poller()
+        if wake_up is not None:
+            self._poller.register(wake_up.fileno(), zmq.POLLIN)
+
+    def listen(self, name: str, address: str = "tcp://127.0.0.1:0") -> str:
+        """Begin to listen to the process `name`; returns the address to give to it."""
+        socket = self._network.socket(zmq.SUB)
+        socket.setsockopt(zmq.SUBSCRIBE, b"")
+        bound = self._network.bind(socket, address)
+        self._names[socket] = name
+        self._poller.register(socket, zmq.POLLIN)
+        return bound
+
+    def poll(self, timeout_s: float | None) -> list[Heartbeat]:
+        """The beats that have come; waits up to `timeout_s` real seconds (None: as long as it takes)."""
+        timeout_ms = None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
+        found = []
+        for ready, _ in self._poller.poll(timeout_ms):
+            name = None if isinstance(ready, int) else self._names.get(ready)
+            while name is not None and readable(ready):
+                beat = read_beat(name, ready.recv_multipart(zmq.NOBLOCK))
+                if beat is not None:
+                    found.append(beat)
+        return found
+
+    def close(self) -> None:
+        self._network.close()
+
+
+def read_beat(name: str, frames: list[bytes]) -> Heartbeat | None:
+    """A beat of ours or of version 1 (one frame); None if it is neither."""
+    if not frames or frames[0] not in (BEAT, CLOSING):
+        return None
+    ages = [_seconds(frame) for frame in frames[1:3]]
+    age_s, longest_s = [*ages, None, None][:2]
+    return Heartbeat(name, frames[0] == CLOSING, age_s, longest_s)
+
+
+def _seconds(text: bytes) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and value >= 0.0 else None
