@@ -255,10 +255,10 @@ def _only_asks(request: Request) -> bool:
 
 def run_translator(microscope: Microscope, context: Context, make: Callable[..., Translator] = Translator) -> int:
     """What the host runs: the sockets, the memory and the translator itself."""
-    from afspm.transport.zmq_server import ZmqServerPort
+    from afspm.transport.launching import open_server_port
 
     launch = context.launch
     memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None)
-    port = ZmqServerPort(launch, context.clock)
+    port = open_server_port(launch, context.clock)
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     return make(microscope, port, memory, Path(launch.run_dir or "."), context.log).run()
