@@ -93,14 +93,13 @@ class TranslatorReply:
 
 @dataclass(frozen=True, slots=True)
 class ComponentDied:
-    """Whoever watches the processes says that a component's has ended.
+    """Whoever watches the processes says: this component has ended and is not started again.
 
-    Attributes:
-        for_good: it will not be started again, so there is no use in waiting for it.
+    There is no use in waiting for it then. (Of one that is being restarted nothing needs to be said: its connection
+    is lost, and its grace period runs.)
     """
 
     name: str
-    for_good: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,345 @@
+"""Who is in control: the whole transition table as data, and the one function that applies it.
+
+`TABLE` is read from the top: the first row of an event whose condition holds applies, and each event's last row always
+does. Nothing but a row changes who is in control, the mode or the flagged problems.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum, auto
+from types import MappingProxyType
+from typing import Any
+
+from afspm.model import ControlMode, ControlResponse, ControlState
+
+_NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
+
+
+class Event(Enum):
+    """What control depends on: the requests, by kind, and two that time brings."""
+
+    REQUEST_CONTROL = "asks for control"
+    RELEASE_CONTROL = "gives control back"
+    FLAG = "flags a problem"
+    CLEAR = "removes a flag"
+    SET_MODE = "sets the mode"
+    END = "ends the experiment"
+    COMMAND = "commands the microscope"
+    READ = "asks the microscope for a value"
+    DEAD = "is dead"
+    IDLE = "has let its lease run out"
+
+
+class Do(Enum):
+    """What a row does."""
+
+    GRANT = auto()
+    """The asker gets control, to solve the problem it named (or none)."""
+    TAKE = auto()
+    """Whoever is in control no longer is."""
+    FLAG = auto()
+    UNFLAG = auto()
+    SET_MODE = auto()
+    END = auto()
+    FORWARD = auto()
+    """The translator answers."""
+
+
+class Cause(Enum):
+    """Why control was taken from its holder."""
+
+    RELEASED = "it gave control back"
+    PROBLEM = "a problem was flagged"
+    SOLVED = "the problem it solved was cleared"
+    MANUAL = "the mode is manual"
+    DEAD = "it is dead"
+    IDLE = "it did nothing for longer than its lease"
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """The state that control is in.
+
+    Attributes:
+        solving: the flagged problem that the holder is in control for; 0 for none.
+        problems: the flagged problems, each with who flagged it.
+        ended: the experiment is over.
+    """
+
+    mode: ControlMode = ControlMode.AUTOMATED
+    holder: str | None = None
+    solving: int = 0
+    problems: Mapping[int, str] = field(default_factory=lambda: _NO_PROBLEMS)
+    ended: bool = False
+
+    def published(self) -> ControlState:
+        """What all peers are told of it."""
+        return ControlState(self.mode, self.holder, tuple(sorted(self.problems)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain JSON."""
+        problems = {str(number): who for number, who in sorted(self.problems.items())}
+        return {
+            "mode": int(self.mode),
+            "holder": self.holder,
+            "solving": self.solving,
+            "problems": problems,
+            "ended": self.ended,
+        }
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Control:
+        problems = {int(number): str(who) for number, who in plain["problems"].items()}
+        return cls(
+            ControlMode(plain["mode"]),
+            plain["holder"],
+            int(plain["solving"]),
+            MappingProxyType(problems),
+            bool(plain["ended"]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Roles:
+    """Who may do what is not everybody's. None: everybody may; but nobody may `operate` unless named.
+
+    Attributes:
+        end: end the experiment.
+        mode: switch between MANUAL and AUTOMATED.
+        clear: remove flags of others (who flagged a problem, or is in control to solve it, may always).
+        operate: command the microscope in MANUAL mode.
+    """
+
+    end: Collection[str] | None = None
+    mode: Collection[str] | None = None
+    clear: Collection[str] | None = None
+    operate: Collection[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What the table takes from the experiment file: roles, and the problems there are."""
+
+    roles: Roles = Roles()
+    known_problems: Collection[int] = range(1, 256)
+
+
+@dataclass(slots=True)
+class Ask:
+    """An event of `who`; `number` is the problem or mode that it is about."""
+
+    event: Event
+    who: str
+    number: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """Something that may hold of a state and an ask, with words for it."""
+
+    text: str
+    holds: Callable[[Control, Ask, Rules], bool]
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        response: of a request; None where the translator answers, or nobody asked.
+        why: why it is so. Of a refusal it is the reason given, with {who}, {holder}, {number} and {problems} filled in.
+        cause: why control is taken, where it is.
+    """
+
+    event: Event
+    when: Condition
+    response: ControlResponse | None
+    do: tuple[Do, ...]
+    why: str
+    cause: Cause | None = None
+
+
+def _may(role: Collection[str] | None, who: str) -> bool:
+    return role is None or who in role
+
+
+def _may_clear(control: Control, ask: Ask, rules: Rules) -> bool:
+    flagged_by = control.problems.get(ask.number, ask.who)
+    solves = control.holder == ask.who and control.solving == ask.number
+    return flagged_by == ask.who or solves or _may(rules.roles.clear, ask.who)
+
+
+OTHERWISE = Condition("otherwise", lambda c, a, r: True)
+IS_MANUAL = Condition("the mode is manual", lambda c, a, r: c.mode is ControlMode.MANUAL)
+IS_OPERATOR = Condition(
+    "the mode is manual and it has the role `operate`",
+    lambda c, a, r: c.mode is ControlMode.MANUAL and a.who in r.roles.operate,
+)
+ASKER_HOLDS = Condition("it is in control", lambda c, a, r: c.holder == a.who)
+OTHER_HOLDS = Condition("another is in control", lambda c, a, r: c.holder not in (None, a.who))
+SOLVES_NONE = Condition("problems are flagged and it names none", lambda c, a, r: not a.number and bool(c.problems))
+SOLVES_UNFLAGGED = Condition(
+    "it names a problem that is not flagged", lambda c, a, r: bool(a.number) and a.number not in c.problems
+)
+UNKNOWN_PROBLEM = Condition("the experiment knows no such problem", lambda c, a, r: a.number not in r.known_problems)
+IS_FLAGGED = Condition("it is flagged already", lambda c, a, r: a.number in c.problems)
+NOT_FLAGGED = Condition("it is not flagged", lambda c, a, r: a.number not in c.problems)
+HOLDER_SOLVES_NOTHING = Condition(
+    "one is in control that solves no problem", lambda c, a, r: c.holder is not None and not c.solving
+)
+HOLDER_SOLVES_IT = Condition(
+    "one is in control to solve it", lambda c, a, r: c.holder is not None and c.solving == a.number
+)
+MAY_NOT_CLEAR = Condition(
+    "another flagged it, and it has not the role `clear`", lambda c, a, r: not _may_clear(c, a, r)
+)
+MAY_NOT_SET_MODE = Condition("it has not the role `mode`", lambda c, a, r: not _may(r.roles.mode, a.who))
+MAY_NOT_END = Condition("it has not the role `end`", lambda c, a, r: not _may(r.roles.end, a.who))
+NO_SUCH_MODE = Condition(
+    "neither manual nor automated", lambda c, a, r: a.number not in (ControlMode.MANUAL, ControlMode.AUTOMATED)
+)
+SAME_MODE = Condition("that is the mode", lambda c, a, r: a.number == c.mode)
+TO_MANUAL = Condition("to manual", lambda c, a, r: a.number == ControlMode.MANUAL)
+
+_E, _R = Event, ControlResponse
+
+TABLE: tuple[Row, ...] = (
+    Row(
+        _E.REQUEST_CONTROL,
+        IS_MANUAL,
+        _R.WRONG_CONTROL_MODE,
+        (),
+        "the mode is manual: the person at the microscope is in control",
+    ),
+    Row(
+        _E.REQUEST_CONTROL,
+        SOLVES_UNFLAGGED,
+        _R.WRONG_EXP_PROBLEM,
+        (),
+        "problem {number} is not flagged; flagged: {problems}",
+    ),
+    Row(
+        _E.REQUEST_CONTROL,
+        SOLVES_NONE,
+        _R.WRONG_EXP_PROBLEM,
+        (),
+        "flagged: {problems}; until that is cleared, control is only for who solves it",
+    ),
+    Row(
+        _E.REQUEST_CONTROL, OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, (), "{holder} is in control until it gives that back"
+    ),
+    Row(
+        _E.REQUEST_CONTROL,
+        ASKER_HOLDS,
+        _R.SUCCESS,
+        (Do.GRANT,),
+        "asked for again: it stays in control, for the problem it now names",
+    ),
+    Row(_E.REQUEST_CONTROL, OTHERWISE, _R.SUCCESS, (Do.GRANT,), "nobody is in control: the first to ask gets it"),
+    Row(_E.RELEASE_CONTROL, ASKER_HOLDS, _R.SUCCESS, (Do.TAKE,), "its own decision", Cause.RELEASED),
+    Row(_E.RELEASE_CONTROL, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is; nothing changed"),
+    Row(_E.FLAG, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem {number}"),
+    Row(_E.FLAG, IS_FLAGGED, _R.SUCCESS, (), "what was asked for is so: two may notice the same"),
+    Row(
+        _E.FLAG,
+        HOLDER_SOLVES_NOTHING,
+        _R.SUCCESS,
+        (Do.FLAG, Do.TAKE),
+        "from now on only who solves a flagged problem may have control",
+        Cause.PROBLEM,
+    ),
+    Row(_E.FLAG, OTHERWISE, _R.SUCCESS, (Do.FLAG,), "a solver stays in control while its own problem is flagged"),
+    Row(_E.CLEAR, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem {number}"),
+    Row(_E.CLEAR, NOT_FLAGGED, _R.SUCCESS, (), "what was asked for is so: classifier and corrector may both clear"),
+    Row(
+        _E.CLEAR,
+        MAY_NOT_CLEAR,
+        _R.FAILURE,
+        (),
+        "{who} has not flagged problem {number} and has not the role 'clear' ([control] roles)",
+    ),
+    Row(
+        _E.CLEAR,
+        HOLDER_SOLVES_IT,
+        _R.SUCCESS,
+        (Do.UNFLAG, Do.TAKE),
+        "solved: its solver has no more reason to be in control",
+        Cause.SOLVED,
+    ),
+    Row(_E.CLEAR, OTHERWISE, _R.SUCCESS, (Do.UNFLAG,), "who solves another problem stays in control"),
+    Row(_E.SET_MODE, MAY_NOT_SET_MODE, _R.FAILURE, (), "{who} has not the role 'mode' ([control] roles)"),
+    Row(
+        _E.SET_MODE, NO_SUCH_MODE, _R.WRONG_CONTROL_MODE, (), "there is no control mode {number}: 1 manual, 2 automated"
+    ),
+    Row(_E.SET_MODE, SAME_MODE, _R.SUCCESS, (), "what was asked for is so"),
+    Row(
+        _E.SET_MODE,
+        TO_MANUAL,
+        _R.SUCCESS,
+        (Do.SET_MODE, Do.TAKE),
+        "a person takes over: whoever is in control is disengaged",
+        Cause.MANUAL,
+    ),
+    Row(_E.SET_MODE, OTHERWISE, _R.SUCCESS, (Do.SET_MODE,), "components ask for control again, and go on"),
+    Row(_E.END, MAY_NOT_END, _R.FAILURE, (), "{who} has not the role 'end' ([control] roles)"),
+    Row(_E.END, OTHERWISE, _R.SUCCESS, (Do.END,), "all receivers close"),
+    Row(_E.COMMAND, ASKER_HOLDS, None, (Do.FORWARD,), "only who is in control commands the microscope"),
+    Row(_E.COMMAND, IS_OPERATOR, None, (Do.FORWARD,), "in manual mode a person may, by a component"),
+    Row(_E.COMMAND, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is"),
+    Row(_E.READ, OTHERWISE, None, (Do.FORWARD,), "it disturbs nothing, so anybody may, at any time"),
+    Row(_E.DEAD, ASKER_HOLDS, None, (Do.TAKE,), "control never stays with the dead", Cause.DEAD),
+    Row(_E.DEAD, OTHERWISE, None, (), "it was not in control"),
+    Row(_E.IDLE, ASKER_HOLDS, None, (Do.TAKE,), "a greedy component can't block the night", Cause.IDLE),
+    Row(_E.IDLE, OTHERWISE, None, (), "it was not in control"),
+)
+
+_ROWS = {event: tuple(row for row in TABLE if row.event is event) for event in Event}
+
+
+def row_for(control: Control, ask: Ask, rules: Rules) -> Row:
+    """The row of the table that applies."""
+    for row in _ROWS[ask.event]:
+        if row.when.holds(control, ask, rules):
+            return row
+    raise AssertionError(f"the table has no last row for {ask.event}")
+
+
+def apply(row: Row, control: Control, ask: Ask) -> Control:
+    """The state after a row."""
+    for do in row.do:
+        control = _APPLY[do](control, ask)
+    return control
+
+
+def reason(row: Row, control: Control, ask: Ask) -> str:
+    """The reason given with a refusal; empty for a success."""
+    if row.response in (None, ControlResponse.SUCCESS):
+        return ""
+    return row.why.format(
+        who=ask.who,
+        holder=control.holder or "nobody",
+        number=ask.number,
+        problems=", ".join(map(str, sorted(control.problems))) or "none",
+    )
+
+
+def _flag(control: Control, ask: Ask) -> Control:
+    return replace(control, problems=MappingProxyType({**control.problems, ask.number: ask.who}))
+
+
+def _unflag(control: Control, ask: Ask) -> Control:
+    rest = {number: who for number, who in control.problems.items() if number != ask.number}
+    return replace(control, problems=MappingProxyType(rest))
+
+
+_APPLY: dict[Do, Callable[[Control, Ask], Control]] = {
+    Do.GRANT: lambda control, ask: replace(control, holder=ask.who, solving=ask.number),
+    Do.TAKE: lambda control, ask: replace(control, holder=None, solving=0),
+    Do.FLAG: _flag,
+    Do.UNFLAG: _unflag,
+    Do.SET_MODE: lambda control, ask: replace(control, mode=ControlMode(ask.number)),
+    Do.END: lambda control, ask: replace(control, ended=True),
+    Do.FORWARD: lambda control, ask: control,
+}

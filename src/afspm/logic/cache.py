@@ -1,0 +1,157 @@
+"""What was published lately, for those who come late: ordered, bounded, without doubles."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from afspm.logic.envelopes import Envelopes
+from afspm.model import Packet, PacketHeader
+
+TIME_STEP_NS = 1_000
+"""The least time between two packets: peers that reckon in microseconds must see them in order."""
+
+_OVERHEAD_BYTES = 300  # of a kept packet beside its payload, so that a flood of empty ones is bounded too
+_TIMES_REMEMBERED = 4096
+_FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than that is not believed
+
+
+@dataclass(slots=True)
+class Kept:
+    """A packet in the cache; `source_ns` is the time that the translator gave it."""
+
+    packet: Packet
+    source_ns: int | None
+    size: int
+
+
+class Cache:
+    """The latest packets of each envelope, oldest first over all of them.
+
+    Args:
+        envelopes: how packets are named and how many of each name are kept.
+        max_bytes: of all together. Beyond it, older packets go first while their envelope has a newer one.
+    """
+
+    def __init__(self, envelopes: Envelopes | None = None, max_bytes: int = 512 * 2**20) -> None:
+        self._envelopes = envelopes or Envelopes()
+        self._max_bytes = max_bytes
+        self._kept: dict[int, Kept] = {}  # by time, which increases: insertion order is the order in time
+        self._times: dict[str, deque[int]] = {}
+        self._several = 0  # envelopes with more than one packet
+        self._bytes = 0
+        self._last_ns = 0
+        self._sources: OrderedDict[int, None] = OrderedDict()
+        self._newest_source_ns = -1
+
+    @property
+    def last_ns(self) -> int:
+        """The time of the newest packet."""
+        return self._last_ns
+
+    @property
+    def newest_source_ns(self) -> int:
+        """The translator's time of the packet that it published last, as far as we have it; -1: none yet."""
+        return self._newest_source_ns
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return self._bytes
+
+    def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, bool] | None:
+        """A packet of the translator's, as it is to be published, and whether it is kept.
+
+        Its time is the translator's, or later where that would not be after what was published before (a clock that
+        was set back or is far ahead, a peer that says no time). None: we have had it.
+        """
+        source_ns = packet.time_ns
+        if source_ns is not None:
+            if source_ns in self._sources:
+                return None
+            self._saw(source_ns)
+        envelope, history = self._envelopes.of(header)
+        said = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
+        out = Packet(envelope, packet.payload, self._next_ns(source_ns if said and source_ns is not None else now_ns))
+        return out, self._keep(out, source_ns, history)
+
+    def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, bool]:
+        """A packet of the scheduler's own, kept under its envelope."""
+        out = Packet(envelope, payload, self._next_ns(now_ns))
+        _, history = self._envelopes.of(PacketHeader(envelope))
+        return out, self._keep(out, None, history)
+
+    def restore(self, packets: Iterable[tuple[Packet, int | None]], history_of: dict[str, int] | None = None) -> None:
+        """Take up what was kept before a restart, oldest first.
+
+        How many are kept of an envelope is known again with its next packet; until then all of them are.
+        """
+        for packet, source_ns in packets:
+            if packet.time_ns is None or packet.time_ns <= self._last_ns:
+                continue
+            self._last_ns = packet.time_ns
+            if source_ns is not None:
+                self._saw(source_ns)
+            self._keep(packet, source_ns, (history_of or {}).get(packet.envelope, _TIMES_REMEMBERED))
+
+    def not_before(self, time_ns: int) -> None:
+        """What is published from here on is after this time."""
+        self._last_ns = max(self._last_ns, time_ns)
+
+    def replay(self, prefixes: Iterable[str], since_ns: int) -> tuple[Packet, ...]:
+        """What is kept under the prefixes and newer than `since_ns`, oldest first over all envelopes."""
+        starts = tuple(prefixes)
+        return tuple(
+            kept.packet
+            for time_ns, kept in self._kept.items()
+            if time_ns > since_ns and kept.packet.envelope.startswith(starts)
+        )
+
+    def __iter__(self) -> Iterator[tuple[Packet, int | None]]:
+        return iter([(kept.packet, kept.source_ns) for kept in self._kept.values()])
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def _next_ns(self, time_ns: int) -> int:
+        self._last_ns = time_ns if time_ns >= self._last_ns + TIME_STEP_NS else self._last_ns + TIME_STEP_NS
+        return self._last_ns
+
+    def _saw(self, source_ns: int) -> None:
+        self._newest_source_ns = source_ns
+        self._sources[source_ns] = None
+        if len(self._sources) > _TIMES_REMEMBERED:
+            self._sources.popitem(last=False)
+
+    def _keep(self, packet: Packet, source_ns: int | None, history: int) -> bool:
+        payload = packet.payload
+        size = (payload.nbytes if isinstance(payload, memoryview) else len(payload)) + _OVERHEAD_BYTES
+        if size > self._max_bytes:
+            return False
+        assert packet.time_ns is not None
+        self._kept[packet.time_ns] = Kept(packet, source_ns, size)
+        self._bytes += size
+        times = self._times.setdefault(packet.envelope, deque())
+        times.append(packet.time_ns)
+        self._several += len(times) == 2
+        while len(times) > history:
+            self._drop(times[0])
+        while self._bytes > self._max_bytes:
+            self._drop(self._least_needed())
+        return True
+
+    def _least_needed(self) -> int:
+        """The oldest packet that its envelope has a newer one of; else the oldest."""
+        if self._several:
+            return next(t for t, kept in self._kept.items() if len(self._times[kept.packet.envelope]) > 1)
+        return next(iter(self._kept))
+
+    def _drop(self, time_ns: int) -> None:
+        kept = self._kept.pop(time_ns)
+        self._bytes -= kept.size
+        times = self._times[kept.packet.envelope]
+        times.popleft()
+        self._several -= len(times) == 1
+        if not times:
+            del self._times[kept.packet.envelope]

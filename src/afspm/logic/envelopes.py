@@ -1,0 +1,131 @@
+"""Under which envelope the scheduler publishes and caches a packet, and how many of them it keeps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from afspm.errors import ConfigError
+from afspm.model import PacketHeader
+
+EnvelopeMapping = Callable[[PacketHeader], str]
+
+DEFAULT_HISTORY = {"Scan2d": 5, "Spec1d": 10, "ScopeStateMsg": 10}
+"""How many packets are kept of each envelope, by message; of all others one."""
+
+
+def default_envelope(header: PacketHeader) -> str:
+    """The wire format's: "Scan2d_2000.0_Height", "Spec1d_IV", or else the name of the message."""
+    if header.message == "Scan2d" and header.size_m is not None:
+        return f"Scan2d_{size_text(header.size_m[0])}_{header.channel or ''}"
+    if header.message == "Spec1d" and header.kind:
+        return f"Spec1d_{header.kind}"
+    return header.message
+
+
+def size_text(size_m: float) -> str:
+    """A length in nm, rounded, as a decimal number; below 1 nm with its digits, since all of them would be 0.0 or 1.0.
+
+    >>> size_text(2e-6), size_text(2.5e-10)
+    ('2000.0', '0.25')
+    """
+    size_nm = size_m * 1e9
+    if not math.isfinite(size_nm):
+        return str(size_nm)
+    if abs(size_nm) < 1.0:
+        return str(float(f"{size_nm:.6g}"))
+    return str(float(round(size_nm)))
+
+
+@dataclass(frozen=True)
+class CacheRule:
+    """One entry of the experiment file's [cache]: the first rule that fits a packet says how it is kept.
+
+    Attributes:
+        message, channel, kind: what it must be; None: any.
+        above_m, up_to_m: its region's width: above_m < width <= up_to_m.
+        envelope: text in which {message}, {channel}, {kind} and {size} (nm) are filled in; None for the default one.
+        history: how many are kept; None for the default number.
+    """
+
+    message: str | None = None
+    channel: str | None = None
+    kind: str | None = None
+    above_m: float | None = None
+    up_to_m: float | None = None
+    envelope: str | None = None
+    history: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.history is not None and self.history < 1:
+            raise ConfigError(f"a history of {self.history} keeps nothing", where="[cache]", hint="1 or more")
+        if self.envelope is not None:
+            self.name(PacketHeader("", "", (0.0, 0.0), ""))
+        if self.above_m is not None and self.up_to_m is not None and self.above_m >= self.up_to_m:
+            raise ConfigError(f"no width is above {self.above_m:g} m and up to {self.up_to_m:g} m", where="[cache]")
+
+    def fits(self, header: PacketHeader) -> bool:
+        wanted = ((self.message, header.message), (self.channel, header.channel), (self.kind, header.kind))
+        if any(want is not None and want != have for want, have in wanted):
+            return False
+        if self.above_m is None and self.up_to_m is None:
+            return True
+        if header.size_m is None:
+            return False
+        return (self.above_m is None or header.size_m[0] > self.above_m) and (
+            self.up_to_m is None or header.size_m[0] <= self.up_to_m
+        )
+
+    def name(self, header: PacketHeader) -> str:
+        """The envelope of a packet that fits."""
+        if self.envelope is None:
+            return default_envelope(header)
+        size = "" if header.size_m is None else size_text(header.size_m[0])
+        try:
+            return self.envelope.format(
+                message=header.message, channel=header.channel or "", kind=header.kind or "", size=size
+            )
+        except (KeyError, IndexError, ValueError) as error:
+            raise ConfigError(
+                f"{self.envelope!r} can't be filled in: {error}",
+                where="[cache]",
+                hint="use {message}, {channel}, {kind} and {size}",
+            ) from error
+
+
+class Envelopes:
+    """What the experiment file says of envelopes.
+
+    Args:
+        rules: tried in their order; then the defaults.
+        mapping: a function of the user's own that names the envelope instead of rules and defaults.
+        history: how many to keep, by message, over the defaults.
+    """
+
+    def __init__(
+        self,
+        rules: Sequence[CacheRule] = (),
+        mapping: EnvelopeMapping | None = None,
+        history: dict[str, int] | None = None,
+    ) -> None:
+        self._rules = tuple(rules)
+        self._mapping = mapping
+        self._history = {**DEFAULT_HISTORY, **(history or {})}
+
+    def of(self, header: PacketHeader) -> tuple[str, int]:
+        """The envelope of a packet, and how many of that envelope are kept."""
+        rule = next((rule for rule in self._rules if rule.fits(header)), None)
+        history = self._history.get(header.message, 1)
+        if rule is not None and rule.history is not None:
+            history = rule.history
+        if self._mapping is not None:
+            envelope = self._mapping(header)
+            if not isinstance(envelope, str) or not envelope or "\0" in envelope or envelope == "KILL":
+                raise ConfigError(
+                    f"the mapping of envelopes gave {envelope!r} for {header.message}",
+                    where="[cache]",
+                    hint="it must return a text, not empty, without NUL",
+                )
+            return envelope, history
+        return (default_envelope(header) if rule is None else rule.name(header)), history

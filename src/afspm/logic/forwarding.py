@@ -1,0 +1,197 @@
+"""Requests on their way to the translator: one at a time, each with its deadline, and every one is answered.
+
+A translator of version 1 serves one request after the other and says nothing while it does. So one is in flight; the
+others wait here, where they can still be called back, and whoever waited too long is told that nothing was done.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from afspm.logic.events import Forward
+from afspm.model import ControlResponse, Request, Response
+
+NOT_SENT = "not sent: "
+"""Begins the reason of a NO_RESPONSE to a request that was certainly not carried out: it may be asked again."""
+
+UNKNOWN = "outcome unknown: "
+"""Begins the reason of a NO_RESPONSE to a request that may have been carried out."""
+
+
+@dataclass(slots=True, eq=False)
+class Job:
+    """A request for the translator.
+
+    Attributes:
+        client: who asked; empty for the scheduler's own.
+        deadline_s: when (real) it must be answered at the latest.
+        command: whether it is a command, which only who is in control may give.
+        sent_s: when it was sent; None while it waits.
+        answered: the client has been told that there was no response in time.
+        link: which connection to the translator it was sent over.
+    """
+
+    number: int
+    client: str
+    request: Request
+    deadline_s: float
+    command: bool
+    sent_s: float | None = None
+    answered: bool = False
+    link: int = 0
+
+
+class End(Enum):
+    """How a job ended."""
+
+    ANSWERED = auto()
+    NOT_SENT = auto()
+    UNKNOWN = auto()
+    LATE = auto()
+    """The true answer, after the client was told that none had come."""
+
+
+@dataclass(slots=True)
+class Settled:
+    job: Job
+    end: End
+    response: Response
+
+
+class Forwarder:
+    """The one line to the translator.
+
+    Every call returns what it settled; requests to be sent are appended to `outbox`, which the caller empties.
+
+    Args:
+        timeout_s: how long (real) a client waits for an answer.
+        patience_s: how much longer the line is kept for an answer that is overdue, before the next is sent.
+        longest_queue: how many may wait.
+    """
+
+    def __init__(self, timeout_s: float = 5.0, patience_s: float = 5.0, longest_queue: int = 64) -> None:
+        self.timeout_s = timeout_s
+        self.patience_s = patience_s
+        self.longest_queue = longest_queue
+        self.outbox: list[Forward] = []
+        self.up = False
+        self.link = 0
+        self.flight: Job | None = None
+        self.number = 0
+        self._own: deque[Job] = deque()
+        self._queue: deque[Job] = deque()
+        self._overdue: OrderedDict[int, Job] = OrderedDict()
+
+    def connected(self) -> list[Settled]:
+        """The translator can be asked, for the first time or again. (A reconnection is a loss before it.)"""
+        settled = self.lost() if self.up else []
+        self.up = True
+        self.link += 1
+        return settled
+
+    def lost(self) -> list[Settled]:
+        """The translator is gone: all are answered at once."""
+        self.up = False
+        settled = []
+        if self.flight is not None:
+            if not self.flight.answered:
+                settled.append(_unknown(self.flight, "the connection to the translator was lost before it answered"))
+            self.flight = None
+        waiting = [*self._own, *self._queue]
+        self._own.clear()
+        self._queue.clear()
+        return settled + [_not_sent(job, "the translator is not connected") for job in waiting]
+
+    def ask(self, client: str, request: Request, now_s: float, *, command: bool) -> Settled | None:
+        """Send a client's request, now or when its turn comes. Returns what it was refused with, if it was."""
+        self.number += 1
+        job = Job(self.number, client, request, now_s + self.timeout_s, command)
+        if not self.up:
+            return _not_sent(job, "the translator is not connected")
+        if self.flight is None:
+            self._send(job, now_s)
+        elif len(self._queue) >= self.longest_queue:
+            return _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
+        else:
+            self._queue.append(job)
+        return None
+
+    def ask_own(self, request: Request, now_s: float) -> Job | None:
+        """Send a request of the scheduler's own before all that wait. None: the translator is not connected."""
+        if not self.up:
+            return None
+        self.number += 1
+        job = Job(self.number, "", request, now_s + self.timeout_s, command=True)
+        if self.flight is None:
+            self._send(job, now_s)
+        else:
+            self._own.append(job)
+        return job
+
+    def answered(self, number: int, response: Response, now_s: float) -> Settled | None:
+        """The translator answered. None: nobody knows what (it was settled long ago, or never asked)."""
+        job = self.flight
+        if job is not None and job.number == number:
+            self.flight = None
+            self._next(now_s)
+            return Settled(job, End.LATE if job.answered else End.ANSWERED, response)
+        late = self._overdue.pop(number, None)
+        return None if late is None else Settled(late, End.LATE, response)
+
+    def expire(self, now_s: float) -> list[Settled]:
+        """Answer whoever has waited too long."""
+        settled = []
+        job = self.flight
+        if job is not None and not job.answered and now_s >= job.deadline_s:
+            job.answered = True
+            settled.append(_unknown(job, f"the translator did not answer within {self.timeout_s:g} s"))
+        for queue in (self._own, self._queue):
+            while queue and now_s >= queue[0].deadline_s:
+                settled.append(_not_sent(queue.popleft(), f"the translator was busy for {self.timeout_s:g} s"))
+        if job is not None and now_s >= job.deadline_s + self.patience_s:
+            self._overdue[job.number] = job
+            if len(self._overdue) > self.longest_queue:
+                self._overdue.popitem(last=False)
+            self.flight = None
+            self._next(now_s)
+        return settled
+
+    def call_back(self, which: Callable[[Job], bool]) -> list[Job]:
+        """Take back what waits and has not been sent; the caller answers it."""
+        called = [job for job in self._queue if which(job)]
+        for job in called:
+            self._queue.remove(job)
+        return called
+
+    def deadline_s(self) -> float | None:
+        """When `expire` has something to do."""
+        times = [queue[0].deadline_s for queue in (self._own, self._queue) if queue]
+        if self.flight is not None:
+            times.append(self.flight.deadline_s + (self.patience_s if self.flight.answered else 0.0))
+        return min(times, default=None)
+
+    def _send(self, job: Job, now_s: float) -> None:
+        job.sent_s, job.link = now_s, self.link
+        self.flight = job
+        self.outbox.append(Forward(job.number, job.request))
+
+    def _next(self, now_s: float) -> None:
+        if self._own:
+            self._send(self._own.popleft(), now_s)
+        elif self._queue:
+            self._send(self._queue.popleft(), now_s)
+
+
+def _not_sent(job: Job, why: str) -> Settled:
+    return Settled(job, End.NOT_SENT, _no_response(job, NOT_SENT + why))
+
+
+def _unknown(job: Job, why: str) -> Settled:
+    return Settled(job, End.UNKNOWN, _no_response(job, UNKNOWN + why))
+
+
+def _no_response(job: Job, reason: str) -> Response:
+    return Response(int(ControlResponse.NO_RESPONSE), b"", reason, job.request.id)

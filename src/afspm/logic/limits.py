@@ -1,0 +1,358 @@
+"""Limits of an experiment: what is refused before it reaches the microscope, and why.
+
+Nothing is clamped. A refusal names the parameter, the value, the limit and where the limit was set.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+from afspm.errors import AfspmError, InvalidValue
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Parameter,
+    ProbePosition,
+    Region,
+    RegionChange,
+    Request,
+    Response,
+    ScanParameters,
+    names,
+)
+from afspm.model.geometry import XY
+from afspm.model.names import BASE_PARAMETERS
+from afspm.units import convert
+
+_REACH = 1e-9  # relative: what lies on the border, to the precision of the arithmetic, is inside
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What is allowed of one parameter or action. None: no such limit.
+
+    Attributes:
+        low, high: the range, in `unit`, both allowed.
+        step: how far one request may change it at most, in `unit`.
+        rate_per_s: how fast it may change at most, in `unit` per second of experiment time since it last changed.
+        interval_s: how much experiment time lies between two requests at least. The only one an action can have,
+            beside `only`.
+        only: the components that may set it.
+        unit: of the values above; SI for the base parameters.
+        source: where it was set, e.g. "experiment.toml:42".
+    """
+
+    low: float | None = None
+    high: float | None = None
+    step: float | None = None
+    rate_per_s: float | None = None
+    interval_s: float | None = None
+    only: Collection[str] | None = None
+    unit: str | None = None
+    source: str = "[limits]"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """All limits of an experiment.
+
+    Attributes:
+        parameters: by name of the parameter.
+        actions: by name of the action.
+        region: what scans (with their corners) and the probe must stay in, in m.
+        region_source: where that was set.
+        most_pixels: of a scan.
+    """
+
+    parameters: Mapping[str, Limit] = field(default_factory=dict)
+    actions: Mapping[str, Limit] = field(default_factory=dict)
+    region: Region | None = None
+    region_source: str = "[limits] region"
+    most_pixels: int = 8192 * 8192
+
+
+@dataclass(slots=True)
+class _Known:
+    value: float
+    since_ns: int
+
+
+class _Breach(Exception):
+    """A limit is broken. Never leaves this module."""
+
+    def __init__(self, code: ControlResponse, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason
+
+
+class Guard:
+    """Checks requests against the limits, and keeps in mind what steps and rates are measured from."""
+
+    def __init__(self, limits: Limits | None = None) -> None:
+        self._limits = limits or Limits()
+        self._known: dict[str, _Known] = {}
+        self._last_ns: dict[str, int] = {}
+        self._scan = ScanParameters()
+        self._probe: XY | None = None
+
+    def check(self, who: str, request: Request, now_ns: int) -> Response | None:
+        """The refusal of a request that breaks a limit or has no meaning; None: it may be sent."""
+        try:
+            self._check(who, request, now_ns)
+        except _Breach as breach:
+            return Response(int(breach.code), b"", breach.reason, request.id)
+        return None
+
+    def carried_out(self, request: Request, now_ns: int, told: Parameter | None = None) -> None:
+        """A request that was checked succeeded; `told` is the parameter as the translator answered it."""
+        subject = told if told is not None and told.value is not None else request.subject
+        if isinstance(subject, str):
+            self._last_ns[subject] = now_ns
+            return
+        sets = not isinstance(request.subject, Parameter) or request.subject.value is not None
+        for name, value in self._values(subject):
+            self._learn(name, value, now_ns)
+            if sets:
+                self._last_ns[name] = now_ns
+        self.published(subject, now_ns)
+
+    def published(self, subject: object, now_ns: int) -> None:
+        """The translator said what is in force: a ScanParameters, Feedback or ProbePosition."""
+        if isinstance(subject, ScanParameters):
+            with suppress(InvalidValue):  # a part of a region that is not known yet
+                self._scan = subject.onto(self._scan)
+        elif isinstance(subject, ProbePosition):
+            self._probe = subject.xy_m
+        if isinstance(subject, ScanParameters | Feedback | ProbePosition):
+            for name, value in self._values(subject):
+                self._learn(name, value, now_ns)
+
+    # --- checks ---
+
+    def _check(self, who: str, request: Request, now_ns: int) -> None:
+        subject = request.subject
+        if request.kind == ControlRequest.ACTION:
+            self._check_use(who, str(subject), self._limits.actions.get(str(subject)), now_ns, "action")
+            return
+        if isinstance(subject, Parameter) and subject.value is None:
+            return
+        if isinstance(subject, ScanParameters):
+            self._check_scan(subject)
+        elif isinstance(subject, ProbePosition):
+            self._check_point(subject.xy_m)
+        elif isinstance(subject, Parameter):
+            self._check_parameter_geometry(subject)
+        for name, value in self._values(subject):
+            limit = self._limits.parameters.get(name)
+            self._check_use(who, name, limit, now_ns, "parameter")
+            if limit is not None:
+                self._check_value(name, value, limit, now_ns)
+
+    def _check_use(self, who: str, name: str, limit: Limit | None, now_ns: int, what: str) -> None:
+        if limit is None:
+            return
+        error = ControlResponse.ACTION_ERROR if what == "action" else ControlResponse.PARAM_ERROR
+        if limit.only is not None and who not in limit.only:
+            allowed = ", ".join(sorted(limit.only)) or "nobody"
+            raise _Breach(error, f"{who} may not use the {what} {name}, only {allowed} ({limit.source})")
+        last_ns = self._last_ns.get(name)
+        if limit.interval_s is not None and last_ns is not None and now_ns - last_ns < limit.interval_s * 1e9:
+            ago_s = (now_ns - last_ns) / 1e9
+            raise _Breach(
+                error, f"{name} was used {ago_s:.3g} s ago, and may be every {limit.interval_s:g} s ({limit.source})"
+            )
+
+    def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
+        unit = f" {limit.unit}" if limit.unit else f" {BASE_PARAMETERS.get(name) or ''}".rstrip()
+        said = f"{name} = {value:g}{unit}"
+        if limit.low is not None and value < limit.low - abs(limit.low) * _REACH:
+            raise _param_error(f"{said} is below the lowest allowed, {limit.low:g}{unit} ({limit.source})")
+        if limit.high is not None and value > limit.high + abs(limit.high) * _REACH:
+            raise _param_error(f"{said} is above the highest allowed, {limit.high:g}{unit} ({limit.source})")
+        if limit.step is None and limit.rate_per_s is None:
+            return
+        known = self._known.get(name)
+        if known is None:
+            raise _param_error(
+                f"{said}: its value now is not known, so the step to it can't be checked; get it first ({limit.source})"
+            )
+        change = abs(value - known.value)
+        if limit.step is not None and change > limit.step * (1 + _REACH):
+            raise _param_error(
+                f"{said} is a step of {change:g}{unit}, the largest allowed is {limit.step:g}{unit} ({limit.source})"
+            )
+        allowed = None if limit.rate_per_s is None else limit.rate_per_s * (now_ns - known.since_ns) / 1e9
+        if allowed is not None and change > allowed * (1 + _REACH):
+            raise _param_error(
+                f"{said} changes by {change:g}{unit}, now allowed is {allowed:.3g}{unit}, at {limit.rate_per_s:g}{unit}"
+                f" per second ({limit.source})"
+            )
+
+    def _check_scan(self, wanted: ScanParameters) -> None:
+        """What is checked is the scan as it would be afterwards: a request may give only a part of it."""
+        shape, region = wanted.shape or self._scan.shape, wanted.region
+        if wanted.shape is not None and shape is not None and shape[0] * shape[1] > self._limits.most_pixels:
+            raise _param_error(f"a scan of {shape[1]} x {shape[0]} pixels; the most are {self._limits.most_pixels}")
+        if isinstance(region, RegionChange):
+            region = self._region_after(region)
+        allowed = self._limits.region
+        if region is None or allowed is None:
+            return
+        for x, y in region.corners_m():
+            if not _inside(allowed, (float(x), float(y))):
+                raise _param_error(
+                    f"the scan's corner ({x:.6g}, {y:.6g}) m lies outside the region allowed"
+                    f" ({self._limits.region_source})"
+                )
+
+    def _region_after(self, change: RegionChange) -> Region | None:
+        given = (change.left_m, change.low_m, change.width_m, change.height_m, change.angle_rad)
+        for value in given:
+            if value is not None and not math.isfinite(value):
+                raise _param_error(f"a scan region can't have a {value} in it")
+        for size in (change.width_m, change.height_m):
+            if size is not None and size <= 0:
+                raise _param_error(f"a scan region of size {size:g} m is empty")
+        if isinstance(self._scan.region, Region):
+            return change.onto(self._scan.region)
+        if self._limits.region is not None:
+            raise _param_error("where the scan is now is not known, so a part of its place can't be checked")
+        return None
+
+    def _check_point(self, xy_m: XY) -> None:
+        if not all(map(math.isfinite, xy_m)):
+            raise _param_error(f"the probe can't go to {xy_m}: not a place")
+        allowed = self._limits.region
+        if allowed is not None and not _inside(allowed, xy_m):
+            raise _param_error(
+                f"the probe position ({xy_m[0]:.6g}, {xy_m[1]:.6g}) m lies outside the region allowed"
+                f" ({self._limits.region_source})"
+            )
+
+    def _check_parameter_geometry(self, parameter: Parameter) -> None:
+        """A single parameter may move or turn the scan, or make it too many pixels, as well."""
+        for name, value in self._values(parameter):
+            if name not in _GEOMETRY and name not in _PROBE and name not in _RESOLUTION:
+                continue
+            if name in _PROBE:
+                if self._limits.region is not None:
+                    self._check_point(self._probe_after(name, value))
+            elif name in _RESOLUTION:
+                self._check_scan(ScanParameters(shape=self._shape_after(name, value)))
+            else:
+                self._check_scan(ScanParameters(_GEOMETRY[name](value)))
+
+    def _probe_after(self, name: str, value: float) -> XY:
+        if self._probe is None:
+            raise _param_error(f"{name}: where the probe is now is not known, so its place can't be checked")
+        return (value, self._probe[1]) if name == names.PROBE_POS_X else (self._probe[0], value)
+
+    def _shape_after(self, name: str, value: float) -> tuple[int, int]:
+        if value < 1 or value != int(value):
+            raise _param_error(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
+        rows, columns = self._scan.shape or (1, 1)
+        return (rows, int(value)) if name == names.SCAN_RESOLUTION_X else (int(value), columns)
+
+    # --- values ---
+
+    def _values(self, subject: object) -> list[tuple[str, float]]:
+        """Numbers of the parameters that a subject sets, in SI or the unit of their limit."""
+        if isinstance(subject, Parameter):
+            value = self._number(subject)
+            return [] if value is None else [(subject.name, value)]
+        if isinstance(subject, ScanParameters):
+            return _scan_values(subject)
+        if isinstance(subject, Feedback):
+            pairs = (
+                (names.ZCTRL_SETPOINT, subject.setpoint),
+                (names.ZCTRL_PGAIN, subject.proportional_gain),
+                (names.ZCTRL_IGAIN, subject.integral_gain),
+            )
+            return [(name, _finite(name, value)) for name, value in pairs if value is not None]
+        if isinstance(subject, ProbePosition):
+            return [(names.PROBE_POS_X, subject.xy_m[0]), (names.PROBE_POS_Y, subject.xy_m[1])]
+        return []
+
+    def _number(self, parameter: Parameter) -> float | None:
+        """The value of a parameter; None if it may be a text."""
+        if parameter.value is None:
+            return None
+        limit = self._limits.parameters.get(parameter.name)
+        must_be = parameter.name in BASE_PARAMETERS or (limit is not None and _is_numeric(limit))
+        try:
+            value = float(parameter.value)
+        except ValueError:
+            if not must_be:
+                return None
+            raise _param_error(f"{parameter.name} = {parameter.value!r} is not a number") from None
+        _finite(parameter.name, value)
+        unit = limit.unit if limit is not None and limit.unit is not None else BASE_PARAMETERS.get(parameter.name)
+        # without a unit an angle is in degrees on the wire, everything else in SI
+        given = parameter.unit or ("deg" if unit == "rad" else unit)
+        if not given or unit is None or given == unit:
+            return value
+        try:
+            return float(convert(value, given, unit))
+        except AfspmError as error:
+            raise _param_error(f"{parameter.name} = {parameter.value} {given}: {error}") from error
+
+    def _learn(self, name: str, value: float, now_ns: int) -> None:
+        if name not in self._limits.parameters:
+            return
+        known = self._known.get(name)
+        if known is None or known.value != value:
+            self._known[name] = _Known(value, now_ns)
+
+
+_RESOLUTION = (names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y)
+_PROBE = (names.PROBE_POS_X, names.PROBE_POS_Y)
+_GEOMETRY: dict[str, Callable[[float], RegionChange]] = {
+    names.SCAN_TOP_LEFT_X: lambda value: RegionChange(left_m=value),
+    names.SCAN_TOP_LEFT_Y: lambda value: RegionChange(low_m=value),
+    names.SCAN_SIZE_X: lambda value: RegionChange(width_m=value),
+    names.SCAN_SIZE_Y: lambda value: RegionChange(height_m=value),
+    names.SCAN_ANGLE: lambda value: RegionChange(angle_rad=value),
+}
+
+
+def _param_error(reason: str) -> _Breach:
+    return _Breach(ControlResponse.PARAM_ERROR, reason)
+
+
+def _finite(name: str, value: float) -> float:
+    if not math.isfinite(value):
+        raise _param_error(f"{name} = {value}: not a finite number")
+    return value
+
+
+def _is_numeric(limit: Limit) -> bool:
+    return any(bound is not None for bound in (limit.low, limit.high, limit.step, limit.rate_per_s))
+
+
+def _inside(allowed: Region, xy_m: XY) -> bool:
+    grown = (allowed.size_m[0] * (1 + _REACH), allowed.size_m[1] * (1 + _REACH))
+    return replace(allowed, size_m=grown).contains(xy_m)
+
+
+def _scan_values(wanted: ScanParameters) -> list[tuple[str, float]]:
+    region, values = wanted.region, list[tuple[str, float]]()
+    if isinstance(region, Region):
+        (left, low), (width, height) = region.top_left_m, region.size_m
+        region = RegionChange(left, low, width, height, region.angle_rad)
+    if region is not None:
+        given = (
+            (names.SCAN_TOP_LEFT_X, region.left_m),
+            (names.SCAN_TOP_LEFT_Y, region.low_m),
+            (names.SCAN_SIZE_X, region.width_m),
+            (names.SCAN_SIZE_Y, region.height_m),
+            (names.SCAN_ANGLE, region.angle_rad),
+        )
+        values += [(name, value) for name, value in given if value is not None]
+    if wanted.shape is not None:
+        values += [(names.SCAN_RESOLUTION_X, wanted.shape[1]), (names.SCAN_RESOLUTION_Y, wanted.shape[0])]
+    return values

@@ -1,0 +1,92 @@
+"""Whether a process lives, judged by its heartbeats: busy is not dead, and late is not dead if it was we who slept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+
+class Vital(Enum):
+    """The state of health of a process."""
+
+    STARTING = auto()
+    ALIVE = auto()
+    SLOW_START = auto()
+    """It has not sent a first beat within the time that a start may take."""
+    SILENT = auto()
+    """Its beats have stopped: the whole process hangs."""
+    FROZEN = auto()
+    """It beats, but its current step has taken longer than it declared that one may."""
+    NOT_CLOSING = auto()
+    """It said that it is closing and is still there."""
+
+
+@dataclass(frozen=True)
+class LivenessPolicy:
+    """How patient to be; all in real seconds.
+
+    Attributes:
+        beat_period_s: between two beats.
+        missed_beats: after how many that did not come it counts as dead.
+        start_s: how long it may take to the first beat.
+        longest_step_s: how long a step may take, where a process doesn't say.
+        closing_s: how long closing may take.
+    """
+
+    beat_period_s: float = 1.0
+    missed_beats: int = 3
+    start_s: float = 30.0
+    longest_step_s: float = 30.0
+    closing_s: float = 5.0
+
+    @property
+    def silence_s(self) -> float:
+        return self.beat_period_s * self.missed_beats
+
+
+class Liveness:
+    """The heartbeats of one life of a process.
+
+    Args:
+        beats: whether it sends any; one that does not is only known by its exit.
+    """
+
+    def __init__(self, policy: LivenessPolicy, now_s: float, *, beats: bool = True) -> None:
+        self._policy = policy
+        self._beats = beats
+        self._vital = Vital.STARTING
+        self._deadline_s = now_s + policy.start_s
+        self._checked_s = now_s
+        self._frozen = False
+
+    def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> None:
+        """A beat came, with for how long the current step has been running and how long one may."""
+        if self._vital is Vital.NOT_CLOSING:
+            return
+        longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
+        self._vital = Vital.ALIVE
+        self._frozen = step_age_s > longest_s
+        self._deadline_s = now_s + self._policy.silence_s
+
+    def closing(self, now_s: float) -> None:
+        """It says that it is closing on purpose."""
+        self._vital = Vital.NOT_CLOSING
+        self._deadline_s = now_s + self._policy.closing_s
+
+    def check(self, now_s: float) -> Vital:
+        """How it is. To be asked at least once a beat period, since we can't judge while we sleep ourselves."""
+        asleep_s = now_s - self._checked_s - self._policy.beat_period_s
+        self._checked_s = now_s
+        if asleep_s > self._policy.beat_period_s:  # a suspended computer: its beats wait to be read, or it slept too
+            self._deadline_s += asleep_s
+        if self._frozen and self._vital is Vital.ALIVE:
+            return Vital.FROZEN
+        if not self._beats and self._vital is not Vital.NOT_CLOSING:
+            return Vital.ALIVE
+        if now_s < self._deadline_s:
+            return Vital.STARTING if self._vital is Vital.STARTING else Vital.ALIVE
+        return {Vital.STARTING: Vital.SLOW_START, Vital.ALIVE: Vital.SILENT}.get(self._vital, self._vital)
+
+    def next_check_s(self, now_s: float) -> float:
+        """When to check at the latest."""
+        return min(max(self._deadline_s, now_s), now_s + self._policy.beat_period_s)

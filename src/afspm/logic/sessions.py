@@ -1,0 +1,122 @@
+"""Who is connected: names, connections, restarts, and two that call themselves the same.
+
+A name belongs to one session at a time: one life of one process. Its first connection binds it. It is recognised on
+later connections by the token in its request ids ("<name>/<token>/<n>"); of peers without ids the connection is the
+session.
+
+ROUTER hands a name over to its newest connection and closes the older one. So when a second process takes a name that
+is in use, the first is disconnected *after* the second was accepted, while a process that is restarted connects after
+its former life was disconnected. That tells the impostor, who is refused, from the restarted, who is the same client.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from enum import Enum, auto
+
+
+class Hearing(Enum):
+    """What to make of a message from a connection."""
+
+    ACCEPTED = auto()
+    STALE = auto()
+    """The connection is closed already: there is nobody to answer, and whoever sent it will ask again."""
+    TAKEN = auto()
+    """Another live process has this name."""
+
+
+@dataclass(slots=True)
+class _Session:
+    token: str | None
+    connection: int | None
+    lost_order: int = 0
+    lost_s: float = 0.0
+
+
+def token_of(name: str, request_id: str) -> str | None:
+    """The session's token in a request id; None if the id says nothing of it (a caller's own key)."""
+    parts = request_id.split("/")
+    return parts[1] if len(parts) == 3 and parts[0] == name and parts[2].isdigit() else None
+
+
+class Sessions:
+    """The names in use.
+
+    Args:
+        takeover_s: for how long (real) a name that was handed over is kept for its owner to come back. A peer whose
+            connection died without our noticing is restarted under its name after that long at the latest.
+        keep: how many names that are not connected are remembered at most.
+    """
+
+    def __init__(self, takeover_s: float = 3.0, keep: int = 1000) -> None:
+        self._takeover_s = takeover_s
+        self._keep = keep
+        self._order = 0
+        self._highest = -1
+        self._open: dict[int, int] = {}  # connection -> when, in order, it was opened
+        self._names: dict[str, _Session] = {}
+        self._name_of: dict[int, str] = {}
+        self._lost: OrderedDict[str, None] = OrderedDict()
+
+    def connected(self, connection: int) -> None:
+        self._order += 1
+        self._open[connection] = self._order
+        self._highest = max(self._highest, connection)
+
+    def disconnected(self, connection: int, now_s: float) -> str | None:
+        """A connection is gone. Returns the name whose session lost its connection by that, if one did."""
+        self._order += 1
+        self._open.pop(connection, None)
+        name = self._name_of.pop(connection, None)
+        if name is None:
+            return None
+        session = self._names[name]
+        session.connection, session.lost_order, session.lost_s = None, self._order, now_s
+        self._lost[name] = None
+        if len(self._lost) > self._keep:
+            del self._names[self._lost.popitem(last=False)[0]]
+        return name
+
+    def hear(self, connection: int, name: str, request_id: str, now_s: float) -> Hearing:
+        """A message came from `name` by `connection`: may it speak for that name?"""
+        session = self._names.get(name)
+        if session is not None and session.connection == connection:
+            if session.token is None:
+                session.token = token_of(name, request_id)
+            return Hearing.ACCEPTED
+        if connection not in self._open:
+            if connection <= self._highest:
+                return Hearing.STALE
+            self.connected(connection)
+        token = token_of(name, request_id)
+        if session is not None and not self._gives_way(session, token, connection, now_s):
+            return Hearing.TAKEN
+        self._bind(name, token, connection)
+        return Hearing.ACCEPTED
+
+    def connection_of(self, name: str) -> int | None:
+        """The connection by which to answer `name`; None while it has none."""
+        session = self._names.get(name)
+        return session.connection if session is not None else None
+
+    def lost_since_s(self, name: str) -> float | None:
+        """Since when (real) a name that was heard of is without a connection; None if it has one, or is unknown."""
+        session = self._names.get(name)
+        return session.lost_s if session is not None and session.connection is None else None
+
+    def _gives_way(self, session: _Session, token: str | None, connection: int, now_s: float) -> bool:
+        if token is not None and token == session.token:
+            return True
+        if session.connection is not None:
+            return False
+        handed_over = self._open[connection] < session.lost_order
+        return not handed_over or now_s - session.lost_s >= self._takeover_s
+
+    def _bind(self, name: str, token: str | None, connection: int) -> None:
+        former = self._names.get(name)
+        if former is not None and former.connection is not None:
+            self._name_of.pop(former.connection, None)
+        self._lost.pop(name, None)
+        self._names[name] = _Session(token, connection)
+        self._name_of[connection] = name

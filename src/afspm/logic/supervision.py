@@ -1,0 +1,183 @@
+"""What the supervisor does about one child: start it, watch it, start it again, give it up, let it end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, auto
+
+from afspm.logic.liveness import Liveness, LivenessPolicy, Vital
+from afspm.logic.restart import RestartPolicy, Restarts
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Patience and restarts of one child."""
+
+    liveness: LivenessPolicy = field(default_factory=LivenessPolicy)
+    restart: RestartPolicy = field(default_factory=RestartPolicy)
+    beats: bool = True
+    """Whether it sends heartbeats."""
+
+
+class Phase(Enum):
+    """Where a child is in its life."""
+
+    IDLE = auto()
+    """Not started yet."""
+    RUNNING = auto()
+    KILLING = auto()
+    """It did not live any more as it should; its end is awaited."""
+    WAITING = auto()
+    """It crashed and is started again when its delay is over."""
+    STOPPING = auto()
+    """We asked it to end."""
+    DONE = auto()
+    """It ended, on purpose or by our wish."""
+    GIVEN_UP = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class StartChild:
+    """Start the process."""
+
+
+@dataclass(frozen=True, slots=True)
+class KillChild:
+    """End the process by force; its exit will be told."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class GiveUp:
+    """It is not started again: say so loudly, and to the scheduler (`ComponentDied`)."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Say:
+    """Tell people; `level` is a name of the logging module."""
+
+    level: str
+    text: str
+
+
+Action = StartChild | KillChild | GiveUp | Say
+
+_WHY = {
+    Vital.SLOW_START: "it sent no first heartbeat within {start_s:g} s",
+    Vital.SILENT: "no heartbeat for {silence_s:g} s: it hangs",
+    Vital.FROZEN: "its step takes longer than it said that one may: it is frozen",
+    Vital.NOT_CLOSING: "it said that it is closing and was still there {closing_s:g} s later",
+}
+
+
+class ChildWatch:
+    """One child, over all its lives. Every method takes the real monotonic time and returns what to do, in order."""
+
+    def __init__(self, policy: Policy | None = None) -> None:
+        self._policy = policy or Policy()
+        self._restarts = Restarts(self._policy.restart)
+        self._liveness: Liveness | None = None
+        self._began_s = 0.0
+        self._again_s = 0.0
+        self.phase = Phase.IDLE
+
+    @property
+    def over(self) -> bool:
+        """It runs no more and will not be started again."""
+        return self.phase in (Phase.DONE, Phase.GIVEN_UP)
+
+    def start(self, now_s: float) -> list[Action]:
+        """Start it, the first time or after it was over."""
+        if self.phase not in (Phase.IDLE, Phase.DONE, Phase.GIVEN_UP):
+            return []
+        return self._start(now_s)
+
+    def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> list[Action]:
+        """A heartbeat came."""
+        if self._liveness is None:
+            return []
+        self._liveness.beat(now_s, step_age_s, longest_step_s)
+        return self.tick(now_s)
+
+    def closing(self, now_s: float) -> list[Action]:
+        """It says that it is closing on purpose."""
+        if self._liveness is not None:
+            self._liveness.closing(now_s)
+        return []
+
+    def exited(self, now_s: float, how: str, *, restart: bool) -> list[Action]:
+        """It ended.
+
+        Args:
+            how: for people, e.g. "exit code 1", "killed by signal 9".
+            restart: whether it crashed; not if its exit code says that it meant to end, or that starting it again is
+                of no use.
+        """
+        phase, self._liveness = self.phase, None
+        if phase in (Phase.STOPPING, Phase.DONE):
+            self.phase = Phase.DONE
+            return []
+        if not restart and phase is not Phase.KILLING:
+            self.phase = Phase.DONE
+            return [Say("INFO", f"ended: {how}")]
+        return self._failed(now_s, f"ended: {how}")
+
+    def could_not_start(self, now_s: float, why: str) -> list[Action]:
+        """There is no process: the command is missing, the computer has no memory left …"""
+        self._liveness = None
+        if self.phase is Phase.STOPPING:
+            self.phase = Phase.DONE
+            return []
+        return self._failed(now_s, f"could not be started: {why}")
+
+    def stop(self, now_s: float) -> list[Action]:
+        """Its end is wanted, and the caller has asked it to. Nothing is restarted any more."""
+        if self.phase in (Phase.RUNNING, Phase.KILLING):
+            self.phase = Phase.STOPPING
+        elif self.phase in (Phase.IDLE, Phase.WAITING):
+            self.phase = Phase.DONE
+        return []
+
+    def tick(self, now_s: float) -> list[Action]:
+        """Time has passed."""
+        if self.phase is Phase.WAITING and now_s >= self._again_s:
+            return self._start(now_s)
+        if self.phase is not Phase.RUNNING or self._liveness is None:
+            return []
+        vital = self._liveness.check(now_s)
+        if vital not in _WHY:
+            return []
+        self.phase = Phase.KILLING
+        liveness = self._policy.liveness
+        why = _WHY[vital].format(start_s=liveness.start_s, silence_s=liveness.silence_s, closing_s=liveness.closing_s)
+        return [Say("WARNING", f"killed: {why}"), KillChild(why)]
+
+    def deadline_s(self, now_s: float) -> float | None:
+        """When `tick` is due at the latest; None: it is not."""
+        if self.phase is Phase.WAITING:
+            return self._again_s
+        if self.phase is Phase.RUNNING and self._liveness is not None:
+            return self._liveness.next_check_s(now_s)
+        return None
+
+    def _start(self, now_s: float) -> list[Action]:
+        self.phase = Phase.RUNNING
+        self._began_s = now_s
+        self._liveness = Liveness(self._policy.liveness, now_s, beats=self._policy.beats)
+        return [StartChild()]
+
+    def _failed(self, now_s: float, what: str) -> list[Action]:
+        delay_s = self._restarts.failed(now_s, now_s - self._began_s)
+        if delay_s is None:
+            self.phase = Phase.GIVEN_UP
+            restart = self._policy.restart
+            why = f"{what}; it was restarted {restart.budget} times within {restart.window_s:g} s already"
+            return [Say("ERROR", f"given up: {why}"), GiveUp(why)]
+        if delay_s <= 0:
+            return [Say("WARNING", f"{what}; it is started again"), *self._start(now_s)]
+        self.phase = Phase.WAITING
+        self._again_s = now_s + delay_s
+        return [Say("WARNING", f"{what}; it is started again in {delay_s:g} s")]

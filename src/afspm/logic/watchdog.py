@@ -1,0 +1,155 @@
+"""The watchdog: what the scheduler itself tells the microscope to do when control is taken from somebody.
+
+It stops the scan or spectrum that is running, and retracts the tip when its holder died in a dangerous state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from enum import Enum
+
+from afspm.logic.arbitration import Cause
+from afspm.model import ControlResponse, Feedback, ScopeState, names
+
+FEEDBACK_OFF = "feedback-off"
+"""The name of the dangerous state in which the feedback is known to be switched off."""
+
+_STOP = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
+_STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
+_DEFAULT_STOPS = frozenset({Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE})
+
+
+@dataclass(frozen=True)
+class WatchdogSettings:
+    """When the scheduler acts by itself.
+
+    Attributes:
+        stop_when: for which causes of losing control what is running is stopped.
+        dangerous: the states in which a dead holder's tip is retracted: names of ScopeState, and "feedback-off".
+        retract: the action that does it; None: never.
+        attempts: how often an action that gets no response is tried.
+    """
+
+    stop_when: Collection[Cause] = _DEFAULT_STOPS
+    dangerous: Collection[str] = frozenset({ScopeState.COARSE_MOTOR.name, FEEDBACK_OFF})
+    retract: str | None = names.RETRACT
+    attempts: int = 3
+
+
+class Result(Enum):
+    """What became of an action of the watchdog's."""
+
+    DONE = "done"
+    AGAIN = "to be tried again"
+    FAILED = "failed"
+
+
+class Watchdog:
+    """Knows what the microscope is doing, and what the scheduler wants it to do.
+
+    The caller sends `next_action()` before anything else, reports by `answered`, and lets nobody command while `busy`.
+    """
+
+    def __init__(self, settings: WatchdogSettings | None = None) -> None:
+        self._settings = settings or WatchdogSettings()
+        self._state = ScopeState.UNDEFINED
+        self._feedback_on: bool | None = None
+        self._starting: str | None = None
+        self._states_seen = 0
+        self._wanted: list[str] = []
+        self._sent = False
+        self._attempts = 0
+        self._refused_at = -1  # states seen when the microscope last was not free
+
+    @property
+    def busy(self) -> bool:
+        """Something is wanted of the microscope that must not be disturbed."""
+        return bool(self._wanted)
+
+    @property
+    def wants_retract(self) -> bool:
+        return self._settings.retract in self._wanted
+
+    @property
+    def state(self) -> ScopeState:
+        return self._state
+
+    @property
+    def states_seen(self) -> int:
+        """How many states the microscope has told; see `started`."""
+        return self._states_seen
+
+    def scope_is(self, state: ScopeState) -> None:
+        self._state = state
+        self._states_seen += 1
+        self._starting = None
+        if state is ScopeState.FREE and not self._sent:  # it ended while the translator could not be told to stop it
+            self._wanted = [action for action in self._wanted if action not in _STOP.values()]
+
+    def feedback_is(self, feedback: Feedback) -> None:
+        if feedback.on is not None:
+            self._feedback_on = feedback.on
+
+    def started(self, action: str, states_seen: int) -> None:
+        """A start action succeeded that was sent when `states_seen` states were known.
+
+        The answer may overtake the state that the microscope is in by it, or be overtaken.
+        """
+        if states_seen == self._states_seen:
+            self._starting = _STARTS.get(action, self._starting)
+
+    def control_taken(self, cause: Cause, in_flight: str | None) -> list[str]:
+        """Control was taken for `cause` while the action `in_flight` was with the translator.
+
+        Returns:
+            What is wanted now, in order.
+        """
+        wanted = []
+        stop = _STOP.get(self._state) or self._starting or _STARTS.get(in_flight or "")
+        if stop is not None and cause in self._settings.stop_when:
+            wanted.append(stop)
+        if cause is Cause.DEAD and self._settings.retract is not None and self._is_dangerous():
+            wanted.append(self._settings.retract)
+        self._wanted += [action for action in wanted if action not in self._wanted]
+        return wanted
+
+    def next_action(self) -> str | None:
+        """The action to send now, if one is; it counts as sent."""
+        if self._sent or not self._wanted or self._refused_at == self._states_seen:
+            return None
+        action = self._wanted[0]
+        if action == self._settings.retract and self._state in _STOP:
+            return None  # it is being stopped
+        self._sent = True
+        return action
+
+    def answered(self, code: int) -> Result:
+        """The translator answered what was sent (or NO_RESPONSE)."""
+        self._sent = False
+        if code == ControlResponse.SUCCESS:
+            self._starting = None
+            self._forget()
+            return Result.DONE
+        if code == ControlResponse.NOT_FREE:
+            self._refused_at = self._states_seen
+            return Result.AGAIN
+        self._attempts += 1
+        if code == ControlResponse.NO_RESPONSE and self._attempts < self._settings.attempts:
+            return Result.AGAIN
+        self._forget()
+        return Result.FAILED
+
+    def unsent(self) -> None:
+        """What `next_action` said could not be sent: the translator is not connected. Again when it is."""
+        self._sent = False
+        self._attempts = 0
+        self._refused_at = -1
+
+    def _forget(self) -> None:
+        self._wanted.pop(0)
+        self._attempts = 0
+
+    def _is_dangerous(self) -> bool:
+        dangerous = self._settings.dangerous
+        return self._state.name in dangerous or (self._feedback_on is False and FEEDBACK_OFF in dangerous)
