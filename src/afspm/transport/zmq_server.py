@@ -9,7 +9,7 @@ import zmq
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
-from afspm.transport.frames import readable, user_of
+from afspm.transport.frames import readable, receive, user_of
 from afspm.transport.history import Published
 from afspm.transport.network import Network
 from afspm.transport.port import RequestReceived, Served, SubscriberJoined
@@ -20,8 +20,8 @@ from afspm.transport.wakeup import WakeUp
 class ZmqServerPort:
     """See `transport.port.ServerPort`.
 
-    A REP socket: it gives back whatever the requester put before the empty frame, so that a scheduler of ours can
-    number its requests, and one of version 1 need not.
+    To a requester it is a REP socket: it gives back whatever came before the empty frame, so that a scheduler of ours
+    can number its requests, and one of version 1 need not. It is a ROUTER since an answer may also be withheld.
 
     Args:
         serve: the address to answer requests on.
@@ -38,12 +38,12 @@ class ZmqServerPort:
         self._network = network
         self._clock = clock
         self._allowed = allowed
-        self._asked = False
+        self._asker: list[bytes] | None = None
         self._closed = False
         self._wake_up: WakeUp[Served] = WakeUp()
         self._published = Published(clock)
         self._publisher = None if publish is None else Publisher(network, publish, self._published)
-        self._socket = network.socket(zmq.REP)
+        self._socket = network.socket(zmq.ROUTER)
         self.serve_address = network.bind(self._socket, serve)
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
@@ -63,6 +63,7 @@ class ZmqServerPort:
     def poll(self, timeout_s: float | None) -> list[Served]:
         timeout_ms = None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
         found: list[Served] = []
+        self._poller.modify(self._socket, zmq.POLLIN if self._asker is None else 0)
         for ready, _ in self._poller.poll(timeout_ms):
             if ready is self._socket:
                 found += self._request()
@@ -74,20 +75,23 @@ class ZmqServerPort:
 
     def _request(self) -> list[Served]:
         """The next request, if the last one was answered."""
-        while not self._asked and readable(self._socket):
-            first = self._socket.recv(zmq.NOBLOCK, copy=False)
-            rest = self._socket.recv_multipart(zmq.NOBLOCK) if first.more else []
-            user = user_of(first) if self._network.keys is not None else None
-            self._asked = True
+        while self._asker is None and readable(self._socket):
+            frames = receive(self._socket)
+            parts = [frame.bytes for frame in frames]
+            if b"" not in parts[1:]:
+                continue  # not what REQ or DEALER peers send: there is no telling where an answer would go
+            start = parts.index(b"", 1) + 1
+            self._asker = parts[:start]
+            user = user_of(frames[-1]) if self._network.keys is not None else None
             if self._allowed is None or self._network.keys is None or user == self._allowed:
-                return [RequestReceived([first.bytes, *rest], user)]
+                return [RequestReceived(parts[start:], user)]
             self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])
         return []
 
-    def reply(self, frames: Sequence[bytes]) -> None:
-        if self._asked:
-            self._asked = False
-            self._socket.send_multipart(frames, zmq.NOBLOCK)
+    def reply(self, frames: Sequence[bytes] | None) -> None:
+        asker, self._asker = self._asker, None
+        if asker is not None and frames is not None:
+            self._socket.send_multipart([*asker, *frames], zmq.NOBLOCK)
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
         if self._publisher is None:
