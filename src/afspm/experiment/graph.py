@@ -1,0 +1,281 @@
+"""An experiment as a picture: the scheduler as a bar, its translator below it, the components above.
+
+Every component has a column of its own, in which its envelopes come up from the bar and its requests go down to it;
+what components publish to each other runs in lanes above them. So no two lines share a way, and nothing has to be
+searched for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from afspm.experiment.parts import Part, Role
+from afspm.experiment.svg import Svg, text_width
+
+if TYPE_CHECKING:
+    from afspm.experiment.experiment import Experiment
+    from afspm.experiment.resolved import Resolved
+
+ENVELOPES, CONTROL, VENDOR = "#1f6fb2", "#c2570c", "#777777"
+GREY, RED, GREEN = "#666666", "#a3241c", "#1d7a3e"
+FILLS: Final = {
+    Role.COMPONENT: ("#fffdf7", "#8a7a4d"),
+    Role.SCHEDULER: ("#eaf1fa", "#3b5b8c"),
+    Role.TRANSLATOR: ("#eaf6ee", "#2f7a4f"),
+}
+
+MARGIN, GAP, LANE, LINE = 36.0, 30.0, 30.0, 15.0
+NAME_SIZE, TEXT_SIZE, LABEL_SIZE = 14.0, 11.0, 11.0
+BAR_HEIGHT, ARROW_AT, MOST_LABELS = 62.0, 16.0, 7
+
+
+@dataclass
+class Box:
+    """One process and its column. Widths first, then places."""
+
+    part: Part
+    lines: list[tuple[str, str]]
+    labels: list[str]
+    asks: bool
+    x: float = 0.0
+    y: float = 0.0
+    height: float = 0.0
+
+    @property
+    def width(self) -> float:
+        texts = [text_width(text, TEXT_SIZE) for text, _ in self.lines]
+        return max([120.0, text_width(self.part.name, NAME_SIZE, bold=True) + 28, *(t + 28 for t in texts)])
+
+    @property
+    def _sides(self) -> tuple[float, float]:
+        """The room that the two arrows and their labels take, left and right of the middle between the arrows."""
+        left = max([text_width(label, LABEL_SIZE) for label in self.labels], default=0.0)
+        right = text_width("requests", LABEL_SIZE) if self.asks else 0.0
+        return left + ARROW_AT + 8, right + ARROW_AT + 8
+
+    @property
+    def arrows_at(self) -> float:
+        """Where the middle between the arrows is, from the middle of the box: labels are not of one length."""
+        left, right = self._sides
+        most = self.width / 2 - ARROW_AT - 12
+        return max(-most, min(most, (left - right) / 2))
+
+    @property
+    def column(self) -> float:
+        left, right = self._sides
+        return max(self.width, 2 * (left - self.arrows_at), 2 * (right + self.arrows_at))
+
+    @property
+    def own_height(self) -> float:
+        return 34.0 + LINE * len(self.lines)
+
+
+@dataclass(frozen=True)
+class Lane:
+    """What one component publishes to others."""
+
+    publisher: Box
+    listeners: tuple[Box, ...]
+    label: str
+
+
+def draw(experiment: Experiment) -> str:
+    """The picture as the text of an SVG file."""
+    return _Drawing(experiment.resolved, experiment.name).document()
+
+
+class _Drawing:
+    def __init__(self, resolved: Resolved, name: str) -> None:
+        self.resolved = resolved
+        self.name = name
+        self.svg = Svg()
+        self.components_of_file = resolved.with_role(Role.COMPONENT)
+        self.boxes = {part.name: self._box(part) for part in resolved.parts.components}
+        self.components = [self.boxes[p.name] for p in self.components_of_file]
+        self.lanes = self._lanes()
+        self.bar_x, self.bar_y, self.bar_width = MARGIN, 0.0, 0.0
+
+    def document(self) -> str:
+        self._place()
+        for box in self.components:
+            self._component(box)
+        for i, lane in enumerate(self.lanes):
+            self._lane(lane, self._top() - LANE * (i + 0.75))
+        for part in self.resolved.with_role(Role.SCHEDULER)[:1]:
+            self._scheduler(part)
+        bottom = self.bar_y + BAR_HEIGHT
+        for part in self.resolved.with_role(Role.TRANSLATOR)[:1]:
+            bottom = self._translator(self.boxes[part.name])
+        self.svg.text(MARGIN, MARGIN + 8, self.name, size=18, anchor="start", bold=True)
+        self._legend(bottom + 40)
+        width = self.bar_width + 2 * MARGIN
+        return self.svg.document(width, bottom + 66, self.name, (ENVELOPES, CONTROL, VENDOR))
+
+    # --- what there is ------------------------------------------------------------------------------------------
+
+    def _box(self, part: Part) -> Box:
+        said = self.resolved.declared[part.name]
+        what = part.class_path.rpartition(".")[2] if part.class_path else " ".join(part.command)
+        lines = [(what if len(what) <= 34 else what[:33] + "…", GREY)]
+        lines += [(f"flags {problem}", RED) for problem in said.flags]
+        lines += [(f"solves {problem}", GREEN) for problem in said.solves]
+        labels = self._from_scheduler(part)
+        if len(labels) > MOST_LABELS:
+            labels = [*labels[: MOST_LABELS - 1], f"and {len(labels) - MOST_LABELS + 1} more"]
+        written = "subscriber" in part.own and "control_client" not in part.own
+        return Box(part, lines, labels, asks=not written)
+
+    def _from_scheduler(self, part: Part) -> list[str]:
+        """What it hears from the scheduler: not what only other components publish; at least that it is over."""
+        prefixes = self.resolved.envelopes(part)
+        if prefixes is None or "" in prefixes:
+            return ["all envelopes"]
+        others = {e for p in self.components_of_file for e in self.resolved.declared[p.name].publishes}
+        return [p for p in prefixes if not any(e.startswith(p) for e in others)] or ["KILL"]
+
+    def _lanes(self) -> list[Lane]:
+        lanes = []
+        for box in self.components:
+            key = f"{box.part.name}/publish"
+            slot = self.resolved.net.slots.get(key)
+            if slot is None:
+                continue
+            listeners = tuple(
+                other
+                for other in self.components
+                if any(s in (key, slot.address) for s in self.resolved.net.links[other.part.name].subscribe)
+            )
+            label = ", ".join(self.resolved.declared[box.part.name].publishes) or "messages of its own"
+            lanes.append(Lane(box, listeners, f"{label} {_at(slot.address)}"))
+        # short ways near the boxes, long ways above them: fewer crossings
+        return sorted(lanes, key=lambda lane: len(lane.listeners))
+
+    # --- where it goes --------------------------------------------------------------------------------------------
+
+    def _top(self) -> float:
+        """The y of the components' upper edge."""
+        return MARGIN + 34 + LANE * len(self.lanes)
+
+    def _place(self) -> None:
+        height = max((box.own_height for box in self.components), default=0.0)
+        columns = sum(box.column for box in self.components) + GAP * max(0, len(self.components) - 1)
+        widest_lane = max((text_width(lane.label, LABEL_SIZE) for lane in self.lanes), default=0.0)
+        self.bar_width = max(columns, 560.0, widest_lane, text_width(self.name, 18, bold=True))
+        x = MARGIN + (self.bar_width - columns) / 2
+        for box in self.components:
+            box.x, box.y, box.height = x + box.column / 2, self._top(), height
+            x += box.column + GAP
+        labels = max((len(box.labels) for box in self.components), default=0)
+        self.bar_y = self._top() + height + max(64.0, LINE * labels + 34.0)
+
+    # --- drawn ----------------------------------------------------------------------------------------------------
+
+    def _process(self, box: Box) -> None:
+        fill, stroke = FILLS[self.resolved.roles[box.part.name]]
+        self.svg.box(box.x - box.width / 2, box.y, box.width, box.height, fill=fill, stroke=stroke)
+        y = box.y + 22
+        self.svg.text(box.x, y, box.part.name, size=NAME_SIZE, bold=True)
+        for text, colour in box.lines:
+            y += LINE
+            self.svg.text(box.x, y, text, size=TEXT_SIZE, fill=colour)
+
+    def _component(self, box: Box) -> None:
+        self._process(box)
+        top, bottom = box.y + box.height, self.bar_y
+        if self._hears_scheduler(box):
+            self._up(box.x + box.arrows_at - ARROW_AT, top, bottom, box.labels)
+        if box.asks:
+            self._down(box.x + box.arrows_at + ARROW_AT, top, bottom)
+
+    def _hears_scheduler(self, box: Box) -> bool:
+        """Some only listen to other components."""
+        sources = self.resolved.net.links[box.part.name].subscribe
+        own = {f"{p.name}/publish" for p in self.resolved.with_role(Role.SCHEDULER)}
+        own |= {slot.address for key, slot in self.resolved.net.slots.items() if key in own and slot.address}
+        others = {f"{b.part.name}/publish" for b in self.components}
+        others |= {self.resolved.net.slots[o].address or "" for o in others if o in self.resolved.net.slots}
+        return any(source in own or source not in others for source in sources)
+
+    def _up(self, x: float, top: float, bottom: float, labels: Sequence[str]) -> None:
+        """Envelopes, from below to above, with their names to the left."""
+        self.svg.line([(x, bottom), (x, top + 1)], stroke=ENVELOPES)
+        y = (top + bottom) / 2 - LINE * (len(labels) - 1) / 2 + 4
+        for label in labels:
+            self.svg.text(x - 8, y, label, size=LABEL_SIZE, fill=ENVELOPES, anchor="end")
+            y += LINE
+
+    def _down(self, x: float, top: float, bottom: float) -> None:
+        """Requests, from above to below."""
+        self.svg.line([(x, top), (x, bottom - 1)], stroke=CONTROL)
+        self.svg.text(x + 8, (top + bottom) / 2 + 4, "requests", size=LABEL_SIZE, fill=CONTROL, anchor="start")
+
+    def _lane(self, lane: Lane, y: float) -> None:
+        start = lane.publisher.x + lane.publisher.width / 4
+        ends = [box.x - box.width / 4 for box in lane.listeners]
+        top = self._top()
+        for x in ends:
+            self.svg.line([(start, top), (start, y), (x, y), (x, top - 1)], stroke=ENVELOPES)
+        if not ends:
+            self.svg.line([(start, top), (start, y)], stroke=ENVELOPES)
+        far = max(ends, key=lambda x: abs(x - start), default=start)
+        half = text_width(lane.label, LABEL_SIZE) / 2
+        middle = min(max((start + far) / 2, MARGIN + half), MARGIN + self.bar_width - half)
+        self.svg.text(middle, y - 6, lane.label, size=LABEL_SIZE, fill=ENVELOPES, halo=True)
+
+    def _scheduler(self, part: Part) -> None:
+        fill, stroke = FILLS[Role.SCHEDULER]
+        self.svg.box(self.bar_x, self.bar_y, self.bar_width, BAR_HEIGHT, fill=fill, stroke=stroke)
+        middle = self.bar_x + self.bar_width / 2
+        self.svg.text(middle, self.bar_y + 27, part.name, size=NAME_SIZE, bold=True)
+        what = self.boxes[part.name].lines[0][0]
+        self.svg.text(middle, self.bar_y + 27 + LINE, what, size=TEXT_SIZE, fill=GREY)
+        self._addresses(part.name, self.bar_x + 14, self.bar_x + self.bar_width - 14, self.bar_y + 27)
+
+    def _addresses(self, name: str, left: float, right: float, y: float) -> None:
+        """Where a process publishes (left) and answers (right)."""
+        for use, said, x, anchor, colour in (
+            ("publish", "publishes", left, "start", ENVELOPES),
+            ("serve", "answers", right, "end", CONTROL),
+        ):
+            slot = self.resolved.net.slots.get(f"{name}/{use}")
+            if slot is not None:
+                self.svg.text(x, y, said, size=TEXT_SIZE, fill=colour, anchor=anchor)
+                self.svg.text(x, y + LINE, _at(slot.address), size=TEXT_SIZE, fill=GREY, anchor=anchor)
+
+    def _translator(self, box: Box) -> float:
+        """The translator below the bar and its microscope below it; returns where that ends."""
+        middle = self.bar_x + self.bar_width / 2
+        top = self.bar_y + BAR_HEIGHT
+        name = box.part.name
+        slots = [self.resolved.net.slots.get(f"{name}/{use}") for use in ("publish", "serve")]
+        sides = max(text_width(_at(slot.address), TEXT_SIZE) if slot else 0.0 for slot in slots)
+        width = box.width + 2 * sides + 24
+        box.x, box.y, box.height = middle, top + 64, max(box.own_height, 56.0)
+        fill, stroke = FILLS[Role.TRANSLATOR]
+        self.svg.box(middle - width / 2, box.y, width, box.height, fill=fill, stroke=stroke)
+        self.svg.text(middle, box.y + 24, name, size=NAME_SIZE, bold=True)
+        for i, (text, colour) in enumerate(box.lines, 1):
+            self.svg.text(middle, box.y + 24 + LINE * i, text, size=TEXT_SIZE, fill=colour)
+        self._addresses(name, middle - width / 2 + 12, middle + width / 2 - 12, box.y + 24)
+        self._up(middle - ARROW_AT, top, box.y, ["all envelopes"])
+        self._down(middle + ARROW_AT, top, box.y)
+        below = box.y + box.height
+        self.svg.line([(middle, below), (middle, below + 38)], stroke=VENDOR, start=True, dashed=True)
+        label = "simulated microscope" if self.resolved.simulated else "microscope"
+        half = text_width(label, TEXT_SIZE) / 2 + 18
+        self.svg.box(middle - half, below + 38, 2 * half, 30, fill="#f6f6f6", stroke=VENDOR, dashed=True, corner=15)
+        self.svg.text(middle, below + 57, label, size=TEXT_SIZE, fill="#444444")
+        return below + 68
+
+    def _legend(self, y: float) -> None:
+        x = MARGIN
+        for colour, said in ((ENVELOPES, "published envelopes"), (CONTROL, "requests, each with its response")):
+            self.svg.line([(x, y - 4), (x + 34, y - 4)], stroke=colour)
+            self.svg.text(x + 42, y, said, size=LABEL_SIZE, fill=GREY, anchor="start")
+            x += 42 + text_width(said, LABEL_SIZE) + 30
+
+
+def _at(address: str | None) -> str:
+    return f"at {address}" if address else "at a free port"
