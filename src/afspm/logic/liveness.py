@@ -87,6 +87,6 @@ class Liveness:
             return Vital.STARTING if self._vital is Vital.STARTING else Vital.ALIVE
         return {Vital.STARTING: Vital.SLOW_START, Vital.ALIVE: Vital.SILENT}.get(self._vital, self._vital)
 
-    def next_check_s(self, now_s: float) -> float:
+    def next_check_s(self) -> float:
         """When to check at the latest."""
-        return min(max(self._deadline_s, now_s), now_s + self._policy.beat_period_s)
+        return min(self._deadline_s, self._checked_s + self._policy.beat_period_s)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from typing import Protocol
 
 from afspm.logic.liveness import Liveness, LivenessPolicy, Vital
 from afspm.logic.restart import RestartPolicy, Restarts
@@ -17,6 +19,22 @@ class Policy:
     restart: RestartPolicy = field(default_factory=RestartPolicy)
     beats: bool = True
     """Whether it sends heartbeats."""
+    final_codes: Collection[int] = frozenset({0, 78, 80, 81})
+    """Exit codes after which it is not started again: done, bad settings, the experiment ended, asked to stop."""
+
+
+class Beat(Protocol):
+    """What a heartbeat says; None where the process does not say."""
+
+    @property
+    def closing(self) -> bool: ...
+    @property
+    def step_age_s(self) -> float | None: ...
+    @property
+    def longest_step_s(self) -> float | None: ...
+
+
+CONFIG_CODE = 78
 
 
 class Phase(Enum):
@@ -37,12 +55,12 @@ class Phase(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class StartChild:
+class Start:
     """Start the process."""
 
 
 @dataclass(frozen=True, slots=True)
-class KillChild:
+class Kill:
     """End the process by force; its exit will be told."""
 
     why: str
@@ -56,14 +74,14 @@ class GiveUp:
 
 
 @dataclass(frozen=True, slots=True)
-class Say:
+class Log:
     """Tell people; `level` is a name of the logging module."""
 
     level: str
     text: str
 
 
-Action = StartChild | KillChild | GiveUp | Say
+Effect = Start | Kill | GiveUp | Log
 
 _WHY = {
     Vital.SLOW_START: "it sent no first heartbeat within {start_s:g} s",
@@ -89,43 +107,35 @@ class ChildWatch:
         """It runs no more and will not be started again."""
         return self.phase in (Phase.DONE, Phase.GIVEN_UP)
 
-    def start(self, now_s: float) -> list[Action]:
+    def begin(self, now_s: float) -> list[Effect]:
         """Start it, the first time or after it was over."""
         if self.phase not in (Phase.IDLE, Phase.DONE, Phase.GIVEN_UP):
             return []
         return self._start(now_s)
 
-    def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> list[Action]:
+    def beat(self, beat: Beat, now_s: float) -> list[Effect]:
         """A heartbeat came."""
         if self._liveness is None:
             return []
-        self._liveness.beat(now_s, step_age_s, longest_step_s)
+        if beat.closing:
+            self._liveness.closing(now_s)
+        else:
+            self._liveness.beat(now_s, beat.step_age_s or 0.0, beat.longest_step_s)
         return self.tick(now_s)
 
-    def closing(self, now_s: float) -> list[Action]:
-        """It says that it is closing on purpose."""
-        if self._liveness is not None:
-            self._liveness.closing(now_s)
-        return []
-
-    def exited(self, now_s: float, how: str, *, restart: bool) -> list[Action]:
-        """It ended.
-
-        Args:
-            how: for people, e.g. "exit code 1", "killed by signal 9".
-            restart: whether it crashed; not if its exit code says that it meant to end, or that starting it again is
-                of no use.
-        """
+    def exited(self, code: int, now_s: float, how: str = "") -> list[Effect]:
+        """It ended, with an exit code or, below zero, by a signal; `how` says it for people."""
+        how = how or f"exit code {code}"
         phase, self._liveness = self.phase, None
         if phase in (Phase.STOPPING, Phase.DONE):
             self.phase = Phase.DONE
             return []
-        if not restart and phase is not Phase.KILLING:
+        if phase is not Phase.KILLING and code in self._policy.final_codes:
             self.phase = Phase.DONE
-            return [Say("INFO", f"ended: {how}")]
+            return [Log("INFO" if code != CONFIG_CODE else "ERROR", f"ended: {how}; it is not started again")]
         return self._failed(now_s, f"ended: {how}")
 
-    def could_not_start(self, now_s: float, why: str) -> list[Action]:
+    def start_failed(self, why: str, now_s: float) -> list[Effect]:
         """There is no process: the command is missing, the computer has no memory left …"""
         self._liveness = None
         if self.phase is Phase.STOPPING:
@@ -133,7 +143,7 @@ class ChildWatch:
             return []
         return self._failed(now_s, f"could not be started: {why}")
 
-    def stop(self, now_s: float) -> list[Action]:
+    def stop(self, now_s: float) -> list[Effect]:
         """Its end is wanted, and the caller has asked it to. Nothing is restarted any more."""
         if self.phase in (Phase.RUNNING, Phase.KILLING):
             self.phase = Phase.STOPPING
@@ -141,7 +151,7 @@ class ChildWatch:
             self.phase = Phase.DONE
         return []
 
-    def tick(self, now_s: float) -> list[Action]:
+    def tick(self, now_s: float) -> list[Effect]:
         """Time has passed."""
         if self.phase is Phase.WAITING and now_s >= self._again_s:
             return self._start(now_s)
@@ -153,31 +163,31 @@ class ChildWatch:
         self.phase = Phase.KILLING
         liveness = self._policy.liveness
         why = _WHY[vital].format(start_s=liveness.start_s, silence_s=liveness.silence_s, closing_s=liveness.closing_s)
-        return [Say("WARNING", f"killed: {why}"), KillChild(why)]
+        return [Log("WARNING", f"killed: {why}"), Kill(why)]
 
-    def deadline_s(self, now_s: float) -> float | None:
+    def deadline_s(self) -> float | None:
         """When `tick` is due at the latest; None: it is not."""
         if self.phase is Phase.WAITING:
             return self._again_s
         if self.phase is Phase.RUNNING and self._liveness is not None:
-            return self._liveness.next_check_s(now_s)
+            return self._liveness.next_check_s()
         return None
 
-    def _start(self, now_s: float) -> list[Action]:
+    def _start(self, now_s: float) -> list[Effect]:
         self.phase = Phase.RUNNING
         self._began_s = now_s
         self._liveness = Liveness(self._policy.liveness, now_s, beats=self._policy.beats)
-        return [StartChild()]
+        return [Start()]
 
-    def _failed(self, now_s: float, what: str) -> list[Action]:
+    def _failed(self, now_s: float, what: str) -> list[Effect]:
         delay_s = self._restarts.failed(now_s, now_s - self._began_s)
         if delay_s is None:
             self.phase = Phase.GIVEN_UP
             restart = self._policy.restart
             why = f"{what}; it was restarted {restart.budget} times within {restart.window_s:g} s already"
-            return [Say("ERROR", f"given up: {why}"), GiveUp(why)]
+            return [Log("ERROR", f"given up: {why}"), GiveUp(why)]
         if delay_s <= 0:
-            return [Say("WARNING", f"{what}; it is started again"), *self._start(now_s)]
+            return [Log("WARNING", f"{what}; it is started again"), *self._start(now_s)]
         self.phase = Phase.WAITING
         self._again_s = now_s + delay_s
-        return [Say("WARNING", f"{what}; it is started again in {delay_s:g} s")]
+        return [Log("WARNING", f"{what}; it is started again in {delay_s:g} s")]
