@@ -1,0 +1,51 @@
+"""Ready-made components. Each is loaded only when it is asked for, so that a process starts with what it needs."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from afspm.components.feedback_analysis import FeedbackAnalysis
+    from afspm.components.feedback_tuner import FeedbackTuner
+    from afspm.components.log_collector import LogCollector
+    from afspm.components.metadata import Metadata
+    from afspm.components.night_picture import NightPicture
+    from afspm.components.planned_scans import RegionGrid, ScanList, ScanSeries
+    from afspm.components.spectroscopy_grid import SpectroscopyGrid
+    from afspm.components.tip_classifier import TipClassifier
+    from afspm.components.tip_corrector import TipCorrector
+
+_MODULES = {
+    "FeedbackAnalysis": "feedback_analysis",
+    "FeedbackTuner": "feedback_tuner",
+    "LogCollector": "log_collector",
+    "Metadata": "metadata",
+    "NightPicture": "night_picture",
+    "RegionGrid": "planned_scans",
+    "ScanList": "planned_scans",
+    "ScanSeries": "planned_scans",
+    "SpectroscopyGrid": "spectroscopy_grid",
+    "TipClassifier": "tip_classifier",
+    "TipCorrector": "tip_corrector",
+}
+
+__all__ = [
+    "FeedbackAnalysis",
+    "FeedbackTuner",
+    "LogCollector",
+    "Metadata",
+    "NightPicture",
+    "RegionGrid",
+    "ScanList",
+    "ScanSeries",
+    "SpectroscopyGrid",
+    "TipClassifier",
+    "TipCorrector",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

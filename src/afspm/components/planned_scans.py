@@ -1,0 +1,219 @@
+"""Scans by plan: one region again and again, a list of regions, or a grid of them. Each is taken exactly once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from afspm.components.plan import XY, Rhythm, ScanPlan, Step, grid_centers, rounds_within, squares
+from afspm.errors import ConfigError, InvalidValue
+from afspm.model import Region
+from afspm.runtime.component import Component
+from afspm.units import Angle, Duration, Length, parse_quantity
+
+Pixels = tuple[int, int]
+
+
+class PlannedScans(Component):
+    """What takes the scans of a plan. Derive from it for a plan of your own: call its `__init__` with the plan.
+
+    Each scan has a key, so that whatever process is killed, and whenever, no scan is left out or taken twice. While
+    control is lost (to the repair of a tip, to a person) the scan waits; what was interrupted is said in the log.
+
+    Args:
+        plan: the regions, and how often.
+        period_s: between the beginnings of two rounds, experiment time; 0 for one right after the other.
+        end_when_done: whether to end the whole experiment after the last scan.
+        parameters: set before the first scan, e.g. {"scan-speed": "2 um/s"}.
+    """
+
+    def __init__(
+        self,
+        plan: ScanPlan,
+        *,
+        period_s: float = 0.0,
+        end_when_done: bool = False,
+        parameters: Mapping[str, str | float] | None = None,
+    ) -> None:
+        self.plan = plan
+        self.period_s = period_s
+        self.end_when_done = end_when_done
+        self.parameters = dict(parameters or {})
+
+    def run(self) -> None:
+        self.memory.setdefault("start_s", self.clock.now_s())
+        rhythm = Rhythm(float(self.memory["start_s"]), self.period_s)
+        self.memory.save()
+        self._set_parameters()
+        done = int(self.memory.get("done", 0))
+        if done:
+            self.log.info("going on with scan %d%s", done + 1, self._of_total())
+        for step in self.plan.steps(done):
+            self._await(step, rhythm)
+            self._take(step)
+        self.log.info("all %d scans are taken", self.plan.total)
+        if self.end_when_done:
+            self.scope.end_experiment()
+
+    def _set_parameters(self) -> None:
+        with self.scope.control():
+            for name, quantity in self.parameters.items():
+                value, unit = parse_quantity(quantity) if isinstance(quantity, str) else (quantity, "")
+                self.scope.set(name, value, unit or None)
+
+    def _await(self, step: Step, rhythm: Rhythm) -> None:
+        if not step.starts_round or self.memory.get("begun") == step.index:
+            return
+        last_s = self.memory.get("round_s")
+        wait_s = rhythm.next_due_s(last_s) - self.clock.now_s()
+        if wait_s > 0:
+            self.scope.sleep(wait_s)
+        elif missed := rhythm.missed(last_s, self.clock.now_s()):
+            self.log.warning("%s comes late: %d that were due meanwhile are not made up for", step.key, missed)
+        # before it is asked for: a scan that a kill interrupts belongs to the beat that it was begun on
+        self.memory["begun"], self.memory["round_s"] = step.index, self.clock.now_s()
+        self.memory.save()
+
+    def _take(self, step: Step) -> None:
+        scans = self.scope.scan(step.region, shape=step.shape, key=step.key)
+        self.memory["done"] = step.index + 1
+        self.memory.save()
+        for interruption in scans.interruptions:
+            self.log.warning("%s was interrupted and taken again: %s", step.key, interruption)
+        self.log.info("scan %d%s %s", step.index + 1, self._of_total(), _told(scans.time))
+
+    def _of_total(self) -> str:
+        return "" if self.plan.total is None else f" of {self.plan.total}"
+
+
+class ScanSeries(PlannedScans):
+    """The same region every so often, for as long or as many scans as wanted.
+
+    With neither `scans` nor `duration` it goes on until the experiment is ended by somebody else.
+
+    Args:
+        size: (width, height) of the region, e.g. ["2 um", "2 um"].
+        center: (x, y) of its middle.
+        angle: counter-clockwise.
+        pixels: (columns, rows).
+        every: from the beginning of one scan to that of the next, experiment time; 0 for no pause.
+        scans: how many.
+        duration: for how long scans are begun (instead of `scans`).
+        end_when_done: whether to end the whole experiment then.
+        parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
+    """
+
+    def __init__(
+        self,
+        size: tuple[Length, Length],
+        center: tuple[Length, Length] = (0.0, 0.0),
+        angle: Angle = 0.0,
+        pixels: Pixels = (128, 128),
+        every: Duration = 0.0,
+        scans: int | None = None,
+        duration: Duration | None = None,
+        end_when_done: bool = False,
+        parameters: dict[str, str | float] | None = None,
+    ) -> None:
+        if scans is not None and duration is not None:
+            raise ConfigError("both `scans` and `duration` are given", hint="one of them says when to end")
+        rounds = scans if duration is None else rounds_within(duration, every)
+        if end_when_done and rounds is None:
+            raise ConfigError("`end_when_done` without an end", hint="give `scans` or `duration`")
+        plan = _plan((Region(pair(center), pair(size), angle),), pixels, rounds)
+        super().__init__(plan, period_s=every, end_when_done=end_when_done, parameters=parameters)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A region in an experiment file: {center = ["1 um", "0 um"], size = ["500 nm", "500 nm"], angle = "30 deg"}."""
+
+    center: tuple[Length, Length]
+    size: tuple[Length, Length]
+    angle: Angle = 0.0
+
+    @classmethod
+    def of(cls, given: Place | Mapping[str, Any]) -> Place:
+        """From the table that a process is given."""
+        return given if isinstance(given, Place) else cls(**given)
+
+    @property
+    def region(self) -> Region:
+        return Region(pair(self.center), pair(self.size), self.angle)
+
+
+class ScanList(PlannedScans):
+    """Regions of a list, in its order, in one round or several.
+
+    Args:
+        regions: each with center, size and angle.
+        pixels: (columns, rows) of each.
+        rounds: how often the list is gone through.
+        every: from the beginning of one round to that of the next, experiment time.
+        end_when_done: whether to end the whole experiment then.
+        parameters: set before the first scan.
+    """
+
+    def __init__(
+        self,
+        regions: list[Place],
+        pixels: Pixels = (128, 128),
+        rounds: int = 1,
+        every: Duration = 0.0,
+        end_when_done: bool = False,
+        parameters: dict[str, str | float] | None = None,
+    ) -> None:
+        plan = _plan(tuple(Place.of(place).region for place in regions), pixels, rounds)
+        super().__init__(plan, period_s=every, end_when_done=end_when_done, parameters=parameters)
+
+
+class RegionGrid(PlannedScans):
+    """A region about each point of a grid, there and back row after row: a map larger than one scan, or samples of one.
+
+    Args:
+        size: (width, height) of each region.
+        counts: (columns, rows) of the grid.
+        spacing: (x, y) from one centre to the next; by default the size, so that the regions touch.
+        center: (x, y) of the middle of the grid.
+        angle: of grid and regions, counter-clockwise.
+        pixels: (columns, rows) of each scan.
+        rounds: how often the grid is gone through.
+        every: from the beginning of one round to that of the next, experiment time.
+        end_when_done: whether to end the whole experiment then.
+        parameters: set before the first scan.
+    """
+
+    def __init__(
+        self,
+        size: tuple[Length, Length],
+        counts: tuple[int, int],
+        spacing: tuple[Length, Length] | None = None,
+        center: tuple[Length, Length] = (0.0, 0.0),
+        angle: Angle = 0.0,
+        pixels: Pixels = (128, 128),
+        rounds: int = 1,
+        every: Duration = 0.0,
+        end_when_done: bool = False,
+        parameters: dict[str, str | float] | None = None,
+    ) -> None:
+        points = grid_centers(pair(center), (counts[0], counts[1]), pair(spacing or size), angle)
+        plan = _plan(squares(points, pair(size), angle), pixels, rounds)
+        super().__init__(plan, period_s=every, end_when_done=end_when_done, parameters=parameters)
+
+
+def pair(values: Sequence[float]) -> XY:
+    """Two numbers as a tuple: from JSON they come as a list."""
+    if len(values) != 2:
+        raise InvalidValue(f"{list(values)!r} is not a pair of x and y")
+    return float(values[0]), float(values[1])
+
+
+def _plan(regions: tuple[Region, ...], pixels: Sequence[int], rounds: int | None) -> ScanPlan:
+    columns, rows = pixels
+    return ScanPlan(regions, (int(rows), int(columns)), rounds)
+
+
+def _told(time: datetime | None) -> str:
+    return "" if time is None else f"at {time.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -1,0 +1,62 @@
+"""Spectra on a grid or a list of positions, each exactly once."""
+
+from __future__ import annotations
+
+from afspm.components.plan import grid_centers
+from afspm.components.planned_scans import pair
+from afspm.errors import ConfigError
+from afspm.runtime.component import Component
+from afspm.units import Angle, Length
+
+
+class SpectroscopyGrid(Component):
+    """A spectrum at each point of a grid, or of a list; points are gone to there and back, row after row.
+
+    Whatever process is killed, and whenever, no spectrum is left out or taken twice.
+
+    Args:
+        counts: (columns, rows) of the grid.
+        spacing: (x, y) from one point to the next.
+        center: (x, y) of the middle of the grid.
+        angle: of the grid, counter-clockwise.
+        positions: a list of (x, y) instead of a grid.
+        kind: what is measured, where the microscope can choose, e.g. "IV" or "force".
+        repeats: how many spectra at each point.
+        end_when_done: whether to end the whole experiment after the last.
+    """
+
+    def __init__(
+        self,
+        counts: tuple[int, int] | None = None,
+        spacing: tuple[Length, Length] | None = None,
+        center: tuple[Length, Length] = (0.0, 0.0),
+        angle: Angle = 0.0,
+        positions: list[tuple[Length, Length]] | None = None,
+        kind: str | None = None,
+        repeats: int = 1,
+        end_when_done: bool = False,
+    ) -> None:
+        if (positions is None) == (counts is None):
+            raise ConfigError("either `positions` or `counts` says where to measure")
+        if positions is not None:
+            self.positions = tuple(pair(position) for position in positions)
+        elif counts is not None and spacing is not None:
+            self.positions = grid_centers(pair(center), (counts[0], counts[1]), pair(spacing), angle)
+        else:
+            raise ConfigError("a grid needs its `spacing`", hint='e.g. spacing = ["10 nm", "10 nm"]')
+        if repeats < 1:
+            raise ConfigError(f"{repeats} repeats are none", where="repeats")
+        self.kind = kind
+        self.repeats = repeats
+        self.end_when_done = end_when_done
+
+    def run(self) -> None:
+        total = len(self.positions) * self.repeats
+        for index in range(int(self.memory.get("done", 0)), total):
+            place, repeat = divmod(index, self.repeats)
+            self.scope.spectrum(self.positions[place], kind=self.kind, key=f"spectrum-{place}-{repeat}")
+            self.memory["done"] = index + 1
+            self.memory.save()
+            self.log.info("spectrum %d of %d", index + 1, total)
+        if self.end_when_done:
+            self.scope.end_experiment()
