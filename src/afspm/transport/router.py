@@ -70,25 +70,30 @@ class Router:
         self.address = network.bind(self.socket, address)
 
     def receive(self) -> list[RouterEvent]:
-        """What has come, a batch at a time, each disconnection after what came by the connection before."""
+        """What has come, a batch at a time: connections in the order in which they came and went, and what came by
+        one that is gone before its going."""
         messages: list[list[zmq.Frame]] = []
         while len(messages) < _BATCH and readable(self.socket):
             messages.append(receive(self.socket))
-        found: list[RouterEvent] = []
         # after the messages: every connection that they came by is known then
-        dying = self._follow_connections(found)
+        changes = self._follow_connections()
+        dying = {peer: descriptor for descriptor, peer, came in changes if not came}
+        asked: list[tuple[_Peer, RouterEvent]] = []
         for frames in messages:
             peer = self._sender(frames[0], dying)
-            if peer is None:
+            if peer is not None and (event := self._interpret(peer, frames)) is not None:
+                asked.append((peer, event))
+        if not changes:
+            return [event for _, event in asked]
+        found: list[RouterEvent] = []
+        for _, peer, came in changes:
+            if came:
+                found.append(PeerConnected(peer.connection))
                 continue
-            if len(frames) < 2 or len(frames[1]):
-                self._complaints.say(f"dropped a request of {peer.name or 'somebody'}: no empty frame before it")
-                continue
-            body = [frame.bytes for frame in frames[2:]]
-            found.append(PeerAsked(peer.connection, peer.name, peer.user, body))
-        for peer in dying.values():
-            found.append(self._gone(peer))
-        return found
+            found += [event for asker, event in asked if asker is peer]
+            found.append(PeerDisconnected(peer.connection))
+            self._identities.pop(peer.connection, None)
+        return found + [event for asker, event in asked if asker not in dying]
 
     def reply(self, connection: int, frames: Sequence[bytes]) -> None:
         """Answer by `connection`, if it is still there. Never blocks."""
@@ -96,43 +101,42 @@ class Router:
         if identity is not None:
             self.socket.send_multipart([identity, b"", *frames], zmq.NOBLOCK)
 
-    def _follow_connections(self, found: list[RouterEvent]) -> dict[int, _Peer]:
-        """Take in the monitor's events; returns those that are gone, whose messages may still have to be read."""
-        dying: dict[int, _Peer] = {}
+    def _interpret(self, peer: _Peer, frames: list[zmq.Frame]) -> PeerAsked | None:
+        if len(frames) < 2 or len(frames[1]):
+            self._complaints.say(f"dropped a request of {peer.name or 'somebody'}: no empty frame before it")
+            return None
+        return PeerAsked(peer.connection, peer.name, peer.user, [frame.bytes for frame in frames[2:]])
+
+    def _follow_connections(self) -> list[tuple[int, _Peer, bool]]:
+        """Take in the monitor's events: (descriptor, peer, whether it came or went), in order."""
+        changes = []
         for kind, descriptor in self.monitor.drain():
             gone = self._by_descriptor.pop(descriptor, None)
             if gone is not None:
-                if (earlier := dying.get(descriptor)) is not None:
-                    found.append(self._gone(earlier))
-                dying[descriptor] = gone
+                changes.append((descriptor, gone, False))
             if kind == CONNECTED:
-                found.append(PeerConnected(self._new_peer(descriptor).connection))
-        return dying
+                self._connections += 1
+                peer = self._by_descriptor[descriptor] = _Peer(self._connections)
+                changes.append((descriptor, peer, True))
+        return changes
 
-    def _new_peer(self, descriptor: int) -> _Peer:
-        self._connections += 1
-        peer = self._by_descriptor[descriptor] = _Peer(self._connections)
-        return peer
-
-    def _gone(self, peer: _Peer) -> PeerDisconnected:
-        self._identities.pop(peer.connection, None)
-        return PeerDisconnected(peer.connection)
-
-    def _sender(self, first: zmq.Frame, dying: dict[int, _Peer]) -> _Peer | None:
+    def _sender(self, first: zmq.Frame, dying: dict[_Peer, int]) -> _Peer | None:
+        """Whose message this is; None if its connection is long gone."""
         identity = first.bytes
         descriptor = int(first.get(zmq.SRCFD))
-        peer = dying.get(descriptor)
-        if peer is None or peer.identity not in (identity, None):
-            peer = self._by_descriptor.get(descriptor)
-        if peer is None:
-            return None  # its connection went long ago
+        # a descriptor is given out again at once: what an earlier connection said may still have been waiting
+        for peer, old in dying.items():
+            if old == descriptor and peer.identity in (identity, None):
+                return self._named(peer, first, identity)
+        current = self._by_descriptor.get(descriptor)
+        return None if current is None else self._named(current, first, identity)
+
+    def _named(self, peer: _Peer, first: zmq.Frame, identity: bytes) -> _Peer | None:
         if peer.identity is None:
             peer.identity = self._identities[peer.connection] = identity
             peer.name = _name(identity)
             peer.user = user_of(first) if self._with_keys else None
-        elif peer.identity != identity:
-            return None  # left over from another connection that had the same descriptor
-        return peer
+        return peer if peer.identity == identity else None
 
     def close(self) -> None:
         self.monitor.close()
