@@ -7,6 +7,7 @@ from enum import Enum, auto
 
 OWN_PACE_S = 1.0  # after the end of the experiment: everybody has heard it, and may finish a file
 KILL_AFTER_S = 1.5  # after being asked
+LEAVE_AFTER_S = 3.0  # after being killed
 
 
 class Why(Enum):
@@ -24,20 +25,30 @@ class Why(Enum):
         return {Why.EXPERIMENT_ENDED: 0, Why.ALL_DONE: 0, Why.STOPPED: 130, Why.LOST: 1}[self]
 
 
+class Do(Enum):
+    """What is to be done with those that still run."""
+
+    ASK = auto()
+    """Close their stdin: they end cleanly."""
+    KILL = auto()
+    LEAVE = auto()
+    """Not even killing ends them (a driver hangs in the system): say so, and go."""
+
+
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """A run that is ending: first those left are asked to stop (their stdin is closed), then killed.
+    """A run that is ending: those that still run are asked to end, then killed, then left.
 
     Attributes:
         ask_s, kill_s: when, in real monotonic time.
-        asked: whether they have been.
+        last: what has been done already.
     """
 
     why: Why
     text: str
     ask_s: float
     kill_s: float
-    asked: bool = False
+    last: Do | None = None
 
     @classmethod
     def begin(cls, why: Why, text: str, now_s: float) -> Ending:
@@ -47,8 +58,24 @@ class Ending:
 
     def hurried(self, now_s: float) -> Ending:
         """Somebody asked again: no more waiting."""
-        return replace(self, ask_s=now_s, kill_s=now_s)
+        return self if self.last in (Do.KILL, Do.LEAVE) else replace(self, kill_s=now_s, last=Do.ASK)
 
-    def deadline_s(self) -> float:
-        """When there is something to do next."""
-        return self.kill_s if self.asked else self.ask_s
+    def deadline_s(self) -> float | None:
+        """When `step` has something to do next; None: never again."""
+        match self.last:
+            case None:
+                return self.ask_s
+            case Do.ASK:
+                return self.kill_s
+            case Do.KILL:
+                return self.kill_s + LEAVE_AFTER_S
+            case Do.LEAVE:
+                return None
+
+    def step(self, now_s: float) -> tuple[Ending, Do | None]:
+        """What the time has come for, if anything, and the ending after it."""
+        deadline_s = self.deadline_s()
+        if deadline_s is None or now_s < deadline_s:
+            return self, None
+        do = {None: Do.ASK, Do.ASK: Do.KILL, Do.KILL: Do.LEAVE}[self.last]
+        return replace(self, last=do), do

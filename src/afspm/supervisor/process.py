@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, Literal
 
 from afspm.errors import AfspmError
+from afspm.runtime.exit_codes import ExitCode
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
 LAST_WORDS_S = 0.3  # how long output may still come after an exit (a grandchild can hold the pipe open)
@@ -122,9 +123,19 @@ class ChildProcess:
                 self._tell(Printed(self.name, self.pid, stream, text))
 
 
-def _start(
-    command: Sequence[str], environment: Mapping[str, str], folder: Path | None
-) -> subprocess.Popen[bytes]:
+def describe_exit(code: int) -> str:
+    """What an exit code says, in words."""
+    if code in set(ExitCode):
+        return f"ended ({ExitCode(code).name.lower()})"
+    if code < 0:
+        try:
+            return f"killed by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"killed by signal {-code}"
+    return f"ended with exit code {code}"
+
+
+def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path | None) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         command,
         stdin=subprocess.PIPE,

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from afspm.supervisor.ending import KILL_AFTER_S, OWN_PACE_S, Ending, Why
+from afspm.supervisor.ending import KILL_AFTER_S, LEAVE_AFTER_S, OWN_PACE_S, Do, Ending, Why
 
 
 def test_ctrl_c_asks_at_once_and_kills_within_two_seconds() -> None:
@@ -16,7 +16,24 @@ def test_at_the_end_of_the_experiment_all_may_finish_first() -> None:
 
 
 def test_a_second_ctrl_c_kills_at_once() -> None:
-    assert Ending.begin(Why.EXPERIMENT_ENDED, "", 100.0).hurried(100.2).kill_s == 100.2
+    ending = Ending.begin(Why.EXPERIMENT_ENDED, "", 100.0).hurried(100.2)
+    assert ending.step(100.2)[1] is Do.KILL
+
+
+def test_a_third_ctrl_c_changes_nothing_about_what_is_killed_already() -> None:
+    ending, _ = Ending.begin(Why.STOPPED, "", 100.0).hurried(100.2).step(100.2)
+    assert ending.hurried(100.3) == ending
+
+
+def test_each_stage_comes_once_and_in_its_time() -> None:
+    ending = Ending.begin(Why.STOPPED, "Ctrl-C", 100.0)
+    done = []
+    for tenth in range(100):
+        ending, do = ending.step(100.0 + tenth / 10)
+        if do:
+            done.append((do, tenth / 10))
+    assert done == [(Do.ASK, 0.0), (Do.KILL, KILL_AFTER_S), (Do.LEAVE, KILL_AFTER_S + LEAVE_AFTER_S)]
+    assert ending.deadline_s() is None
 
 
 def test_an_end_on_purpose_is_a_success_and_a_loss_is_none() -> None:

@@ -1,0 +1,85 @@
+"""`afspm run`: an experiment, from its file to the folder that it leaves behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.cli.arguments import Files
+
+if TYPE_CHECKING:
+    from afspm.experiment import Start
+
+
+def run(
+    files: Files,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--only", metavar="NAME[,NAME…]", help="Start these processes here, and no others.", show_default=False
+        ),
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without", metavar="NAME[,NAME…]", help="Start all processes here but these.", show_default=False
+        ),
+    ] = None,
+    runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the run's folder.")] = Path("runs"),
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.", show_default=False
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check, say what would be started, and start nothing.")
+    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details too.")] = False,
+) -> None:
+    """Run an experiment.
+
+    Everything is checked before anything starts. Processes that crash or freeze are restarted. Ctrl-C ends the
+    experiment cleanly, a second one at once. Ends with 0 when the experiment has ended by itself, with 1 when the
+    experiment file is wrong or something essential was given up.
+    """
+    import logging
+    import sys
+
+    from afspm.cli import check
+    from afspm.experiment import load
+    from afspm.supervisor import run as running
+
+    experiment = load(*files)
+    findings = experiment.check()
+    if findings:
+        from rich.console import Console
+
+        check.show(findings, Console(stderr=True, highlight=False))
+    if any(finding.is_error for finding in findings):
+        raise typer.Exit(1)
+    options = running.Options(
+        runs=runs,
+        only=_names(only),
+        without=_names(without),
+        speed=speed,
+        log_level=logging.DEBUG if verbose else logging.INFO,
+    )
+    if dry_run:
+        for start in running.dry_run(experiment, options):
+            typer.echo(_told(start))
+        return
+    ended = running.run(experiment, options, terminal=sys.stdout)
+    raise typer.Exit(ended.outcome.exit_code)
+
+
+def _names(given: list[str] | None) -> tuple[str, ...]:
+    """Names given by repeating the option, by commas, or both."""
+    return tuple(name.strip() for names in given or () for name in names.split(",") if name.strip())
+
+
+def _told(start: Start) -> str:
+    what = " ".join(start.command) or start.launch.class_
+    return f"{start.launch.name} ({start.role.value}): {what}"

@@ -1,0 +1,34 @@
+"""What is said at the end of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from afspm.supervisor.supervisor import Outcome
+
+
+def lines(outcome: Outcome, folder: Path) -> list[str]:
+    """The summary: why it ended, what ran, what had to be restarted or was given up, where everything is."""
+    told = [f"{outcome.text}, after {_duration(outcome.duration_s)}"]
+    told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
+    for report in outcome.reports:
+        if report.starts > 1:
+            told.append(f"{report.name} was restarted {_times(report.starts - 1)}")
+        if report.given_up:
+            told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
+    told.append(f"everything is in {folder}")
+    return told
+
+
+def _times(count: int) -> str:
+    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes, rest_s = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest_s} s"

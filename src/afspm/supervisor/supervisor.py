@@ -1,0 +1,228 @@
+"""The supervisor: one poller on heartbeats, exits, output, signals and the next deadline.
+
+What to do about a child is decided by `logic.supervision.ChildWatch`, how a run ends by `ending`; here it is done.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from afspm.clock import Clock
+from afspm.errors import AfspmError
+from afspm.logic import supervision
+from afspm.runtime.exit_codes import ExitCode
+from afspm.supervisor import signals
+from afspm.supervisor.ending import Do, Ending, Why
+from afspm.supervisor.log import SUPERVISOR, LineReader, RunLog
+from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed, describe_exit
+from afspm.supervisor.task import Task
+from afspm.transport.heartbeat import HeartbeatListener
+from afspm.transport.wakeup import WakeUp
+
+
+@dataclass(frozen=True)
+class Report:
+    """What became of one process: how often it was started, whether it was given up, how it ended last."""
+
+    name: str
+    starts: int
+    given_up: bool
+    last_exit: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    why: Why
+    text: str
+    reports: tuple[Report, ...]
+    duration_s: float
+
+    @property
+    def exit_code(self) -> int:
+        """Of `afspm run`."""
+        return self.why.exit_code
+
+
+@dataclass
+class _Child:
+    task: Task
+    heartbeat: str
+    watch: supervision.ChildWatch
+    process: ChildProcess | None = None
+    lines: LineReader = field(default_factory=LineReader)
+    starts: int = 0
+    given_up: bool = False
+    last_exit: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.task.name
+
+    @property
+    def over(self) -> bool:
+        return self.given_up or self.watch.over
+
+
+class Supervisor:
+    """Runs tasks until the experiment ends, everything is done, something essential is lost, or it is stopped."""
+
+    def __init__(self, tasks: Sequence[Task], log: RunLog, clock: Clock, policy: supervision.Policy) -> None:
+        self._log = log
+        self._clock = clock
+        self._wakeup: WakeUp[ChildEvent | signals.Signalled] = WakeUp()
+        self._beats = HeartbeatListener(self._wakeup)
+        self._children = {
+            task.name: _Child(task, self._beats.listen(task.name), supervision.ChildWatch(policy)) for task in tasks
+        }
+        self._ending: Ending | None = None
+
+    def run(self) -> Outcome:
+        """Start everything; returns when nothing of it runs any more."""
+        began_s = self._clock.monotonic_s()
+        try:
+            with signals.told(self._wakeup.post, self._wakeup.writer_fileno()):
+                for child in self._children.values():
+                    self._carry_out(child, child.watch.begin(began_s))
+                while self._ending is None or any(child.process for child in self._children.values()):
+                    self._wait()
+                    self._attend()
+        finally:  # also when an error of ours ends it: nothing may be left behind
+            for child in self._children.values():
+                if child.process:
+                    child.process.kill()
+            self._beats.close()
+            self._wakeup.close()
+        reports = tuple(
+            Report(child.name, child.starts, child.given_up, child.last_exit) for child in self._children.values()
+        )
+        return Outcome(self._ending.why, self._ending.text, reports, self._clock.monotonic_s() - began_s)
+
+    # --- what comes in ---
+
+    def _wait(self) -> None:
+        """Wait for whatever comes first, and take all of it in."""
+        beats = self._beats.poll(self._timeout_s())
+        now_s = self._clock.monotonic_s()
+        for beat in beats:
+            child = self._children[beat.name]
+            self._carry_out(child, child.watch.beat(beat, now_s))
+        for event in self._wakeup.take():
+            match event:
+                case Printed():
+                    self._on_printed(self._children[event.name], event)
+                case Exited():
+                    self._on_exited(self._children[event.name], event)
+                case signals.Signalled():
+                    self._on_signal(event)
+
+    def _timeout_s(self) -> float | None:
+        """How long there is nothing to do if nothing happens; None: for ever."""
+        now_s = self._clock.monotonic_s()
+        if self._ending:
+            deadlines = [self._ending.deadline_s()]
+        else:
+            deadlines = [child.watch.deadline_s() for child in self._children.values()]
+        soonest_s = min((s for s in deadlines if s is not None), default=None)
+        return None if soonest_s is None else max(0.0, soonest_s - now_s)
+
+    def _on_printed(self, child: _Child, printed: Printed) -> None:
+        level, text = child.lines.read(printed.stream, printed.line)
+        self._log.write(child.name, level, text)
+
+    def _on_exited(self, child: _Child, exited: Exited) -> None:
+        if child.process is None or child.process.pid != exited.pid:
+            return
+        child.process = None
+        child.last_exit = describe_exit(exited.code)
+        if self._ending is not None:
+            self._log.write(child.name, logging.DEBUG, child.last_exit)
+            return
+        self._carry_out(child, child.watch.exited(exited.code, self._clock.monotonic_s(), child.last_exit))
+        if exited.code == ExitCode.ENDED:
+            self._end(Why.EXPERIMENT_ENDED, "the experiment has ended")
+        elif exited.code == ExitCode.CONFIG:
+            self._give_up(child, "its settings can't work, so starting it again is of no use")
+        elif exited.code == ExitCode.DONE and child.task.essential:
+            self._end(Why.EXPERIMENT_ENDED, f"{child.name} is done")
+
+    def _on_signal(self, signalled: signals.Signalled) -> None:
+        if self._ending is None:
+            self._end(Why.STOPPED, f"stopped by {signalled.name}")
+        else:
+            self._ending = self._ending.hurried(self._clock.monotonic_s())
+
+    # --- what is done about it ---
+
+    def _attend(self) -> None:
+        """Do what the time has come for."""
+        now_s = self._clock.monotonic_s()
+        if self._ending is not None:
+            self._go_on_ending(self._ending, now_s)
+            return
+        for child in self._children.values():
+            self._carry_out(child, child.watch.tick(now_s))
+        if self._ending is None and all(child.over for child in self._children.values()):
+            lost = all(child.given_up for child in self._children.values())
+            self._end(Why.LOST if lost else Why.ALL_DONE, "nothing is left to run")
+
+    def _carry_out(self, child: _Child, effects: Sequence[supervision.Effect]) -> None:
+        for effect in effects:
+            match effect:
+                case supervision.Start():
+                    self._start(child)
+                case supervision.Kill():
+                    if child.process:
+                        child.process.kill()
+                case supervision.Log(level, text):
+                    self._log.write(child.name, logging.getLevelNamesMapping()[level], text)
+                case supervision.GiveUp(why):
+                    self._give_up(child, why)
+
+    def _start(self, child: _Child) -> None:
+        task = child.task
+        if self._ending is not None:
+            return
+        launch = replace(task.launch, sockets=replace(task.launch.sockets, heartbeat=child.heartbeat))
+        child.lines = LineReader()
+        child.starts += 1
+        try:
+            child.process = ChildProcess(
+                task.name, task.command, launch.to_json(), self._wakeup.post, task.environment, task.folder
+            )
+        except AfspmError as error:
+            child.last_exit = f"could not be started: {error}"
+            self._carry_out(child, child.watch.start_failed(str(error), self._clock.monotonic_s()))
+
+    def _give_up(self, child: _Child, why: str) -> None:
+        child.given_up = True
+        if child.task.essential:
+            self._end(Why.LOST, f"{child.name}, which the experiment can't do without, is given up: {why}")
+        else:
+            self._log.write(SUPERVISOR, logging.CRITICAL, f"{child.name} is given up, the rest goes on: {why}")
+
+    def _end(self, why: Why, text: str) -> None:
+        if self._ending is None:
+            now_s = self._clock.monotonic_s()
+            self._ending = Ending.begin(why, text, now_s)
+            for child in self._children.values():
+                child.watch.stop(now_s)
+            self._log.write(SUPERVISOR, logging.INFO if why is not Why.LOST else logging.CRITICAL, text)
+
+    def _go_on_ending(self, ending: Ending, now_s: float) -> None:
+        self._ending, do = ending.step(now_s)
+        for child in self._children.values():
+            if child.process is None:
+                continue
+            match do:
+                case Do.ASK:
+                    child.process.close_stdin()
+                case Do.KILL:
+                    self._log.write(child.name, logging.WARNING, "does not end: killed")
+                    child.process.kill()
+                case Do.LEAVE:
+                    self._log.write(child.name, logging.CRITICAL, f"can't be killed (process {child.process.pid})")
+                    child.process = None
