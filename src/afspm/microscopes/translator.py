@@ -62,6 +62,7 @@ class Translator:
         self._values: dict[str, Value] = {}
         self._connected = self._started = False
         self._retry_at_s = 0.0
+        self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
 
@@ -121,10 +122,12 @@ class Translator:
         return True
 
     def _lose(self, error: Exception) -> None:
-        self._log.error("the controller is not there: %s", error)
-        self._connected = False
         self._retry_at_s = self._clock.monotonic_s() + _RECONNECT_S
-        if self._sequence.said.state is not ScopeState.UNDEFINED:
+        was_connected, self._connected = self._connected, False
+        if was_connected or str(error) != self._complaint:
+            self._complaint = str(error)
+            self._log.error("the controller can't be reached, it is tried again: %s", error)
+        if was_connected:
             # what it was doing is remembered: it may still be at it when it is found again
             self._publish(ScopeStatus(ScopeState.UNDEFINED))
 
@@ -183,7 +186,8 @@ class Translator:
         try:
             self._answer(request)
         except LOST as error:
-            self._lose(error)
+            if self._connected:
+                self._lose(error)
             reason = f"the controller can't be reached: {error}"
             self._finish(request, Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id))
 

@@ -1,0 +1,128 @@
+"""The files that the simulated controller saves: one per scan with all its channels, one per spectrum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from afspm.errors import FileError
+from afspm.microscopes.simulator import netcdf
+from afspm.microscopes.simulator.netcdf import Attributes, Variable
+from afspm.model import Region, Scan, Spectrum
+
+_CONVENTIONS = "afspm simulator 1"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a file is made of besides its values.
+
+    Attributes:
+        time_ns: when it was finished.
+        attributes: everything that was in force, for whoever opens the file.
+    """
+
+    time_ns: int
+    attributes: Attributes
+
+
+def encode_scan(region: Region, channels: Mapping[str, tuple[str, np.ndarray]], measured: Measured) -> bytes:
+    """A scan file: a variable over (y, x) per channel; x and y are those of the frame before it was turned."""
+    rows, columns = next(iter(channels.values()))[1].shape
+    (left, low), (width, height) = region.top_left_m, region.size_m
+    variables = {
+        "y": Variable(("y",), np.linspace(low, low + height, rows), {"units": "m"}),
+        "x": Variable(("x",), np.linspace(left, left + width, columns), {"units": "m"}),
+    }
+    for channel, (unit, values) in channels.items():
+        attributes: Attributes = {"long_name": channel, "units": unit}
+        variables[_identifier(channel)] = Variable(("y", "x"), values, attributes)
+    where = {
+        "region_center_x_m": region.center_m[0],
+        "region_center_y_m": region.center_m[1],
+        "region_size_x_m": region.size_m[0],
+        "region_size_y_m": region.size_m[1],
+        "region_angle_rad": region.angle_rad,
+    }
+    return netcdf.encoded(variables, _header("scan", measured) | where | dict(measured.attributes))
+
+
+def encode_spectrum(spectrum: Spectrum, measured: Measured) -> bytes:
+    """A spectrum file: a variable over (point) per measured one, in their order."""
+    variables = {}
+    for number, (name, unit) in enumerate(zip(spectrum.names, spectrum.units, strict=True)):
+        attributes: Attributes = {"long_name": name, "units": unit}
+        variables[_identifier(name)] = Variable(("point",), spectrum.values[:, number], attributes)
+    where: dict[str, str | float] = {"kind": spectrum.kind}
+    if spectrum.position_m is not None:
+        where |= {"position_x_m": spectrum.position_m[0], "position_y_m": spectrum.position_m[1]}
+    return netcdf.encoded(variables, _header("spectrum", measured) | where | dict(measured.attributes))
+
+
+def load(path: Path) -> list[Scan | Spectrum]:
+    """What is in a file: every channel of a scan, or one spectrum.
+
+    Raises:
+        FileError: missing, not whole, or something else.
+    """
+    variables, attributes = netcdf.read(path)
+    time_ns = int(str(attributes.get("time_ns", "0")))
+    try:
+        if attributes.get("content") == "spectrum":
+            return [_spectrum(variables, attributes, time_ns, str(path))]
+        return [*_scans(variables, attributes, time_ns, str(path))]
+    except (KeyError, ValueError) as error:
+        raise FileError(f"lacks {error}", where=str(path)) from error
+
+
+def _scans(variables: Mapping[str, Variable], attributes: Attributes, time_ns: int, filename: str) -> list[Scan]:
+    def number(name: str) -> float:
+        return float(attributes[f"region_{name}"])
+
+    region = Region(
+        (number("center_x_m"), number("center_y_m")),
+        (number("size_x_m"), number("size_y_m")),
+        number("angle_rad"),
+    )
+    return [
+        Scan(
+            region,
+            str(variable.attributes["long_name"]),
+            str(variable.attributes["units"]),
+            variable.values,
+            time_ns,
+            filename,
+        )
+        for name, variable in variables.items()
+        if name not in ("x", "y")
+    ]
+
+
+def _spectrum(variables: Mapping[str, Variable], attributes: Attributes, time_ns: int, filename: str) -> Spectrum:
+    position = None
+    if "position_x_m" in attributes:
+        position = (float(attributes["position_x_m"]), float(attributes["position_y_m"]))
+    return Spectrum(
+        position,
+        str(attributes["kind"]),
+        tuple(str(variable.attributes["long_name"]) for variable in variables.values()),
+        tuple(str(variable.attributes["units"]) for variable in variables.values()),
+        np.stack([variable.values for variable in variables.values()], axis=1),
+        time_ns,
+        filename,
+    )
+
+
+def _header(content: str, measured: Measured) -> dict[str, str | float]:
+    # as text: a float64 has no room for nanoseconds since 1970
+    when = datetime.fromtimestamp(measured.time_ns / 1e9, UTC).isoformat()
+    return {"Conventions": _CONVENTIONS, "content": content, "time": when, "time_ns": str(measured.time_ns)}
+
+
+def _identifier(name: str) -> str:
+    """A name that every reader of the format takes; the real one is the attribute `long_name`."""
+    return "".join(c if c.isascii() and c.isalnum() else "_" for c in name).lower()
