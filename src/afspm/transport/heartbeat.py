@@ -45,19 +45,20 @@ class HeartbeatSender:
 
     def __init__(
         self,
-        network: Network,
         address: str,
         period_s: float,
         step_age_s: Callable[[], float],
         longest_step_s: Callable[[], float],
     ) -> None:
+        # a network of its own: beats stay on this computer, and need no keys
+        self._network = Network()
         self._period_ms = max(1, round(period_s * 1000.0))
         self._step_age_s = step_age_s
         self._longest_step_s = longest_step_s
         self._stop: WakeUp[None] = WakeUp()
         # XPUB, since it sees the listener subscribe: a beat sent before that would be lost
-        self._socket = network.socket(zmq.XPUB)
-        network.connect(self._socket, address)
+        self._socket = self._network.socket(zmq.XPUB)
+        self._network.connect(self._socket, address)
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
         self._thread.start()
 
@@ -80,10 +81,11 @@ class HeartbeatSender:
         self._socket.send_multipart([beat, *(f"{age_s:.3f}".encode() for age_s in ages)])
 
     def close(self) -> None:
-        """Say that we are closing on purpose, and stop. Before the network is closed; safe to repeat."""
+        """Say that we are closing on purpose, and stop. Safe to repeat."""
         if self._thread.is_alive():
             self._stop.post()
             self._thread.join()
+            self._network.close()
             self._stop.close()
 
 

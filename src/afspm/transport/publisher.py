@@ -28,7 +28,7 @@ class Publisher:
     """
 
     def __init__(self, network: Network, address: str, history: History) -> None:
-        self._history = history
+        self.history = history
         self.socket = network.socket(zmq.XPUB)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
@@ -63,7 +63,7 @@ class Publisher:
             # anything else is no subscription: nobody has a reason to send that here
         for prefixes in plain.values():
             # all of one peer's prefixes together: peers of version 1 lose what comes out of order
-            for packet in self._history(None, tuple(str(p, "utf-8", "replace") for p in prefixes), -1):
+            for packet in self.history(None, tuple(str(p, "utf-8", "replace") for p in prefixes), -1):
                 self.publish(packet)
         return joined + len(plain)
 
@@ -86,7 +86,7 @@ class Publisher:
         socket.setsockopt(zmq.SUBSCRIBE, topic)
         for prefix in spelled_out(prefix.encode() for prefix in marker.prefixes):
             socket.setsockopt(zmq.SUBSCRIBE, prefix)
-        for packet in self._history(topic, marker.prefixes, marker.since_ns):
+        for packet in self.history(topic, marker.prefixes, marker.since_ns):
             socket.send(topic, zmq.SNDMORE)
             socket.send(packet.envelope.encode(), zmq.SNDMORE)
             send_payload(socket, packet.payload, zmq.SNDMORE)

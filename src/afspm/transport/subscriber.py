@@ -28,6 +28,8 @@ class Subscriber:
         name: of this component.
         prefixes: of the envelopes wanted; None for all. The signal KILL always comes.
         since_ns: what is not newer is known already.
+        filtered: drop what is not newer than the newest of its envelope, as is right where times always increase. A
+            translator's may not, if its clock is set back: then the one who listens has to tell doubles.
     """
 
     def __init__(
@@ -39,7 +41,9 @@ class Subscriber:
         complaints: Complaints,
         *,
         since_ns: int = -1,
+        filtered: bool = True,
     ) -> None:
+        self._filtered = filtered
         self._name = name
         self.address = address
         self._prefixes = _with_kill(prefixes)
@@ -104,6 +108,9 @@ class Subscriber:
     def _is_new(self, packet: Packet) -> bool:
         time_ns = packet.time_ns
         if time_ns is None:
+            return True
+        if not self._filtered:
+            self._newest_ns = time_ns
             return True
         known = self._newest_of
         if time_ns <= known.get(packet.envelope, self._started_ns):

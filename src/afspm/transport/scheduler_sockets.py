@@ -1,0 +1,84 @@
+"""The sockets of a scheduler, in one poller."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+
+import zmq
+
+from afspm.errors import ConfigError
+from afspm.model import Packet
+from afspm.transport.complaints import Complaints
+from afspm.transport.launching import Launched
+from afspm.transport.network import Network
+from afspm.transport.publisher import Publisher
+from afspm.transport.router import Router
+from afspm.transport.subscriber import Subscriber
+from afspm.transport.translator_link import TranslatorLink
+from afspm.transport.wakeup import WakeUp
+
+Source = Router | TranslatorLink | Subscriber | Publisher
+
+
+class SchedulerSockets:
+    """Publisher and router for the components, subscriber and link to the translator.
+
+    Args:
+        since_ns: up to which the translator's packets are known.
+
+    Raises:
+        TransportError: an address can't be used.
+        ConfigError: one is missing.
+    """
+
+    def __init__(self, launch: Launched, complaints: Complaints, *, since_ns: int) -> None:
+        sockets = launch.sockets
+        if sockets.publish is None or sockets.serve is None or sockets.control is None or not sockets.subscribe:
+            raise ConfigError(
+                "a scheduler needs four addresses: publish, serve, and control and subscribe of its translator",
+                where=launch.name,
+            )
+        self._network = Network.from_launch(launch.name, launch.keys)
+        self._wake_up: WakeUp[None] = WakeUp()
+        self.publisher = Publisher(self._network, sockets.publish, _nothing)
+        self.router = Router(self._network, sockets.serve, complaints)
+        self.link = TranslatorLink(self._network, sockets.control, complaints)
+        self.subscriber = Subscriber(
+            self._network, launch.name, sockets.subscribe[0], None, complaints, since_ns=since_ns, filtered=False
+        )
+        self._sources: dict[zmq.Socket[bytes], Source] = {
+            self.router.socket: self.router,
+            self.router.monitor.socket: self.router,
+            self.link.socket: self.link,
+            self.link.monitor.socket: self.link,
+            self.subscriber.socket: self.subscriber,
+            self.subscriber.monitor.socket: self.subscriber,
+            self.publisher.socket: self.publisher,
+        }
+        self._poller = zmq.Poller()
+        for socket in self._sources:
+            self._poller.register(socket, zmq.POLLIN)
+        self._poller.register(self._wake_up.fileno(), zmq.POLLIN)
+
+    def wait(self, timeout_ms: int | None) -> list[Source]:
+        """Those that have something to receive; returns early, perhaps with none, after `wake_up`."""
+        found: list[Source] = []
+        for ready, _ in self._poller.poll(timeout_ms):
+            if isinstance(ready, int):
+                self._wake_up.take()
+            elif (source := self._sources[ready]) not in found:
+                found.append(source)
+        return found
+
+    def wake_up(self) -> None:
+        """End a `wait` under way, or the next. From any thread."""
+        self._wake_up.post()
+
+    def close(self) -> None:
+        """Close all once what was sent has gone out, within a fraction of a second."""
+        self._network.close()
+        self._wake_up.close()
+
+
+def _nothing(_who: Hashable, _prefixes: tuple[str, ...], _since_ns: int) -> tuple[Packet, ...]:
+    return ()
