@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -194,25 +194,25 @@ def _number(resolved: Resolved, problem: str) -> int | None:
 def check_envelopes(resolved: Resolved) -> None:
     """Every envelope subscribed to is published by somebody."""
     published = {*PUBLISHED, *(e for said in resolved.declared.values() for e in said.publishes)}
-    named = set(resolved.cache_envelopes)
+    published |= set(resolved.caching.envelopes)
     for part in resolved.parts.components:
         for i, prefix in enumerate(resolved.envelopes(part) or ()):
             key = next((k for k in ("envelopes", "subscriber") if k in part.own), "class")
             place = resolved.document.place(part.name, key, *([i] if key == "envelopes" else []))
-            if _is_published(prefix, published | named):
+            if _is_published(prefix, published, resolved.caching.envelopes):
                 continue
-            hint = nearest(prefix, published | named)
+            hint = nearest(prefix, published)
             what = f"[{part.name}] subscribes to {prefix!r}, which nobody publishes"
-            if resolved.own_mapping:
+            if resolved.caching.mapping is not None:
                 resolved.findings.warning(what + ", unless the mapping of [cache] makes it", place, hint)
             else:
                 resolved.findings.error(what, place, hint)
 
 
-def _is_published(prefix: str, published: set[str]) -> bool:
-    """A prefix fits what it begins; scans and spectra continue with their kind."""
+def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
+    """A prefix fits what it begins; scans, spectra and what rules of the cache fill in go on behind their beginning."""
     return any(name.startswith(prefix) for name in published) or any(
-        prefix == name or prefix.startswith(name + "_") for name in CONTINUED
+        prefix.startswith(start) for start in (*(f"{name}_" for name in CONTINUED), *filter(None, made))
     )
 
 

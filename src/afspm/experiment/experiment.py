@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import document as documents
 from afspm.experiment import parts as sorting
@@ -17,6 +18,7 @@ from afspm.runtime.launch import Launch
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved import Resolved
+    from afspm.logic.supervision import Policy
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,23 @@ class Experiment:
             )
             for start in starts
         ]
+
+    def policy(self) -> Policy:
+        """How processes are watched and started again, from [restart]."""
+        from afspm.logic.liveness import LivenessPolicy
+        from afspm.logic.restart import RestartPolicy
+        from afspm.logic.supervision import Policy
+
+        r = self.resolved.restart
+        return Policy(
+            LivenessPolicy(r.beat_period, r.missed_beats, r.start, r.longest_step, r.closing),
+            RestartPolicy(r.budget, r.window, r.first_delay, longest_delay_s=r.longest_delay, healthy_s=r.healthy),
+        )
+
+    def clock(self) -> ExperimentClock:
+        """The clock of a run that begins now, from [clock]."""
+        settings = self.resolved.clock
+        return ExperimentClock.starting_now(settings.start.timestamp() if settings.start else None, settings.speed)
 
     def expanded(self) -> str:
         """The whole experiment as one TOML text: references replaced, defaults filled in."""

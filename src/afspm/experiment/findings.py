@@ -60,6 +60,11 @@ class Findings:
         if finding not in self.found:
             self.found.append(finding)
 
+    @property
+    def errors(self) -> int:
+        """How many errors there are so far."""
+        return sum(finding.is_error for finding in self.found)
+
     def ordered(self) -> list[Finding]:
         """Errors first, then in the order of the files' lines."""
         return sorted(self.found, key=lambda f: (not f.is_error, f.place.file, f.place.line))

@@ -7,15 +7,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from afspm.errors import InvalidValue
-from afspm.experiment import abilities, classes, sections, settings, wiring
+from afspm.errors import AfspmError, InvalidValue
+from afspm.experiment import abilities, caching, classes, limits, planned, sections, settings, wiring
 from afspm.experiment.abilities import Abilities
+from afspm.experiment.caching import Caching
 from afspm.experiment.classes import Declared
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
 from afspm.experiment.parts import Part, Parts, Role
 from afspm.experiment.wiring import Net, Wires
+from afspm.logic.limits import Limits
 from afspm.model import ProblemNames
+
+FROM_SECTIONS = ("control", "limits", "cache")
+"""Arguments of a scheduler's constructor that come from sections of these names."""
 
 
 @dataclass
@@ -29,8 +34,11 @@ class Resolved:
     control: sections.Control
     security: sections.Security
     messages: sections.Messages
+    restart: sections.Restart
     problems: ProblemNames
     named_problems: dict[str, int]
+    refused: set[str] = field(default_factory=set)
+    """Those whose settings are wrong."""
     classes: dict[str, type] = field(default_factory=dict)
     class_paths: dict[str, str] = field(default_factory=dict)
     roles: dict[str, Role] = field(default_factory=dict)
@@ -38,8 +46,8 @@ class Resolved:
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     wires: dict[str, Wires] = field(default_factory=dict)
     net: Net = field(default_factory=Net)
-    cache_envelopes: tuple[str, ...] = ()
-    own_mapping: bool = False
+    limits: Limits = field(default_factory=Limits)
+    caching: Caching = field(default_factory=Caching)
 
     def with_role(self, role: Role) -> list[Part]:
         return [part for part in self.parts.components if self.roles.get(part.name) is role]
@@ -84,14 +92,16 @@ def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:
         control=section(sections.Control, "control"),
         security=section(sections.Security, "security"),
         messages=section(sections.Messages, "messages"),
+        restart=section(sections.Restart, "restart"),
         problems=ProblemNames(named),
         named_problems=named,
     )
+    for part in parts.components:
+        resolved.wires[part.name] = wiring.read_wires(part, document.place, findings)
     with classes.importing_from(document.folders):
         for part in parts.components:
             _resolve_part(part, resolved)
-    for part in parts.components:
-        resolved.wires[part.name] = wiring.read_wires(part, document.place, findings)
+        _resolve_sections(resolved)
     resolved.net = wiring.connect(parts.components, resolved.roles, resolved.declared, resolved.wires, document.place)
     return resolved
 
@@ -119,7 +129,47 @@ def _resolve_part(part: Part, resolved: Resolved) -> None:
         return
     resolved.classes[name], resolved.class_paths[name], resolved.roles[name] = component, path, role
     resolved.declared[name] = Declared.of_class(component)
-    resolved.settings[name] = settings.check(component, part.settings, (name,), document, findings)
+    errors = findings.errors
+    given = FROM_SECTIONS if role is Role.SCHEDULER else ()
+    resolved.settings[name] = settings.check(component, part.settings, (name,), document, findings, given)
+    if findings.errors > errors:
+        resolved.refused.add(name)
+
+
+def _resolve_sections(resolved: Resolved) -> None:
+    """The sections whose meaning depends on the components: what is kept, what is allowed, what is planned."""
+    parts, document, findings = resolved.parts, resolved.document, resolved.findings
+    logic = next((wires.cache_logic for wires in resolved.wires.values() if wires.cache_logic), None)
+    resolved.caching = caching.read(parts.sections.get("cache", {}), logic, document, findings)
+    has = next((has for part in resolved.with_role(Role.TRANSLATOR) if (has := resolved.abilities(part))), None)
+    reader = limits.LimitsReader(
+        document,
+        findings,
+        components=tuple(part.name for part in parts.components),
+        parameters=abilities.base() if has is None else {**abilities.base(), **has.parameters},
+        actions=None if has is None else has.actions,
+        certain=has is not None,
+    )
+    resolved.limits = reader.read(parts.sections.get("limits", {}))
+    for part in resolved.with_role(Role.COMPONENT):
+        if part.name in resolved.classes and part.name not in resolved.refused:
+            _resolve_plan(part.name, resolved)
+
+
+def _resolve_plan(name: str, resolved: Resolved) -> None:
+    """A ready-made component is made once: it knows best whether its settings fit together."""
+    place = resolved.document.place(name)
+    try:
+        plan = planned.plan_of(resolved.classes[name], resolved.settings[name])
+    except AfspmError as error:
+        where = resolved.document.place(name, error.where) if error.where else place
+        resolved.findings.error(f"[{name}] {error.what}", where, error.hint)
+        return
+    except Exception as error:
+        resolved.findings.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", place)
+        return
+    for reason in planned.refusals(name, plan, resolved.limits) if plan else ():
+        resolved.findings.error(f"[{name}] plans what its limits refuse: {reason}", place)
 
 
 def _written_role(part: Part, resolved: Resolved) -> Role:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import datetime
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import pydantic
 from pydantic import Field
@@ -20,6 +21,7 @@ class Section(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
+DangerousState = Literal["MOVING", "SCANNING", "COARSE_MOTOR", "BUSY_PARAM", "SPEC", "feedback-off"]
 PositiveDuration = Annotated[Duration, Field(gt=0)]
 
 
@@ -49,6 +51,10 @@ class Control(Section):
     request_retries: Annotated[int, Field(ge=0)] = 3
     solved_by_hand: tuple[str, ...] = ()
     """Problems that a person puts right: they may be flagged though no component solves them."""
+    retract: bool = True
+    """Whether the tip is retracted when a holder dies in a dangerous state, where the microscope can."""
+    dangerous: tuple[DangerousState, ...] | None = None
+    """Those states; None: what the watchdog takes for dangerous by itself."""
     roles: Roles = Roles()
 
 
@@ -57,6 +63,21 @@ class Security(Section):
 
     keys: str | None = None
     insecure: bool = False
+
+
+class Restart(Section):
+    """[restart]: how patiently processes are watched, and how often they are started again. Real time."""
+
+    beat_period: PositiveDuration = 1.0
+    missed_beats: Annotated[int, Field(ge=1)] = 3
+    start: PositiveDuration = 30.0
+    longest_step: PositiveDuration = 30.0
+    closing: PositiveDuration = 5.0
+    budget: Annotated[int, Field(ge=0)] = 10
+    window: PositiveDuration = 600.0
+    first_delay: Annotated[Duration, Field(ge=0)] = 0.25
+    longest_delay: Annotated[Duration, Field(ge=0)] = 30.0
+    healthy: PositiveDuration = 30.0
 
 
 class Messages(Section):
@@ -93,7 +114,7 @@ def report(
     elif isinstance(cause := error.get("ctx", {}).get("error"), AfspmError):
         findings.error(f"{shown} = {error['input']!r}: {cause.what}", place, cause.hint)
     else:
-        said = error["msg"].removeprefix("Value error, ")
+        said = error["msg"].removeprefix("Value error, ").replace("Input should be", "it should be")
         said = said[:1].lower() + said[1:]
         given = error.get("input")
         tail = f", not {given!r}" if not isinstance(given, dict) and repr(given) not in said else ""
@@ -113,7 +134,13 @@ def _fields_at(model: type[pydantic.BaseModel], location: tuple[str | int, ...])
     here: type[pydantic.BaseModel] = model
     for part in location[:-1]:
         info = here.model_fields.get(str(part))
-        inner = info.annotation if info else None
-        if isinstance(inner, type) and issubclass(inner, pydantic.BaseModel):
-            here = inner
+        here = next(_sections_in(info.annotation), here) if info else here
     return tuple(here.model_fields)
+
+
+def _sections_in(annotation: Any) -> Iterator[type[pydantic.BaseModel]]:
+    """The sections that an annotation speaks of: itself, or within a union or a tuple."""
+    if isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _sections_in(inner)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, is_dataclass
 from datetime import date, datetime
 from enum import Enum
@@ -22,11 +22,20 @@ _TYPES = pydantic.ConfigDict(arbitrary_types_allowed=True)
 
 
 def check(
-    component: type, settings: Mapping[str, Any], path: tuple[str, ...], document: Document, findings: Findings
+    component: type,
+    settings: Mapping[str, Any],
+    path: tuple[str, ...],
+    document: Document,
+    findings: Findings,
+    given: Collection[str] = (),
 ) -> dict[str, Any]:
-    """The settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong."""
+    """The settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
+
+    Args:
+        given: parameters that are not for the table to set.
+    """
     everything = _parameters(component)
-    parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME}
+    parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME and name not in given}
     takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in everything.values())
     kinds = _annotations(component)
     checked: dict[str, Any] = {}

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from afspm.errors import ConfigError
-from afspm.experiment import wiring
+from afspm.experiment import limits, wiring
 from afspm.experiment.experiment import Start
 from afspm.experiment.findings import nearest
 from afspm.experiment.parts import Part, Role
@@ -90,6 +90,7 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
         request_retries=_first(wires.request_retries, resolved.control.request_retries),
         keys=_keys(resolved, links, addresses),
         messages=resolved.messages.modules,
+        beat_period_s=resolved.restart.beat_period,
         simulated=resolved.simulated,
     )
     folders = tuple(str(folder) for folder in resolved.document.folders)
@@ -117,5 +118,23 @@ def _first(a: int | None, b: int) -> int:
 
 
 def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
-    """The sections that the scheduler enforces, as settings of its constructor."""
-    return {}
+    """The sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m.
+
+    control: lease_s, grace_s, stop_scan_on_problem, stop_scan_on_manual, retract, dangerous,
+        roles (name of the role -> names; None: everyone).
+    limits: see `limits.to_settings`; cache: see `caching.Caching.to_settings`.
+    """
+    control = resolved.control
+    return {
+        "control": {
+            "lease_s": control.lease,
+            "grace_s": control.grace,
+            "stop_scan_on_problem": control.stop_scan_on_problem,
+            "stop_scan_on_manual": control.stop_scan_on_manual,
+            "retract": control.retract,
+            "dangerous": None if control.dangerous is None else list(control.dangerous),
+            "roles": {role: None if who is None else list(who) for role, who in control.roles},
+        },
+        "limits": limits.to_settings(resolved.limits),
+        "cache": resolved.caching.to_settings(),
+    }

@@ -1,0 +1,61 @@
+"""What a ready-made component will do, as far as that is fixed before it runs: made once, never started."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from afspm.logic.limits import Guard, Limits
+from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
+
+PURE = "afspm.components"
+"""Classes from here, and those derived from them, do nothing in `__init__` but to keep and to check their settings."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """The measurements of a plan."""
+
+    regions: tuple[Region, ...] = ()
+    positions: tuple[tuple[float, float], ...] = ()
+    shape: tuple[int, int] | None = None
+
+
+def plan_of(component: type, settings: Mapping[str, Any]) -> Planned | None:
+    """The plan of a component with these settings; None where it has none, or none that can be known.
+
+    Raises:
+        AfspmError: the component refuses its settings.
+    """
+    if not any(base.__module__.startswith(PURE + ".") for base in component.__mro__):
+        return None
+    made = component(**settings)
+    plan = getattr(made, "plan", None)
+    regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
+    positions = tuple(getattr(made, "positions", ()))
+    return Planned(regions, positions, getattr(plan, "shape", None))
+
+
+def refusals(name: str, planned: Planned, limits: Limits) -> list[str]:
+    """Why the limits would refuse what is planned; each reason once."""
+    # steps and rates depend on what is in force by then
+    guard = Guard(_without_changes(limits))
+    wanted: list[tuple[ControlRequest, object]] = [
+        (ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, planned.shape)) for region in planned.regions
+    ]
+    wanted += [(ControlRequest.SET_PROBE_POS, ProbePosition(xy)) for xy in planned.positions]
+    reasons = []
+    for kind, subject in wanted:
+        refused = guard.check(name, Request(kind, subject, b""), 0)
+        if refused is not None:
+            reasons.append(refused.reason)
+    return list(dict.fromkeys(reasons))
+
+
+def _without_changes(limits: Limits) -> Limits:
+
+    parameters = {
+        name: replace(limit, step=None, rate_per_s=None, interval_s=None) for name, limit in limits.parameters.items()
+    }
+    return replace(limits, parameters=parameters)
