@@ -1,0 +1,17 @@
+"""The physics behind the simulated microscope: pure, seeded, in SI units and experiment time.
+
+    world = World.from_settings({"surface": {"kind": "steps"}}, seed=1, start_s=0.0)
+    scan = world.scan(Region((0.0, 0.0), (1e-6, 1e-6)), (128, 128), line_s=1.0, start_s=0.0)
+    unit, height = scan.channels()["Height"]
+
+A feature at `x_sample` is found at `x_tip = x_sample + world.drift_m(t)`.
+"""
+
+from __future__ import annotations
+
+from afspm.simulation.scanning import SimulatedScan
+from afspm.simulation.surfaces.readers import READERS, Heightmap
+from afspm.simulation.tip import TipState
+from afspm.simulation.world import World, WorldSettings
+
+__all__ = ["READERS", "Heightmap", "SimulatedScan", "TipState", "World", "WorldSettings"]

@@ -1,0 +1,65 @@
+"""Chance that is a function: the same seed and the same whole numbers give the same draw, in any order.
+
+A surface without bounds and a drift that can be asked for at any time need this: what lies at (i, j) is hashed from
+(seed, i, j), not drawn from a sequence. The hash is the finaliser of splitmix64 (Steele, Lea & Flood 2014).
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Hashes = NDArray[np.uint64]
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def subseed(seed: int, name: str) -> int:
+    """A seed of its own for a part of the world, so that one part drawing more leaves the others alone."""
+    return int(hashes(seed, zlib.crc32(name.encode()))[()])
+
+
+def hashes(seed: int, *keys: ArrayLike) -> Hashes:
+    """64 mixed bits for each combination (broadcast) of whole numbers."""
+    state = _mix(np.asarray(seed % 2**64, dtype=np.uint64))
+    for key in keys:
+        whole = np.asarray(key).astype(np.int64).astype(np.uint64)
+        state = _mix(_times_golden(whole) ^ state)
+    return state
+
+
+def uniform(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
+    """Uniform in [0, 1), shaped as the keys broadcast."""
+    return (hashes(seed, *keys) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+def normal(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
+    """Standard normal (Box and Muller), shaped as the keys broadcast."""
+    first = 1.0 - uniform(seed, *keys, 0)
+    second = uniform(seed, *keys, 1)
+    result: NDArray[np.float64] = np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
+    return result
+
+
+def whole(seed: int, low: int, high: int, *keys: ArrayLike) -> NDArray[np.int64]:
+    """Uniform whole numbers in [low, high]."""
+    return low + (uniform(seed, *keys) * (high - low + 1)).astype(np.int64)
+
+
+def generator(seed: int, *keys: int) -> np.random.Generator:
+    """A generator for what is drawn in sequence within one call, chosen by seed and whole numbers."""
+    return np.random.Generator(np.random.PCG64(int(hashes(seed, *keys)[()])))
+
+
+def _times_golden(values: Hashes) -> Hashes:
+    with np.errstate(over="ignore"):  # arithmetic modulo 2**64 is what is meant
+        return (values + np.uint64(1)) * _GOLDEN
+
+
+def _mix(values: Hashes) -> Hashes:
+    with np.errstate(over="ignore"):
+        values = values + _GOLDEN
+        values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return values ^ (values >> np.uint64(31))

@@ -1,0 +1,108 @@
+"""Thermal drift: how the sample wanders under the tip.
+
+The sign, once and for all: drift is the displacement of the sample, so a feature that was at `x_sample` when the
+experiment started is found at `x_tip = x_sample + drift(t)`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from afspm.errors import InvalidValue
+from afspm.simulation import chance
+from afspm.simulation.settings import check
+
+_LONGEST_S = 2.0**20  # twelve days: the random walk's coarsest interval
+_LEVELS = 22  # halvings of it; finer than a quarter of a second the walk is a straight line
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """What is left of a change of temperature or of an approach: total_m * (1 - exp(-t / time_s))."""
+
+    total_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    time_s: float = 3600.0
+
+    def __post_init__(self) -> None:
+        check(self, above_zero="time_s")
+
+
+@dataclass(frozen=True)
+class DriftSettings:
+    """Everything adds up; (x, y, z), or z alone where it says so.
+
+    Attributes:
+        velocity_m_per_s: constant drift.
+        relaxing: any number of exponential relaxations since the start.
+        walk_m_per_sqrt_hour: standard deviation in x and y that a random walk gains in an hour.
+        walk_z_m_per_sqrt_hour: the same for z.
+        daily_m: amplitude of a sine of 24 hours.
+    """
+
+    velocity_m_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    relaxing: tuple[Relaxation, ...] = field(default_factory=tuple)
+    walk_m_per_sqrt_hour: float = 0.0
+    walk_z_m_per_sqrt_hour: float = 0.0
+    daily_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check(self, from_zero="walk_m_per_sqrt_hour walk_z_m_per_sqrt_hour")
+
+
+class Drift:
+    """A function of time: asked at any time, in any order, it gives the same."""
+
+    def __init__(self, settings: DriftSettings, seed: int, start_s: float) -> None:
+        self._settings = settings
+        self._seed = chance.subseed(seed, "drift")
+        self._start_s = start_s
+
+    def at(self, t_s: ArrayLike) -> NDArray[np.float64]:
+        """(x, y, z) in m at experiment times, shape t.shape + (3,); zero at the start.
+
+        Raises:
+            InvalidValue: a time before the start.
+        """
+        since = np.asarray(t_s, dtype=np.float64) - self._start_s
+        if since.size and not since.min() >= -1e-6:
+            raise InvalidValue(f"drift is not known {-since.min():g} s before the start of the experiment")
+        since = np.maximum(since, 0.0)[..., None]
+        s = self._settings
+        total = since * np.asarray(s.velocity_m_per_s)
+        for relaxation in s.relaxing:
+            total = total - np.expm1(-since / relaxation.time_s) * np.asarray(relaxation.total_m)
+        total = total + np.sin(since * (2.0 * math.pi / 86400.0)) * np.asarray(s.daily_m)
+        scales = (s.walk_m_per_sqrt_hour, s.walk_m_per_sqrt_hour, s.walk_z_m_per_sqrt_hour)
+        for axis, scale in enumerate(scales):
+            if scale:
+                total[..., axis] += scale / 60.0 * random_walk(self._seed + axis, since[..., 0])
+        return np.asarray(total)
+
+
+def random_walk(seed: int, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A Brownian path of unit variance a second, zero at zero, at any times t >= 0.
+
+    Lévy's construction: the ends of a long interval first, then midpoints between midpoints, each drawn by
+    its index; so a value needs no history.
+    """
+    interval = np.floor(t_s / _LONGEST_S)
+    ends = np.arange(int(interval.max(initial=0.0)) + 2)
+    steps = chance.normal(seed, 0, ends) * math.sqrt(_LONGEST_S)
+    path = np.concatenate([[0.0], np.cumsum(steps)])
+    index = interval.astype(np.int64)
+    left, right = path[index], path[index + 1]
+    position = t_s / _LONGEST_S - interval
+    width_s = _LONGEST_S
+    for level in range(1, _LEVELS + 1):
+        middle = (left + right) / 2 + math.sqrt(width_s) / 2 * chance.normal(seed, level, index)
+        after = position >= 0.5
+        left, right = np.where(after, middle, left), np.where(after, right, middle)
+        position = 2.0 * position - after
+        index = 2 * index + after
+        width_s /= 2
+    walked: NDArray[np.float64] = left + (right - left) * position
+    return walked

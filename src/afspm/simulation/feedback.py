@@ -1,0 +1,197 @@
+"""The z feedback: a controller with gains, an actuator with a lag, a detector that saturates.
+
+Linearised, with error e = h - z (h the height at which the setpoint is met), a PI controller followed by a lag tau and
+a delay T of the loop obeys  (tau - Kp T) z'' + (1 + Kp - Ki T) z' + Ki z = Ki h + (Kp - Ki T) h'.
+Low gains follow late, high ones ring, and above Ki T = 1 + Kp they oscillate. The detector saturates: an amplitude is
+never below zero nor above the free one, so z can only follow so fast down a slope: the tip parachutes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+from afspm.model import Feedback
+from afspm.simulation.fields import Array
+from afspm.simulation.settings import check, one_of
+
+MODES = ("amplitude", "current")
+_GENTLE = 0.3  # share of the free amplitude that a gentle setpoint takes away
+
+
+@dataclass(frozen=True)
+class FeedbackSettings:
+    """What is in force until it is set otherwise, and the loop's hardware.
+
+    Attributes:
+        mode: "amplitude" (tapping; the setpoint is an amplitude in V) or "current" (tunnelling; in A).
+        integral_gain: in 1/s: an error is gone after about 1 / gain.
+        free_amplitude_v: far from the sample.
+        sensitivity_m_per_v: of the detector.
+        lag_s, delay_s: of actuator and loop; gains above about 1 / delay_s oscillate.
+        range_m: of the z actuator: so far the tip withdraws when the setpoint is never met.
+        decay_m: the gap over which a tunnelling current falls by e.
+        current_floor_a: the smallest current the logarithm sees.
+    """
+
+    mode: str = "amplitude"
+    on: bool = True
+    proportional_gain: float = 0.1
+    integral_gain: float = 1500.0
+    setpoint: float = 0.7
+    free_amplitude_v: float = 1.0
+    sensitivity_m_per_v: float = 60e-9
+    lag_s: float = 0.12e-3
+    delay_s: float = 0.12e-3
+    range_m: float = 5e-6
+    decay_m: float = 0.05e-9
+    current_floor_a: float = 0.2e-12
+
+    def __post_init__(self) -> None:
+        one_of(self.mode, MODES, "mode")
+        check(self, above_zero="free_amplitude_v sensitivity_m_per_v lag_s delay_s range_m decay_m current_floor_a")
+        check(self, from_zero="proportional_gain integral_gain", above_zero="setpoint")
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The feedback as it is in force for one scan."""
+
+    settings: FeedbackSettings
+    on: bool
+    proportional_gain: float
+    integral_gain: float
+    setpoint: float
+
+    @classmethod
+    def of(cls, settings: FeedbackSettings, feedback: Feedback | None) -> Loop:
+        """The settings with what `feedback` says instead.
+
+        Raises:
+            InvalidValue: a gain below zero, a setpoint that is not above zero, or what is not finite.
+        """
+        said = feedback or Feedback()
+        on = settings.on if said.on is None else said.on
+        p, i, setpoint = (
+            getattr(settings, name) if getattr(said, name) is None else float(getattr(said, name))
+            for name in ("proportional_gain", "integral_gain", "setpoint")
+        )
+        if not (math.isfinite(p) and math.isfinite(i) and p >= 0 and i >= 0):
+            raise InvalidValue(f"feedback gains are zero or more, not {p:g} and {i:g}", where="feedback")
+        if not (math.isfinite(setpoint) and setpoint > 0):
+            raise InvalidValue(f"a setpoint is above zero, not {setpoint:g}", where="feedback")
+        return cls(settings, on, p, i, setpoint)
+
+    @property
+    def engages(self) -> bool:
+        """Whether the setpoint can be met at all: an amplitude above the free one never is."""
+        return self.settings.mode == "current" or self.setpoint < self.settings.free_amplitude_v
+
+    @property
+    def force(self) -> float:
+        """How hard tip and sample press on each other; 1 at a gentle setpoint, 0 when they never touch."""
+        s = self.settings
+        if s.mode == "current":
+            return math.log1p(self.setpoint / 50e-12) / math.log(2.0)
+        return max(0.0, (s.free_amplitude_v - self.setpoint) / s.free_amplitude_v / _GENTLE)
+
+    @property
+    def error_limits_m(self) -> tuple[float, float]:
+        """Largest errors that the detector can show: (tip too high, tip too low), both positive."""
+        s = self.settings
+        if s.mode == "current":
+            below = math.log(max(self.setpoint / s.current_floor_a, math.e)) * s.decay_m
+            return below, 3.0 * below
+        return (s.free_amplitude_v - self.setpoint) * s.sensitivity_m_per_v, self.setpoint * s.sensitivity_m_per_v
+
+    def follow(self, height_m: Array, step_s: float, start_v: Array) -> Array:
+        """z along paths, one a column.
+
+        Args:
+            height_m: at which the setpoint would be met, shape (steps, paths), `step_s` apart, straight between.
+            start_v: speed of z at the start, one a path; what an oscillating loop starts from.
+        """
+        splits = self._splits(step_s)
+        dt = step_s / splits
+        move = self._propagator(dt)
+        too_high, too_low = self.error_limits_m
+        rate = self.integral_gain + self.proportional_gain / self.settings.lag_s
+        down, up = np.float64(rate * too_high), np.float64(rate * too_low)
+        bound = self._oscillation_bound_m(max(down, up))
+        z, v = height_m[0].copy(), start_v.copy()
+        result = np.empty_like(height_m)
+        result[0] = z
+        for n in range(1, len(height_m)):
+            part = (height_m[n] - height_m[n - 1]) / splits
+            for k in range(splits):
+                h = height_m[n - 1] + k * part
+                y = z - h
+                z_new = z + move[0, 0] * y + move[0, 1] * v + move[0, 2] * part
+                v = np.clip(move[1, 0] * y + move[1, 1] * v + move[1, 2] * part, -down, up)
+                z = np.clip(z_new, z - down * dt, z + up * dt)
+                if bound is not None:
+                    z = np.clip(z, h - bound, h + bound)
+            result[n] = z
+        return result
+
+    def amplitude_v(self, gap_m: Array) -> Array:
+        """What the detector shows; gap is z less the height at which the setpoint is met."""
+        s = self.settings
+        return np.clip(self.setpoint + gap_m / s.sensitivity_m_per_v, 0.0, s.free_amplitude_v)
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether the gains are beyond the limit of stability."""
+        return self._damping <= 0.0 or self._inertia <= 0.0
+
+    @property
+    def _damping(self) -> float:
+        return 1.0 + self.proportional_gain - self.integral_gain * self.settings.delay_s
+
+    @property
+    def _inertia(self) -> float:
+        return self.settings.lag_s - self.proportional_gain * self.settings.delay_s
+
+    def _splits(self, step_s: float) -> int:
+        """Parts of a step: one is exact as long as nothing saturates, ringing is better seen with a few."""
+        ringing = self._damping**2 < 2.0 * max(self._inertia, 0.1 * self.settings.lag_s) * self.integral_gain
+        return min(4, max(1, math.ceil(step_s / self.settings.lag_s / 3.0))) if ringing else 1
+
+    def _oscillation_bound_m(self, fastest_m_per_s: float) -> float | None:
+        if not self.oscillates:
+            return None
+        inertia = max(self._inertia, 0.1 * self.settings.lag_s)
+        return float(fastest_m_per_s * math.sqrt(inertia / max(self.integral_gain, 1.0)))
+
+    def _propagator(self, dt: float) -> NDArray[np.float64]:
+        """Exact over dt: rows give the change of z and the new v from (z - h, v, change of h during dt)."""
+        inertia = self._inertia
+        limit = 0.1 * self.settings.lag_s
+        damping = self._damping if inertia > limit else min(self._damping, -0.5)  # a P gain alone may be too high
+        inertia = max(inertia, limit)
+        ki, drive = self.integral_gain, self.proportional_gain - self.integral_gain * self.settings.delay_s
+        # state (z - h0, v, h - h0, h'), with time in units of dt
+        a = np.zeros((4, 4))
+        a[0, 1] = 1.0
+        a[1] = [-ki * dt * dt / inertia, -damping * dt / inertia, ki * dt * dt / inertia, drive * dt / inertia]
+        a[2, 3] = 1.0
+        e = _exponential(a)
+        # columns: y = z - h0, v in m/s, rise of h over dt
+        return np.array([[e[0, 0] - 1.0, e[0, 1] * dt, e[0, 3]], [e[1, 0] / dt, e[1, 1], e[1, 3] / dt]])
+
+
+def _exponential(a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """exp(a) by scaling and squaring, rows beyond what a float holds cut off (an unstable loop saturates anyway)."""
+    halvings = max(0, math.ceil(math.log2(max(float(np.abs(a).max()), 1e-9))) + 3)
+    small = a / 2.0**halvings
+    term = total = np.eye(len(a))
+    for n in range(1, 14):
+        term = term @ small / n
+        total = total + term
+    for _ in range(halvings):
+        total = np.clip(total @ total, -1e12, 1e12)
+    return total

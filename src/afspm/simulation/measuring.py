@@ -1,0 +1,221 @@
+"""From sample, tip, drift and feedback to the channels of one scan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from afspm.simulation.feedback import Loop
+from afspm.simulation.fields import Array
+from afspm.simulation.imaging import Grid, Sampler, felt, reach_m
+from afspm.simulation.noise import NoiseSettings, disturbances, flattened, height_noise
+from afspm.simulation.scanning import Course, ScannerSettings
+from afspm.simulation.signals import SignalSettings, current_a, phase_deg
+from afspm.simulation.surfaces import Relief
+from afspm.simulation.tip import TipState
+
+Channels = dict[str, tuple[str, Array]]
+TipTimes = Sequence[tuple[float, TipState]]
+"""(since when, tip), the first not later than the scan's start."""
+
+_POINTS = 1_400_000  # of the grid, if oversampling is left to us
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What stays the same during a scan.
+
+    Attributes:
+        sample: relief of the sample as it is now, from (x, y, resolution_m).
+        drift_m: (x, y, z) at times.
+        held_z_m: where z stands if the feedback is off.
+        slope: (x, y) compensation of tilt set on the instrument, m/m.
+        origin_m: (x, y) about which tilt and slope turn.
+        offset_m: (x, y) by which the scanner is not yet where it should be (creep), at times.
+    """
+
+    sample: Callable[[Array, Array, float], Relief]
+    drift_m: Callable[[Array], Array]
+    offset_m: Callable[[Array], Array]
+    scanner: ScannerSettings
+    noise: NoiseSettings
+    signals: SignalSettings
+    loop: Loop
+    bias_v: float
+    held_z_m: float | None
+    slope: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Felt:
+    """What the tip feels along the lines, by row index, x ascending.
+
+    Attributes:
+        height_m: (trace, retrace), each [y, x].
+        material: as height_m.
+    """
+
+    height_m: tuple[Array, Array]
+    material: tuple[Array, Array]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The channels, and what the scan did: z at its end, and the mean depth the tip was pressed in by errors."""
+
+    channels: Channels
+    last_z_m: float
+    pressed_m: float
+
+
+def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Generator) -> Measured:
+    """Scans."""
+    heights = feel(course, tips, setup)
+    tilt = _tilt(course, (setup.scanner.tilt_x, setup.scanner.tilt_y))
+    order = course.order
+    lines = np.concatenate([(heights.height_m[0] + tilt)[order], (heights.height_m[1] + tilt)[order, ::-1]], axis=1)
+    nx = course.shape[1]
+    happened = disturbances(setup.noise, _tip_of_lines(course, tips), course.line_s, nx, random)
+    if happened is not None:
+        lines += happened
+    z = _z(lines, course, setup, random)
+    gap = z - lines
+    noise = height_noise(setup.noise, course.shape[0], nx, course.line_s, course.start_s, random)
+    both = z + noise
+    trace, retrace = np.empty(course.shape), np.empty(course.shape)
+    trace[order], retrace[order] = both[:, :nx], both[:, nx:][:, ::-1]
+    compensated = _tilt(course, setup.slope)
+    how = setup.scanner.flatten
+    channels: Channels = {
+        "Height": ("m", flattened(trace - compensated, how)),
+        "Height Retrace": ("m", flattened(retrace - compensated, how)),
+    }
+    gap_by_row = np.empty(course.shape)
+    gap_by_row[order] = gap[:, :nx]
+    channels.update(_signals(gap_by_row, heights, course, setup, random))
+    return Measured(channels, float(z[-1, -1]), float(np.maximum(-gap, 0.0).mean()))
+
+
+def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
+    """The surface as the tips of the scan feel it at every pixel, without feedback and noise."""
+    trace, retrace = (_sample_positions(course, setup, part) for part in (0.25, 0.75))
+    x = np.stack([trace[0], retrace[0]])
+    y = np.stack([trace[1], retrace[1]])
+    grid, blur = _grid(course, setup, x, y, tips)
+    relief = setup.sample(*grid.axes_m(), max(grid.dx_m, grid.dy_m))
+    height, material = np.empty(x.shape), np.empty(x.shape)
+    taken_s = _pixel_times_s(course)
+    for number, (since_s, tip) in enumerate(tips):
+        until_s = tips[number + 1][0] if number + 1 < len(tips) else math.inf
+        rows = np.any((taken_s >= since_s) & (taken_s < until_s), axis=(0, 2)) if len(tips) > 1 else slice(None)
+        if isinstance(rows, np.ndarray) and not rows.any():
+            continue
+        part, start, stop = _rows_of_grid(grid, y[:, rows], reach_m(tip, float(np.ptp(relief.height_m))))
+        path, offset = felt(relief.height_m[start:stop], part, tip, blur)
+        sampler = Sampler(part, x[:, rows], y[:, rows])
+        here = sampler.spline(path) + (offset + tip.length_m)
+        stuff = sampler.linear(relief.material[start:stop])
+        now = taken_s[:, rows] >= since_s
+        height[:, rows] = np.where(now, here, height[:, rows])
+        material[:, rows] = np.where(now, stuff, material[:, rows])
+    z_drift = np.stack([setup.drift_m(course.row_times_s(part))[:, 2:] for part in (0.25, 0.75)])
+    height += z_drift
+    return Felt((height[0], height[1]), (material[0], material[1]))
+
+
+def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array, Array]:
+    """Where on the sample the tip is at each pixel: x_sample = x_tip - drift(t of the row)."""
+    x, y = course.region.pixels_m(course.shape)
+    times = course.row_times_s(part)
+    away = setup.drift_m(times)[:, :2] + setup.offset_m(times)
+    lag = setup.scanner.backlash_m if part > 0.5 else 0.0
+    angle = course.region.angle_rad
+    return x - away[:, :1] + lag * math.cos(angle), y - away[:, 1:2] + lag * math.sin(angle)
+
+
+def _pixel_times_s(course: Course) -> Array:
+    """When each pixel is taken, shape (2, ny, nx): trace and retrace."""
+    nx = course.shape[1]
+    start = course.row_times_s(0.0)[:, None]
+    along = (np.arange(nx) + 0.5) / nx * (course.line_s / 2)
+    return np.stack([start + along, start + course.line_s - along])
+
+
+def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> tuple[Grid, tuple[float, float]]:
+    """A grid that is fine enough and not too large, and the blur (y, x) in its steps."""
+    pixel = course.pixel_m
+    if course.region.angle_rad % (math.pi / 2) > 1e-9:
+        pixel = (min(pixel), min(pixel))  # the grid does not turn with the scan
+    elif course.region.angle_rad % math.pi > 1e-9:
+        pixel = (pixel[1], pixel[0])
+    # A first look at coarse steps tells how high the sample is, thus how far the tip can touch beside its apex.
+    extent = (float(np.ptp(x)) or pixel[0], float(np.ptp(y)) or pixel[1])
+    look = Grid.covering(x, y, (max(extent[0] / 48, pixel[0]), max(extent[1] / 48, pixel[1])), 0.0)
+    rise = 1.2 * float(np.ptp(setup.sample(*look.axes_m(), max(look.dx_m, look.dy_m)).height_m))
+    margin = max(reach_m(tip, rise) for _, tip in tips) + 2 * max(pixel)
+    area = (extent[0] + 2 * margin) * (extent[1] + 2 * margin)
+    finest = math.sqrt(_POINTS * pixel[0] * pixel[1] / area)
+    over = setup.scanner.oversampling or int(min(4, max(1, math.floor(finest))))
+    step = (pixel[0] / over, pixel[1] / over)
+    blur = setup.scanner.band_limit_px * over
+    return Grid.covering(x, y, step, margin), (blur, blur)
+
+
+def _rows_of_grid(grid: Grid, y: Array, margin_m: float) -> tuple[Grid, int, int]:
+    """The part of the grid that a tip touches while it is at those y."""
+    start = max(0, math.floor((y.min() - margin_m - grid.y0_m) / grid.dy_m) - 7)
+    stop = min(grid.shape[0], math.ceil((y.max() + margin_m - grid.y0_m) / grid.dy_m) + 8)
+    return grid.rows(start, stop), start, stop
+
+
+def _tip_of_lines(course: Course, tips: TipTimes) -> list[TipState]:
+    """The tip at the start of each line, in the order of time."""
+    starts = course.start_s + np.arange(course.shape[0]) * course.line_s
+    index = np.searchsorted([since for since, _ in tips], starts, side="right") - 1
+    return [tips[int(i)][1] for i in np.maximum(index, 0)]
+
+
+def _tilt(course: Course, slope: tuple[float, float]) -> Array | float:
+    """A plane through the origin of the tip's coordinates, at the pixels."""
+    if slope == (0.0, 0.0):
+        return 0.0
+    x, y = course.region.pixels_m(course.shape)
+    return np.asarray(slope[0] * x + slope[1] * y)
+
+
+def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) -> Array:
+    """z along the lines (in time, trace then retrace), led in by the end of the retrace before."""
+    loop = setup.loop
+    if not loop.on:
+        return np.full(lines.shape, lines.max() if setup.held_z_m is None else setup.held_z_m)
+    if not loop.engages:
+        return np.full(lines.shape, lines.mean() + loop.settings.range_m / 2)
+    nx = course.shape[1]
+    lead = min(nx, 6 + nx // 16)
+    path = np.concatenate([lines[:, lead:0:-1] if nx > 1 else lines[:, :1], lines], axis=1).T
+    start_v = random.normal(0.0, 1e-6, path.shape[1]) if loop.oscillates else np.zeros(path.shape[1])
+    z = loop.follow(np.ascontiguousarray(path), course.line_s / (2 * nx), start_v)
+    return z[-2 * nx :].T
+
+
+def _signals(gap_m: Array, heights: Felt, course: Course, setup: Setup, random: np.random.Generator) -> Channels:
+    """Amplitude and phase (when tapping) and current, of the trace."""
+    loop, noise, material = setup.loop, setup.noise, heights.material[0]
+    ny, nx = course.shape
+
+    def white(rms: float) -> Array:
+        return rms * random.standard_normal((ny, nx), dtype=np.float32).astype(np.float64)
+
+    channels: Channels = {}
+    if loop.settings.mode == "amplitude":
+        amplitude = loop.amplitude_v(gap_m)
+        slope = np.gradient(heights.height_m[0], course.pixel_m[0], axis=1) if nx > 1 else np.zeros((ny, nx))
+        phase = phase_deg(setup.signals, loop, amplitude, material, slope)
+        channels["Amplitude"] = ("V", amplitude + white(noise.amplitude_v))
+        channels["Phase"] = ("deg", phase + white(noise.phase_deg))
+    current = current_a(setup.signals, loop, gap_m, material, setup.bias_v)
+    channels["Current"] = ("A", current + white(noise.current_a))
+    return channels

@@ -1,0 +1,147 @@
+"""One scan: where and when each pixel is taken, and what comes of it.
+
+Time: a line lasts `line_s`, its first half the trace (x upwards), its second the retrace. Lines follow each other from
+small y to large y, or the other way round when scanning down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+from afspm.model import Frame, Region
+from afspm.simulation.fields import Array
+from afspm.simulation.noise import FLATTENINGS
+from afspm.simulation.settings import check, one_of
+
+MOST_PIXELS = 1 << 24
+DIRECTIONS = ("up", "down")
+
+
+@dataclass(frozen=True)
+class ScannerSettings:
+    """The instrument's mechanics.
+
+    Attributes:
+        flatten: what is done to height lines before they are handed out: "none", "offset" or "line" (Flatten1).
+        band_limit_px: standard deviation of the blur of every signal.
+        oversampling: grid points a pixel (each axis) on which tip meets sample; 0 for what the size of a scan allows.
+        tilt_x, tilt_y: slope of the sample in its holder, m/m.
+        creep: part of a move that is still missing after a second, gone as 1 - log10(t) decades; 0 for none.
+        backlash_m: how far the retrace lags behind in x.
+    """
+
+    flatten: str = "none"
+    band_limit_px: float = 0.5
+    oversampling: int = 0
+    tilt_x: float = 0.0
+    tilt_y: float = 0.0
+    creep: float = 0.0
+    backlash_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        one_of(self.flatten, FLATTENINGS, "flatten")
+        check(self, from_zero="band_limit_px oversampling backlash_m", fraction="creep")
+
+
+@dataclass(frozen=True)
+class Course:
+    """The course of a scan in place and time.
+
+    Attributes:
+        region: in tip coordinates.
+        shape: (ny, nx).
+        line_s: trace and retrace.
+        direction: of the slow axis, "up" (small y first) or "down".
+    """
+
+    region: Region
+    shape: tuple[int, int]
+    line_s: float
+    start_s: float
+    direction: str = "up"
+
+    def __post_init__(self) -> None:
+        ny, nx = self.shape
+        if ny < 1 or nx < 1 or ny * nx > MOST_PIXELS:
+            raise InvalidValue(f"a scan of {nx} x {ny} pixels cannot be taken", hint=f"1 to {MOST_PIXELS} pixels")
+        if not (math.isfinite(self.line_s) and self.line_s > 0 and math.isfinite(self.start_s)):
+            raise InvalidValue(f"a line of {self.line_s} s, started at {self.start_s} s, cannot be scanned")
+        if self.direction not in DIRECTIONS:
+            raise InvalidValue(f"scan direction {self.direction!r}", hint='"up" or "down"')
+        if self.region.frame is not Frame.TIP:
+            raise InvalidValue("the microscope scans in tip coordinates, not those of the sample")
+
+    @property
+    def end_s(self) -> float:
+        """When the last retrace is done."""
+        return self.start_s + self.shape[0] * self.line_s
+
+    @property
+    def order(self) -> NDArray[np.int64]:
+        """Row indices in the order they are taken."""
+        rows = np.arange(self.shape[0])
+        return rows if self.direction == "up" else rows[::-1]
+
+    def row_times_s(self, part: float) -> Array:
+        """When each row (by index) is at that part of its line: 0.25 mid-trace, 0.75 mid-retrace, 1 done."""
+        times = np.empty(self.shape[0])
+        times[self.order] = self.start_s + (np.arange(self.shape[0]) + part) * self.line_s
+        return times
+
+    def rows_taken(self, until_s: float | None) -> NDArray[np.bool_]:
+        """Which rows are complete at a time."""
+        if until_s is None:
+            return np.ones(self.shape[0], dtype=bool)
+        return np.asarray(self.row_times_s(1.0) <= until_s + 1e-9 * self.line_s)
+
+    @property
+    def pixel_m(self) -> tuple[float, float]:
+        """Distance of pixels (x, y)."""
+        ny, nx = self.shape
+        width, height = self.region.size_m
+        return (width / (nx - 1) if nx > 1 else width, height / (ny - 1) if ny > 1 else height)
+
+    @property
+    def length_m(self) -> float:
+        """Of all lines, trace and retrace."""
+        return 2.0 * self.shape[0] * self.region.size_m[0]
+
+
+@dataclass(frozen=True)
+class SimulatedScan:
+    """A scan, computed when it starts; what the caller hands out of it before its end is up to the caller.
+
+    Attributes:
+        course: place and time.
+        drift_m: (x, y, z) at the middle of each row's trace, by row index.
+        truth: what went into it, JSON-able.
+    """
+
+    course: Course
+    drift_m: Array
+    truth: Mapping[str, Any]
+    _channels: Mapping[str, tuple[str, Array]] = field(repr=False)
+
+    @property
+    def start_s(self) -> float:
+        return self.course.start_s
+
+    @property
+    def end_s(self) -> float:
+        return self.course.end_s
+
+    def channels(self, until_s: float | None = None) -> dict[str, tuple[str, Array]]:
+        """Channel -> (unit, values [y, x]); rows that are not complete at `until_s` are NaN."""
+        taken = self.course.rows_taken(until_s)
+        if taken.all():
+            return {name: (unit, values.copy()) for name, (unit, values) in self._channels.items()}
+        return {
+            name: (unit, np.where(taken[:, None], values, np.nan)) for name, (unit, values) in self._channels.items()
+        }

@@ -1,0 +1,111 @@
+"""Settings of the simulated physics: frozen dataclasses made from plain tables, refused when they make no sense.
+
+Every setting carries its unit in its name. A table may hold a table (another dataclass) or a list (a tuple).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from afspm.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def build(cls: type[T], settings: object, where: str) -> T:
+    """An instance of the frozen dataclass `cls` from a table.
+
+    Raises:
+        ConfigError: an unknown key (the nearest name is offered), a value of the wrong type, or one that
+            the dataclass itself refuses.
+    """
+    if not isinstance(settings, Mapping):
+        raise ConfigError(f"expected a table, got {settings!r}", where=where)
+    hints = typing.get_type_hints(cls)
+    names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    unknown = [key for key in settings if key not in names]
+    if unknown:
+        raise ConfigError(f"no setting named {unknown[0]!r}", where=where, hint=nearest(str(unknown[0]), names))
+    values = {key: _convert(hints[key], value, f"{where}.{key}") for key, value in settings.items()}
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        raise ConfigError(
+            error.what, where=f"{where}.{error.where}" if error.where else where, hint=error.hint
+        ) from None
+    except TypeError:
+        missing = [name for name in names if name not in values and _is_required(cls, name)]
+        raise ConfigError(f"missing: {', '.join(missing)}", where=where) from None
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """A hint: the name that was probably meant, else all there are."""
+    names = list(names)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    return f"did you mean {close[0]!r}?" if close else "there are " + ", ".join(names)
+
+
+def one_of(value: str, choices: Iterable[str], where: str) -> str:
+    """`value` if it is one of `choices`; ConfigError otherwise."""
+    choices = list(choices)
+    if value not in choices:
+        raise ConfigError(f"unknown: {value!r}", where=where, hint=nearest(value, choices))
+    return value
+
+
+def check(settings: object, *, above_zero: str = "", from_zero: str = "", fraction: str = "") -> None:
+    """Checks the named attributes (separated by spaces) of a dataclass in its `__post_init__`.
+
+    A fraction lies in [0, 1]. Raises ConfigError with the attribute as `where`.
+    """
+    for names, wanted, holds in (
+        (above_zero, "above zero", lambda value: value > 0),
+        (from_zero, "zero or more", lambda value: value >= 0),
+        (fraction, "between 0 and 1", lambda value: 0 <= value <= 1),
+    ):
+        for name in names.split():
+            value = getattr(settings, name)
+            if not holds(value):
+                raise ConfigError(f"{value!r} is not {wanted}", where=name)
+
+
+def _is_required(cls: type, name: str) -> bool:
+    field = cls.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _convert(hint: Any, value: object, where: str) -> object:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(next(a for a in arguments if a is not type(None)), value, where)
+    if origin is tuple:
+        return _sequence(arguments, value, where)
+    if dataclasses.is_dataclass(hint):
+        return value if isinstance(value, typing.cast(type, hint)) else build(typing.cast(type, hint), value, where)
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not math.isfinite(value):
+            raise ConfigError(f"{value!r} is not a finite number", where=where)
+        return float(value)
+    if hint is not float and isinstance(value, hint) and isinstance(value, bool) == (hint is bool):
+        return value
+    raise ConfigError(f"expected {getattr(hint, '__name__', hint)}, got {value!r}", where=where)
+
+
+def _sequence(arguments: tuple[Any, ...], value: object, where: str) -> tuple[object, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise ConfigError(f"expected a list, got {value!r}", where=where)
+    if arguments[-1] is Ellipsis:
+        arguments = (arguments[0],) * len(value)
+    if len(value) != len(arguments):
+        raise ConfigError(f"expected {len(arguments)} values, got {len(value)}", where=where)
+    return tuple(
+        _convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, value, strict=True))
+    )

@@ -1,0 +1,45 @@
+"""Samples to scan: generated ones without bounds, and those taken from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from afspm.errors import ConfigError
+from afspm.simulation.settings import build, one_of
+from afspm.simulation.surfaces.lattice import Lattice
+from afspm.simulation.surfaces.particles import Particles
+from afspm.simulation.surfaces.picture import Picture
+from afspm.simulation.surfaces.relief import Relief, Surface
+from afspm.simulation.surfaces.stamper import Stamper
+from afspm.simulation.surfaces.steps import Flat, Rough, Steps
+
+KINDS: dict[str, type[Surface]] = {
+    "steps": Steps,
+    "particles": Particles,
+    "stamper": Stamper,
+    "lattice": Lattice,
+    "rough": Rough,
+    "flat": Flat,
+    "file": Picture,
+}
+
+__all__ = ["KINDS", "Relief", "Surface", "surface_from"]
+
+
+def surface_from(settings: object, where: str = "surface") -> Surface:
+    """The surface that a table asks for: its `kind` and the settings of that kind.
+
+    Raises:
+        ConfigError: an unknown kind or setting, or a value without sense.
+        FileError: a surface of a file that cannot be read.
+    """
+    if isinstance(settings, str):
+        settings = {"kind": settings}
+    if not isinstance(settings, Mapping):
+        raise ConfigError(f"expected a table, got {settings!r}", where=where)
+    kind = settings.get("kind", "steps")
+    cls = KINDS[one_of(str(kind), KINDS, f"{where}.kind")]
+    surface = build(cls, {key: value for key, value in settings.items() if key != "kind"}, where)
+    if isinstance(surface, Picture):
+        surface.load()
+    return surface

@@ -1,0 +1,68 @@
+"""Nanoparticles strewn on a substrate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from afspm.simulation import chance
+from afspm.simulation.fields import Array, smooth_field
+from afspm.simulation.settings import check
+from afspm.simulation.surfaces.relief import Relief, Sites, around, grain
+
+_LARGEST = 2.5  # no particle is larger than this many mean radii
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Spheres resting on a slightly rough substrate, here denser, there sparser.
+
+    Attributes:
+        spacing_m: mean distance: one particle an area of spacing squared, before crowding.
+        spread: standard deviation of ln(radius).
+        crowding: 0 strewn evenly, 1 gathered in places.
+    """
+
+    radius_m: float = 22e-9
+    spread: float = 0.28
+    spacing_m: float = 160e-9
+    crowding: float = 0.6
+    roughness_rms_m: float = 0.5e-9
+
+    def __post_init__(self) -> None:
+        check(self, above_zero="radius_m spacing_m", from_zero="spread roughness_rms_m", fraction="crowding")
+
+    def relief(self, x_m: Array, y_m: Array, resolution_m: float, seed: int) -> Relief:
+        shape = np.broadcast_shapes(x_m.shape, y_m.shape)
+        ground = np.zeros(shape) + grain(seed, x_m, y_m, self.roughness_rms_m, 60e-9, resolution_m)
+        height_m, material = ground.copy(), np.zeros(shape)
+        if self.radius_m * _LARGEST < resolution_m / 4:
+            return Relief(height_m, material)  # far too small to be seen one by one
+        sites = self._present(seed + 10, x_m, y_m)
+        radii = self.radius_m * np.exp(self.spread * chance.normal(seed + 11, sites.key))
+        for x0, y0, radius in zip(sites.x_m, sites.y_m, np.minimum(radii, _LARGEST * self.radius_m), strict=True):
+            _rest(height_m, material, ground, x_m, y_m, (x0, y0, radius), resolution_m)
+        return Relief(height_m, material)
+
+    def _present(self, seed: int, x_m: Array, y_m: Array) -> Sites:
+        sites = Sites.within(seed, x_m, y_m, _LARGEST * self.radius_m, self.spacing_m)
+        density = 1.0 - self.crowding * (0.5 + 0.6 * smooth_field(seed, sites.x_m, sites.y_m, 6.0 * self.spacing_m))
+        there = chance.uniform(seed + 5, sites.key) < density
+        return Sites(sites.x_m[there], sites.y_m[there], sites.key[there])
+
+
+def _rest(
+    height_m: Array, material: Array, ground: Array, x_m: Array, y_m: Array,
+    sphere: tuple[float, float, float], resolution_m: float,
+) -> None:  # fmt: skip
+    """Puts a sphere (x, y, radius) on the ground; one that is too small to be resolved is spread, its volume kept."""
+    x0, y0, radius = sphere
+    seen = max(radius, 0.75 * resolution_m)
+    for index, dx, dy in around(x_m, y_m, x0, y0, seen):
+        inside = 1.0 - (dx * dx + dy * dy) / seen**2
+        top = ground[index] + np.where(
+            inside > 0, radius * (radius / seen) ** 2 * (1.0 + np.sqrt(np.maximum(inside, 0))), 0.0
+        )
+        height_m[index] = np.maximum(height_m[index], top)
+        material[index] = np.maximum(material[index], inside > 0)

@@ -1,0 +1,103 @@
+"""A surface taken from a file: a picture, or a scan of a real microscope."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from afspm.errors import ConfigError
+from afspm.simulation.fields import Array, is_separable
+from afspm.simulation.settings import check
+from afspm.simulation.surfaces.readers import read
+from afspm.simulation.surfaces.relief import Relief
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Heights of a file, its centre at the origin; beyond its borders it goes on mirrored, so without a seam.
+
+    Attributes:
+        path: an image (bright is high) or an SPM file.
+        width_m: of the picture, first to last pixel; 0 for what an SPM file says. An image has none of its own.
+        height_range_m: from lowest to highest; 0 for what an SPM file says.
+    """
+
+    path: str
+    width_m: float = 0.0
+    height_range_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check(self, from_zero="width_m height_range_m")
+
+    def relief(self, x_m: Array, y_m: Array, resolution_m: float, seed: int) -> Relief:
+        levels, size_m = _load(self)
+        level = 0
+        while level + 1 < len(levels) and size_m[0] / (levels[level].shape[1] - 1) < 0.7 * resolution_m:
+            level += 1
+        image = levels[level]
+        ny, nx = levels[0].shape
+        # Averaging 2 x 2 pixels moves the first sample half a pixel inwards each time.
+        inset = (2**level - 1) / 2
+        u = ((x_m / size_m[0] + 0.5) * (nx - 1) - inset) / 2**level
+        v = ((y_m / size_m[1] + 0.5) * (ny - 1) - inset) / 2**level
+        height_m = _cubic(image, u, v)
+        low, high = levels[0].min(), levels[0].max()
+        return Relief(height_m, np.clip((height_m - low) / ((high - low) or 1.0), 0.0, 1.0))
+
+    def load(self) -> None:
+        """Reads the file now, so that a wrong path is found before anything is scanned."""
+        _load(self)
+
+
+@lru_cache(maxsize=4)
+def _load(picture: Picture) -> tuple[tuple[Array, ...], tuple[float, float]]:
+    """The picture and its halvings, and its size (x, y) in m."""
+    found = read(Path(picture.path))
+    heights, size_m = found.height_m, found.size_m
+    pixels_y, pixels_x = heights.shape
+    if picture.width_m:
+        ratio = size_m[1] / size_m[0] if size_m else (pixels_y - 1) / (pixels_x - 1)
+        size_m = (picture.width_m, picture.width_m * ratio)
+    if size_m is None:
+        raise ConfigError("the file does not say how wide it is", where="width_m", hint="set width_m")
+    if picture.height_range_m:
+        heights = (heights - heights.mean()) * (picture.height_range_m / (np.ptp(heights) or 1.0))
+    elif found.size_m is None:
+        raise ConfigError("the file does not say how high it is", where="height_range_m", hint="set height_range_m")
+    levels = [heights]
+    while min(levels[-1].shape) >= 16:
+        top = levels[-1]
+        even = top[: top.shape[0] // 2 * 2, : top.shape[1] // 2 * 2]
+        levels.append((even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4)
+    return tuple(levels), size_m
+
+
+def _mirrored(index: Array, count: int) -> Array:
+    folded = np.mod(index, 2 * count - 2)
+    return np.where(folded < count, folded, 2 * count - 2 - folded).astype(np.intp)
+
+
+def _taps(position: Array, count: int) -> list[tuple[Array, Array]]:
+    """Indices and weights of the four neighbours (Catmull and Rom's cubic, which meets the pixels)."""
+    whole = np.floor(position)
+    t = position - whole
+    weights = (
+        t * (-0.5 + t * (1.0 - 0.5 * t)),
+        1.0 + t * t * (-2.5 + 1.5 * t),
+        t * (0.5 + t * (2.0 - 1.5 * t)),
+        t * t * (-0.5 + 0.5 * t),
+    )
+    return [(_mirrored(whole + k - 1, count), weight) for k, weight in enumerate(weights)]
+
+
+def _cubic(image: Array, u: Array, v: Array) -> Array:
+    rows, columns = _taps(v, image.shape[0]), _taps(u, image.shape[1])
+    if is_separable(u, v):
+        along = sum(image[:, column[0]] * weight for column, weight in columns)
+        result: Array = sum(along[row[:, 0]] * weight for row, weight in rows)  # type: ignore[index,assignment]
+        return result
+    total: Array = sum(image[r, c] * (rw * cw) for r, rw in rows for c, cw in columns)  # type: ignore[assignment]
+    return total

@@ -1,0 +1,109 @@
+"""What a surface is asked for, and what the kinds of surface share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from afspm.simulation import chance
+from afspm.simulation.fields import Array, is_separable, rough_field, smooth_field
+
+
+@dataclass(frozen=True)
+class Relief:
+    """A piece of surface: heights in m and material from 0 to 1, of one shape.
+
+    The material is what phase and current see of the sample besides its height.
+    """
+
+    height_m: Array
+    material: Array
+
+
+class Surface(Protocol):
+    """A sample without bounds: what lies at a place depends on the seed and the place alone."""
+
+    def relief(self, x_m: Array, y_m: Array, resolution_m: float, seed: int) -> Relief:
+        """The sample at positions in sample coordinates.
+
+        Args:
+            x_m, y_m: arrays that broadcast; one row and one column (a grid) are fastest.
+            resolution_m: edges are not drawn sharper, nor roughness finer, than this; 0 for the sample as it is.
+        """
+        ...
+
+
+def smooth_step(t: Array) -> Array:
+    """0 below 0, 1 above 1, a smooth rise between."""
+    t = np.clip(t, 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def turned(x_m: Array, y_m: Array, angle_deg: float) -> tuple[Array, Array]:
+    """Coordinates along and across a direction; a grid stays a grid where it can."""
+    if angle_deg == 0.0:
+        return x_m, y_m
+    cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return x_m * cos + y_m * sin, y_m * cos - x_m * sin
+
+
+def grain(seed: int, x_m: Array, y_m: Array, rms_m: float, size_m: float, resolution_m: float) -> Array | float:
+    """Fine roughness of the given rms whose largest grains are `size_m` wide."""
+    if rms_m == 0.0:
+        return 0.0
+    field = rough_field(seed, x_m, y_m, largest_m=size_m, smallest_m=size_m / 8, hurst=0.6, resolution_m=resolution_m)
+    return rms_m * field
+
+
+def patches(seed: int, x_m: Array, y_m: Array, size_m: float) -> Array:
+    """Two materials in patches with soft borders, from 0 to 1."""
+    return smooth_step(0.5 + 2.0 * smooth_field(seed, x_m, y_m, size_m))
+
+
+def around(x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float) -> Iterator[tuple[Any, Array, Array]]:
+    """Where the positions come within reach of a point: at most one (index, x - x0, y - y0).
+
+    `index` selects those positions from the broadcast array.
+    """
+    if is_separable(x_m, y_m):
+        columns = slice(*np.searchsorted(x_m[0], (x0_m - reach_m, x0_m + reach_m)))
+        rows = slice(*np.searchsorted(y_m[:, 0], (y0_m - reach_m, y0_m + reach_m)))
+        if columns.start < columns.stop and rows.start < rows.stop:
+            yield (rows, columns), x_m[:, columns] - x0_m, y_m[rows] - y0_m
+        return
+    dx, dy = np.broadcast_arrays(x_m - x0_m, y_m - y0_m)
+    index = (np.abs(dx) < reach_m) & (np.abs(dy) < reach_m)
+    if index.any():
+        yield index, dx[index], dy[index]
+
+
+@dataclass(frozen=True)
+class Sites:
+    """Points strewn at random: positions and, for each, a whole number to draw its properties with."""
+
+    x_m: Array
+    y_m: Array
+    key: Array
+
+    @classmethod
+    def within(cls, seed: int, x_m: Array, y_m: Array, margin_m: float, spacing_m: float) -> Sites:
+        """Those in view: one a cell of `spacing_m` on average (none, one or two), anywhere in it."""
+        i = np.arange(
+            math.floor((x_m.min() - margin_m) / spacing_m), math.floor((x_m.max() + margin_m) / spacing_m) + 1
+        )
+        j = np.arange(
+            math.floor((y_m.min() - margin_m) / spacing_m), math.floor((y_m.max() + margin_m) / spacing_m) + 1
+        )
+        column, row, copy = (a.ravel() for a in np.meshgrid(i, j, np.arange(3), indexing="ij"))
+        # 0, 1, 2, 3 with the probabilities of a Poisson number of mean 1 (what is above 3 counted as 3)
+        count = np.searchsorted([0.3679, 0.7358, 0.9197], chance.uniform(seed, column, row))
+        there = copy < count
+        column, row, copy = column[there], row[there], copy[there]
+        key = chance.hashes(seed + 1, column, row, copy) >> np.uint64(12)
+        x = (column + chance.uniform(seed + 2, key)) * spacing_m
+        y = (row + chance.uniform(seed + 3, key)) * spacing_m
+        return cls(x, y, key.astype(np.float64))

@@ -1,0 +1,206 @@
+"""The tip: its shape, what goes wrong with it, and what may cure it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from afspm.simulation import chance
+from afspm.simulation.settings import build, check, one_of
+
+FLAWS = ("blunt", "double", "contaminated")
+CONDITIONS = ("sharp", *FLAWS)
+
+
+@dataclass(frozen=True)
+class TipState:
+    """One shape of the tip.
+
+    Attributes:
+        radius_m: of the apex, debris not counted.
+        half_angle_deg: of the cone that the apex turns into.
+        second_apex_m: (x, y, height) of a second apex beside the first, height (negative) below it; None without.
+        debris_m: size of what sticks to the tip and jumps; 0 for a clean one.
+        length_m: against the first tip; a change makes the height jump.
+        flaws: which of FLAWS it has.
+    """
+
+    radius_m: float
+    half_angle_deg: float
+    second_apex_m: tuple[float, float, float] | None = None
+    debris_m: float = 0.0
+    length_m: float = 0.0
+    flaws: tuple[str, ...] = ()
+
+    @property
+    def is_sharp(self) -> bool:
+        """Without any flaw."""
+        return not self.flaws
+
+    @property
+    def imaging_radius_m(self) -> float:
+        """Of what touches the sample: apex or debris."""
+        return self.radius_m + self.debris_m
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TipState:
+        return build(cls, values, "tip")
+
+
+@dataclass(frozen=True)
+class TipSettings:
+    """The tip at its best, and how bad it gets; sizes of flaws are in units of its radius.
+
+    Attributes:
+        condition: at the start, one of CONDITIONS.
+        spread: relative scatter of every size that is drawn.
+    """
+
+    radius_m: float = 8e-9
+    half_angle_deg: float = 18.0
+    condition: str = "sharp"
+    blunt_radii: float = 6.0
+    second_distance_radii: float = 7.0
+    second_below_radii: float = 0.25
+    debris_radii: float = 1.5
+    length_jump_radii: float = 0.5
+    spread: float = 0.25
+
+    def __post_init__(self) -> None:
+        check(self, above_zero="radius_m half_angle_deg blunt_radii second_distance_radii", fraction="spread")
+        check(self, from_zero="second_below_radii debris_radii length_jump_radii")
+        one_of(self.condition, CONDITIONS, "condition")
+
+
+@dataclass(frozen=True)
+class TipChangeSettings:
+    """When the tip changes, and what a repair does to it.
+
+    Attributes:
+        per_hour: mean number of changes an hour of scanning at a gentle setpoint.
+        per_metre: the same a metre of scanned line.
+        hardness_exponent: both grow as (force against that at a gentle setpoint) to this power.
+        blunt_weight, double_weight, contaminated_weight: how likely each is.
+        schedule: (seconds after the start, condition): changes that come for certain.
+        wear_m_per_m: the radius grows so much a metre scanned at a gentle setpoint.
+        pulse_threshold_v: below, a pulse does nothing.
+        pulse_cures, pulse_worsens, crash_cures, crash_worsens: probabilities.
+        crash_speed_m_per_s: slower crashes are that much less likely to do anything.
+    """
+
+    per_hour: float = 0.0
+    per_metre: float = 0.0
+    hardness_exponent: float = 2.0
+    blunt_weight: float = 1.0
+    double_weight: float = 1.0
+    contaminated_weight: float = 1.0
+    schedule: tuple[tuple[float, str], ...] = field(default_factory=tuple)
+    wear_m_per_m: float = 0.0
+    pulse_threshold_v: float = 2.0
+    pulse_cures: float = 0.5
+    pulse_worsens: float = 0.08
+    crash_cures: float = 0.85
+    crash_worsens: float = 0.1
+    crash_speed_m_per_s: float = 50e-9
+
+    def __post_init__(self) -> None:
+        check(self, from_zero="per_hour per_metre hardness_exponent blunt_weight double_weight contaminated_weight")
+        check(self, from_zero="wear_m_per_m pulse_threshold_v", above_zero="crash_speed_m_per_s")
+        check(self, fraction="pulse_cures pulse_worsens crash_cures crash_worsens")
+        for _, condition in self.schedule:
+            one_of(condition, CONDITIONS, "schedule")
+        object.__setattr__(self, "schedule", tuple(sorted(self.schedule)))
+
+
+@dataclass(frozen=True)
+class TipChange:
+    """From t_s on the tip is `tip`; cause is "start", "chance", "schedule", "pulse", "crash" or "wear"."""
+
+    t_s: float
+    cause: str
+    tip: TipState
+
+
+class TipHistory:
+    """Every shape the tip has had, by time; what was foreseen and did not come to pass can be taken back."""
+
+    def __init__(self, changes: list[TipChange]) -> None:
+        self.changes = changes
+
+    def at(self, t_s: float) -> TipState:
+        """The tip at a time."""
+        return next((c.tip for c in reversed(self.changes) if c.t_s <= t_s), self.changes[0].tip)
+
+    def between(self, start_s: float, end_s: float) -> list[TipChange]:
+        """Changes in (start, end]."""
+        return [change for change in self.changes if start_s < change.t_s <= end_s]
+
+    def add(self, change: TipChange) -> None:
+        """At its place in time."""
+        self.changes.append(change)
+        self.changes.sort(key=lambda c: c.t_s)
+
+    def forget_after(self, t_s: float) -> None:
+        """Takes back what was to come after a time (the scan was stopped)."""
+        self.changes = [c for c in self.changes if c.t_s <= t_s or c.cause == "start"]
+
+
+class TipMaker:
+    """Draws tips: sharp ones, and what becomes of them."""
+
+    def __init__(self, settings: TipSettings) -> None:
+        self._s = settings
+
+    def first(self, random: np.random.Generator) -> TipState:
+        """The tip that the experiment starts with: as in the settings, exactly, and perhaps with a flaw."""
+        sharp = TipState(self._s.radius_m, self._s.half_angle_deg)
+        return sharp if self._s.condition == "sharp" else self.changed(sharp, self._s.condition, random)
+
+    def changed(self, tip: TipState, condition: str, random: np.random.Generator) -> TipState:
+        """The tip after it became sharp, blunt, double or contaminated; flaws it had stay unless it is sharp now."""
+        s, radius = self._s, self._s.radius_m
+        length = tip.length_m + s.length_jump_radii * radius * float(random.normal())
+        if condition == "sharp":
+            return TipState(radius * self._about(0.4, random), s.half_angle_deg, length_m=length)
+        flaws = tuple(sorted({*tip.flaws, condition}))
+        worse = replace(tip, flaws=flaws, length_m=length)
+        if condition == "blunt":
+            return replace(worse, radius_m=max(1.5 * tip.radius_m, s.blunt_radii * radius * self._about(1.0, random)))
+        if condition == "double":
+            angle = random.uniform(0.0, 2.0 * math.pi)
+            distance = s.second_distance_radii * radius * self._about(1.0, random)
+            below = -s.second_below_radii * radius * self._about(1.0, random)
+            return replace(worse, second_apex_m=(distance * math.cos(angle), distance * math.sin(angle), below))
+        return replace(worse, debris_m=s.debris_radii * radius * self._about(1.0, random))
+
+    def _about(self, share: float, random: np.random.Generator) -> float:
+        """A factor near one, scattered by that share of the spread."""
+        return math.exp(share * self._s.spread * float(random.normal()))
+
+
+def drawn_flaw(settings: TipChangeSettings, random: np.random.Generator) -> str | None:
+    """Which flaw comes next; None when all weights are zero."""
+    weights = np.array([settings.blunt_weight, settings.double_weight, settings.contaminated_weight])
+    return str(random.choice(FLAWS, p=weights / weights.sum())) if weights.sum() else None
+
+
+def chance_changes(
+    settings: TipChangeSettings, start_s: float, end_s: float, rate_per_s: float, seed: int, call: int
+) -> list[tuple[float, str]]:
+    """Times and flaws of the changes that come by chance in a scan: a Poisson process."""
+    random = chance.generator(seed, call)
+    t, found = start_s, []
+    while rate_per_s > 0:
+        t += random.exponential(1.0 / rate_per_s)
+        flaw = drawn_flaw(settings, random)
+        if t >= end_s or flaw is None:
+            break
+        found.append((t, flaw))
+    return found

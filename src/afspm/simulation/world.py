@@ -1,0 +1,404 @@
+"""The simulated world: a sample, a tip and an instrument, in experiment time.
+
+`World` holds what lasts from one measurement to the next: the tip and its history, marks on the sample, where the tip
+stands. A measurement is asked for at a time; what had been foreseen after that time (the rest of a scan that was
+stopped: tip changes, wear) is taken back. The same seed and the same calls give the same world.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from afspm.errors import ConfigError, InvalidValue
+from afspm.model import Feedback, Region
+from afspm.simulation import chance, marks, spectra
+from afspm.simulation.drift import Drift, DriftSettings
+from afspm.simulation.feedback import FeedbackSettings, Loop
+from afspm.simulation.fields import Array
+from afspm.simulation.marks import Mark
+from afspm.simulation.measuring import Setup, measure
+from afspm.simulation.noise import NoiseSettings
+from afspm.simulation.scanning import Course, ScannerSettings, SimulatedScan
+from afspm.simulation.settings import build, nearest
+from afspm.simulation.signals import SignalSettings
+from afspm.simulation.surfaces import Relief, surface_from
+from afspm.simulation.tip import (
+    TipChange,
+    TipChangeSettings,
+    TipHistory,
+    TipMaker,
+    TipSettings,
+    TipState,
+    chance_changes,
+    drawn_flaw,
+)
+
+STATE_VERSION = 1
+
+# What suits a sample better than the general defaults; the user's settings go on top.
+_FITTING: dict[str, dict[str, dict[str, Any]]] = {
+    # Atoms are seen by the foremost atom of the tip, not by its apex as a whole.
+    "lattice": {
+        "tip": {"radius_m": 0.12e-9, "half_angle_deg": 35.0},
+        "noise": {"white_m": 3e-12, "one_over_f_m": 3e-12, "line_offset_m": 3e-12, "scar_m": 0.05e-9},
+        "feedback": {"mode": "current", "setpoint": 100e-12},
+    },
+    "stamper": {"noise": {"white_m": 0.3e-9, "one_over_f_m": 0.5e-9, "line_offset_m": 0.5e-9, "scar_m": 8e-9}},
+    "particles": {"noise": {"white_m": 0.2e-9, "one_over_f_m": 0.2e-9, "line_offset_m": 0.2e-9, "scar_m": 4e-9}},
+}
+
+
+@dataclass(frozen=True)
+class WorldSettings:
+    """All but the surface, which has settings of its kind."""
+
+    tip: TipSettings = field(default_factory=TipSettings)
+    tip_changes: TipChangeSettings = field(default_factory=TipChangeSettings)
+    drift: DriftSettings = field(default_factory=DriftSettings)
+    feedback: FeedbackSettings = field(default_factory=FeedbackSettings)
+    scanner: ScannerSettings = field(default_factory=ScannerSettings)
+    noise: NoiseSettings = field(default_factory=NoiseSettings)
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    iv: spectra.IVSettings = field(default_factory=spectra.IVSettings)
+    force: spectra.ForceSettings = field(default_factory=spectra.ForceSettings)
+
+
+class World:
+    """See the module. All times are experiment seconds, all positions tip coordinates unless they say sample."""
+
+    def __init__(
+        self, surface: object = "steps", settings: WorldSettings | None = None, *, seed: int = 0, start_s: float = 0.0
+    ) -> None:
+        self.settings = settings or WorldSettings()
+        self.seed, self.start_s = seed, start_s
+        self._surface_table = dict(surface) if isinstance(surface, Mapping) else {"kind": surface}
+        self._surface = surface_from(self._surface_table)
+        self._surface_seed = chance.subseed(seed, "surface") % 2**62
+        self._drift = Drift(self.settings.drift, seed, start_s)
+        self._maker = TipMaker(self.settings.tip)
+        first = self._maker.first(chance.generator(seed, 0))
+        self._tips = TipHistory([TipChange(start_s, "start", first)])
+        self._marks: list[Mark] = []
+        self._calls = 0
+        self._scheduled_until_s = start_s
+        self._at_m = (0.0, 0.0)
+        self._came_from_m, self._came_s = (0.0, 0.0), start_s
+        self._held_z_m: float | None = None
+        self._advance(start_s)
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, Any], seed: int, start_s: float) -> World:
+        """A world as tables ask for: `surface`, and the fields of `WorldSettings`.
+
+        Raises:
+            ConfigError: unknown names or values without sense. FileError: the surface's file.
+        """
+        settings = dict(settings)
+        names = ["surface", *WorldSettings.__dataclass_fields__]
+        for name in settings:
+            if name not in names:
+                raise ConfigError(f"no setting named {name!r}", where="simulation", hint=nearest(name, names))
+        surface = settings.pop("surface", "steps")
+        kind = surface.get("kind", "steps") if isinstance(surface, Mapping) else surface
+        for name, fitting in _FITTING.get(str(kind), {}).items():
+            own = settings.get(name, {})
+            settings[name] = {**fitting, **own} if isinstance(own, Mapping) else own
+        built = build(WorldSettings, settings, "simulation")
+        return cls(surface, built, seed=seed, start_s=start_s)
+
+    # -- measuring
+
+    def scan(
+        self,
+        region: Region,
+        shape: tuple[int, int],
+        line_s: float,
+        start_s: float,
+        feedback: Feedback | None = None,
+        bias_v: float = 0.1,
+        *,
+        direction: str = "up",
+        slope: tuple[float, float] = (0.0, 0.0),
+    ) -> SimulatedScan:
+        """Scans a region, from `start_s` on.
+
+        Args:
+            region: in tip coordinates.
+            shape: (ny, nx).
+            line_s: of trace and retrace together.
+            feedback: what it says overrides the settings.
+            direction: of the slow axis, "up" (small y first) or "down".
+            slope: compensation of the sample's tilt, (x, y) in m/m.
+
+        Raises:
+            InvalidValue: what cannot be scanned, or feedback without sense.
+        """
+        course = Course(region, shape, line_s, start_s, direction)
+        loop = Loop.of(self.settings.feedback, feedback)
+        call = self._begin(start_s, region.center_m)
+        self._foresee(course, loop, call)
+        tips = [(start_s, self._tips.at(start_s))]
+        tips += [(change.t_s, change.tip) for change in self._tips.between(start_s, course.end_s)]
+        setup = self._setup(loop, bias_v, slope, start_s)
+        measured = measure(course, tips, setup, chance.generator(self.seed, 2, call))
+        self._held_z_m = measured.last_z_m
+        self._wear(course, loop)
+        drift = self._drift.at(course.row_times_s(0.25))
+        truth = {
+            "start_s": start_s,
+            "end_s": course.end_s,
+            "tips": [{"t_s": t, **tip.to_dict()} for t, tip in tips],
+            "drift_start_m": self.drift_m(start_s).tolist(),
+            "drift_end_m": self.drift_m(course.end_s).tolist(),
+            "pressed_m": measured.pressed_m,
+        }
+        return SimulatedScan(course, drift, truth, measured.channels)
+
+    def spectrum(
+        self,
+        kind: str,
+        position_m: tuple[float, float],
+        t_s: float,
+        feedback: Feedback | None = None,
+        bias_v: float = 0.1,
+    ) -> spectra.Curves:
+        """A curve at a position: (names, units, values [n_points, n_variables]). Kinds are "IV" and "force".
+
+        Raises:
+            InvalidValue: an unknown kind, or feedback without sense.
+        """
+        if kind not in spectra.KINDS:
+            raise InvalidValue(f"no spectrum of kind {kind!r}", hint=nearest(kind, spectra.KINDS))
+        loop = Loop.of(self.settings.feedback, feedback)
+        call = self._begin(t_s, position_m)
+        tip = self._tips.at(t_s)
+        x, y = self._on_sample(position_m, t_s)
+        relief = self._relief(np.array([[x]]), np.array([[y]]), 0.0, t_s)
+        material = float(relief.material[0, 0])
+        random = chance.generator(self.seed, 3, call)
+        if kind == "IV":
+            return spectra.current_voltage(self.settings.iv, tip, material, bias_v, loop, random)
+        return spectra.force_distance(self.settings.force, tip, material, random)
+
+    def spectrum_s(self, kind: str) -> float:
+        """How long such a curve takes."""
+        return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
+
+    # -- treating the tip
+
+    def pulse(self, voltage_v: float, duration_s: float, t_s: float) -> str:
+        """A bias pulse where the tip stands: may cure or worsen it, and leaves a little mound.
+
+        Returns:
+            "cured", "worsened" or "unchanged".
+        """
+        if not (math.isfinite(voltage_v) and math.isfinite(duration_s) and duration_s > 0):
+            raise InvalidValue(f"a pulse of {voltage_v} V for {duration_s} s", hint="finite, and longer than nothing")
+        call = self._begin(t_s, self._at_m)
+        s = self.settings.tip_changes
+        strength = max(0.0, abs(voltage_v) / s.pulse_threshold_v - 1.0) if s.pulse_threshold_v else 1.0
+        if strength == 0.0:
+            return "unchanged"
+        effect = 1.0 - math.exp(-3.0 * strength)
+        random = chance.generator(self.seed, 4, call)
+        outcome = self._treat("pulse", t_s, effect * s.pulse_cures, effect * s.pulse_worsens, random)
+        if outcome != "unchanged":
+            radius = self._tips.at(t_s).imaging_radius_m * random.uniform(0.5, 1.0)
+            self._mark("pulse", self._at_m, t_s, -0.3 * radius, radius)
+        return outcome
+
+    def crash(self, position_m: tuple[float, float], speed_m_s: float, t_s: float) -> str:
+        """Drives the tip into the sample: may cure or worsen it, and leaves a crater that later scans see.
+
+        Returns:
+            "cured", "worsened" or "unchanged".
+        """
+        if not (all(map(math.isfinite, position_m)) and math.isfinite(speed_m_s) and speed_m_s > 0):
+            raise InvalidValue(f"a crash at {position_m} with {speed_m_s} m/s", hint="finite, and faster than nothing")
+        call = self._begin(t_s, position_m)
+        s = self.settings.tip_changes
+        effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
+        random = chance.generator(self.seed, 5, call)
+        radius = 3.0 * self._tips.at(t_s).imaging_radius_m * random.uniform(0.8, 1.4)
+        outcome = self._treat("crash", t_s, effect * s.crash_cures, effect * s.crash_worsens, random)
+        depth = radius * random.uniform(0.3, 0.6) * max(effect, 0.1)
+        self._mark("crash", position_m, t_s, depth, radius)
+        self._held_z_m = None
+        return outcome
+
+    # -- the truth
+
+    def drift_m(self, t_s: ArrayLike) -> Array:
+        """(x, y, z) by which the sample is displaced: x_tip = x_sample + drift. Shape t.shape + (3,)."""
+        return self._drift.at(t_s)
+
+    @property
+    def tip(self) -> TipState:
+        """The tip after all that has been asked for so far."""
+        return self._tips.changes[-1].tip
+
+    def tip_at(self, t_s: float) -> TipState:
+        """The tip at a time."""
+        return self._tips.at(t_s)
+
+    def surface_m(self, x_m: ArrayLike, y_m: ArrayLike, t_s: float = math.inf) -> Array:
+        """True heights at sample coordinates, shaped as x and y broadcast, with the marks made up to a time."""
+        x, y = np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
+        shape = np.broadcast_shapes(x.shape, y.shape)
+        x, y = (a if a.ndim == 2 else a.reshape((1,) * (2 - a.ndim) + a.shape) if a.ndim < 2 else a for a in (x, y))
+        return self._relief(x, y, 0.0, t_s).height_m.reshape(shape)
+
+    def truth(self, t_s: float) -> dict[str, Any]:
+        """What nobody on the wire is told, JSON-able: drift, tip, what happened to it, marks on the sample."""
+        return {
+            "t_s": t_s,
+            "seed": self.seed,
+            "surface": dict(self._surface_table),
+            "drift_m": self.drift_m(t_s).tolist(),
+            "tip": self._tips.at(t_s).to_dict(),
+            "tip_changes": [
+                {"t_s": c.t_s, "cause": c.cause, "tip": c.tip.to_dict()} for c in self._tips.changes if c.t_s <= t_s
+            ],
+            "marks": [asdict(mark) for mark in self._marks if mark.t_s <= t_s],
+        }
+
+    # -- being killed and coming back
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs to go on as if nothing had happened, JSON-able."""
+        return {
+            "version": STATE_VERSION,
+            "seed": self.seed,
+            "start_s": self.start_s,
+            "calls": self._calls,
+            "scheduled_until_s": self._scheduled_until_s,
+            "at_m": list(self._at_m),
+            "came_from_m": list(self._came_from_m),
+            "came_s": self._came_s,
+            "held_z_m": self._held_z_m,
+            "tips": [{"t_s": c.t_s, "cause": c.cause, "tip": c.tip.to_dict()} for c in self._tips.changes],
+            "marks": [asdict(mark) for mark in self._marks],
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Becomes the world that `state` was taken from; its settings must be the same.
+
+        Raises:
+            InvalidValue: a state of another world or version, or a damaged one; nothing has changed then.
+        """
+        mine = {"version": STATE_VERSION, "seed": self.seed, "start_s": self.start_s}
+        for name, value in mine.items():
+            if state.get(name) != value:
+                raise InvalidValue(f"a saved state with {name} {state.get(name)!r} instead of {value!r}")
+        try:
+            tips = [TipChange(c["t_s"], c["cause"], TipState.from_dict(c["tip"])) for c in state["tips"]]
+            found = [build(Mark, mark, "marks") for mark in state["marks"]]
+            calls, until = int(state["calls"]), float(state["scheduled_until_s"])
+            at, came_from = (tuple(map(float, state[name])) for name in ("at_m", "came_from_m"))
+            came_s, held = float(state["came_s"]), state["held_z_m"]
+        except (KeyError, TypeError, ValueError, ConfigError) as error:
+            raise InvalidValue(f"a damaged saved state: {error}") from error
+        self._tips, self._marks, self._calls, self._scheduled_until_s = TipHistory(tips), found, calls, until
+        self._at_m, self._came_from_m = (at[0], at[1]), (came_from[0], came_from[1])
+        self._came_s, self._held_z_m = came_s, held
+
+    # -- inside
+
+    def _begin(self, t_s: float, position_m: tuple[float, float]) -> int:
+        """Goes to a time and a place; returns the number of this call."""
+        if not (math.isfinite(t_s) and t_s >= self.start_s - 1e-6):
+            raise InvalidValue(f"the world starts at {self.start_s:g} s, nothing can be done at {t_s:g} s")
+        self._tips.forget_after(t_s)
+        self._scheduled_until_s = min(self._scheduled_until_s, t_s)
+        self._marks = [mark for mark in self._marks if mark.t_s <= t_s]
+        self._advance(t_s)
+        if position_m != self._at_m:
+            self._came_from_m, self._came_s, self._at_m = self._at_m, t_s, position_m
+        self._calls += 1
+        return self._calls
+
+    def _advance(self, until_s: float) -> None:
+        """Lets the scheduled changes up to a time happen."""
+        for number, (after_s, condition) in enumerate(self.settings.tip_changes.schedule):
+            t_s = self.start_s + after_s
+            if self._scheduled_until_s < t_s <= until_s or (t_s == until_s == self.start_s):
+                tip = self._maker.changed(self._tips.at(t_s), condition, chance.generator(self.seed, 6, number))
+                self._tips.add(TipChange(t_s, "schedule", tip))
+        self._scheduled_until_s = max(self._scheduled_until_s, until_s)
+
+    def _foresee(self, course: Course, loop: Loop, call: int) -> None:
+        """Changes of the tip that will come during a scan: scheduled ones, and by chance."""
+        s = self.settings.tip_changes
+        hardness = loop.force**s.hardness_exponent if loop.on and loop.engages else float(not loop.on)
+        speed = course.length_m / (course.end_s - course.start_s)
+        rate = (s.per_hour / 3600.0 + s.per_metre * speed) * hardness
+        seed = chance.subseed(self.seed, "tip changes")
+        found = chance_changes(s, course.start_s, course.end_s, rate, seed, call)
+        for number, (t_s, flaw) in enumerate(found):
+            self._advance(t_s)
+            random = chance.generator(seed, call, number)
+            self._tips.add(TipChange(t_s, "chance", self._maker.changed(self._tips.at(t_s), flaw, random)))
+        self._advance(course.end_s)
+
+    def _wear(self, course: Course, loop: Loop) -> None:
+        """The apex grows by what it has been rubbed off."""
+        s = self.settings.tip_changes
+        if s.wear_m_per_m and loop.engages:
+            worn = s.wear_m_per_m * course.length_m * loop.force**s.hardness_exponent
+            tip = replace(self.tip, radius_m=self.tip.radius_m + worn)
+            self._tips.add(TipChange(course.end_s, "wear", tip))
+
+    def _treat(self, cause: str, t_s: float, cures: float, worsens: float, random: np.random.Generator) -> str:
+        draw = random.random()
+        tip = self._tips.at(t_s)
+        if draw < cures:
+            self._tips.add(TipChange(t_s, cause, self._maker.changed(tip, "sharp", random)))
+            return "cured"
+        flaw = drawn_flaw(self.settings.tip_changes, random)
+        if draw < cures + worsens and flaw is not None:
+            self._tips.add(TipChange(t_s, cause, self._maker.changed(tip, flaw, random)))
+            return "worsened"
+        return "unchanged"
+
+    def _mark(self, kind: str, position_m: tuple[float, float], t_s: float, depth_m: float, radius_m: float) -> None:
+        self._marks.append(Mark(self._on_sample(position_m, t_s), depth_m, radius_m, t_s, kind))
+
+    def _on_sample(self, position_m: tuple[float, float], t_s: float) -> tuple[float, float]:
+        drift = self.drift_m(t_s)
+        return float(position_m[0] - drift[0]), float(position_m[1] - drift[1])
+
+    def _relief(self, x_m: Array, y_m: Array, resolution_m: float, t_s: float) -> Relief:
+        relief = self._surface.relief(x_m, y_m, resolution_m, self._surface_seed)
+        for mark in self._marks:
+            if mark.t_s <= t_s:
+                marks.draw(mark, relief, x_m, y_m)
+        return relief
+
+    def _setup(self, loop: Loop, bias_v: float, slope: tuple[float, float], start_s: float) -> Setup:
+        if not (math.isfinite(bias_v) and all(map(math.isfinite, slope))):
+            raise InvalidValue(f"bias {bias_v} V and slope {slope} must be finite")
+        return Setup(
+            sample=lambda x, y, resolution_m: self._relief(x, y, resolution_m, start_s),
+            drift_m=self._drift.at,
+            offset_m=self._creep_m,
+            scanner=self.settings.scanner,
+            noise=self.settings.noise,
+            signals=self.settings.signals,
+            loop=loop,
+            bias_v=bias_v,
+            held_z_m=self._held_z_m,
+            slope=slope,
+        )
+
+    def _creep_m(self, t_s: Array) -> Array:
+        """How far the piezo is from where it was sent, (x, y): what is missing of its last move."""
+        move = np.subtract(self._at_m, self._came_from_m)
+        since = np.maximum(np.asarray(t_s) - self._came_s, 0.0) + 1.0
+        left = self.settings.scanner.creep * np.maximum(1.0 - np.log10(since) / 4.0, 0.0)
+        return np.asarray(left[:, None] * move)
