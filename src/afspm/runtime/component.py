@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -74,6 +75,7 @@ class Component:
     memory: Memory
     run_dir: Path
     packet: Packet | None
+    _publish: Callable[[Any, str | None], None]
 
     def run(self) -> None:
         """The experiment as a script; when it returns, the component is done. Not to be combined with ticks."""
@@ -129,7 +131,16 @@ class Component:
         Raises:
             ConfigError: the component has no address to publish on.
         """
-        raise NotImplementedError
+        self._publish(message, envelope)
+
+    if not TYPE_CHECKING:  # for the type checker the annotations above are all there is
+
+        def __getattr__(self, name: str) -> Any:
+            if name in Component.__annotations__:
+                raise AttributeError(
+                    f"{type(self).__name__}.{name.lstrip('_')} is not there yet in __init__; use it from on_start on"
+                )
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
 
     def run_process(self, context: Context) -> int:
         """Called by the host; see `afspm.runtime.process.Process`."""

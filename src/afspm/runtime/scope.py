@@ -3,43 +3,80 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+from afspm import wire
+from afspm.errors import InvalidValue
 from afspm.model import (
     ControlMode,
+    ControlRequest,
+    ControlResponse,
     ControlState,
     Feedback,
+    Parameter,
     ProbePosition,
+    Problem,
+    ProblemNames,
     Region,
+    Response,
     ScanParameters,
     ScanSet,
     ScopeState,
     Spectrum,
 )
+from afspm.runtime.asking import SETTLED_WITHIN_S, Asker, refused
+from afspm.runtime.events import Event, Events
+from afspm.runtime.holding import Holding
+from afspm.runtime.link import Link
+from afspm.runtime.measurement import Measuring
+from afspm.runtime.plans import MEASURED, Plans, fits
+from afspm.runtime.results import Results
+from afspm.runtime.values import Value, from_parameter, to_parameter
 
+__all__ = ["Event", "Events", "Scope"]
 
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Something that was published: `message` is an object of `afspm.model` or a generated message."""
-
-    envelope: str
-    message: Any
-    time_ns: int | None
+ANSWER_S = 60.0  # by default; what waits for control or for a measurement has no limit by default
 
 
 class Scope:
-    """What an experiment asks of the microscope. Every call blocks until it is done; nothing is polled.
+    """What an experiment asks of the microscope. A call returns when what it asks for is done.
 
     Control is asked for by itself and given back after each call; `with scope.control():` keeps it over several. Where
-    it is refused or taken away, calls wait until it is back. All timeouts are real seconds; None waits for ever.
+    it is refused or taken away, calls wait until it is back. Timeouts are in real seconds; None waits for ever.
 
-    Raises, from every call:
-        Refused: scheduler or microscope said no; it says why.
-        NoResponse: the time given was up.
+    Every call may raise:
+        Refused: the scheduler, a limit or the microscope said no; `reason` says why.
+        NoResponse: the time given was up, or nobody answers.
+        ControlLost: control was not given within the timeout.
         ExperimentEnded: there is nothing more to ask.
+
+    Args:
+        link: to the experiment.
+        state_dir: where keyed measurements are kept; None: only in memory.
+        between: called after each outermost call, when nothing is under way.
     """
+
+    def __init__(
+        self,
+        link: Link,
+        problems: ProblemNames | None = None,
+        state_dir: Path | None = None,
+        between: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._link = link
+        self._between = between
+        self._depth = 0
+        self.problems = problems or ProblemNames()
+        self._holding = Holding(link, self.problems)
+        self._asker = Asker(link, self._holding)
+        self._plans = Plans(link.view, self._asker)
+        self._results = Results(state_dir, link.name)
+        self._measuring = Measuring(link, self._holding, self._asker, self._results)
+        self._measuring.resume(MEASURED, fits)
+
+    # --- measuring ---
 
     def scan(
         self,
@@ -48,7 +85,22 @@ class Scope:
         shape: tuple[int, int] | None = None,
         key: str | None = None,
         timeout_s: float | None = None,
-    ) -> ScanSet: ...
+    ) -> ScanSet:
+        """Take a scan and return all its channels.
+
+        A scan that is interrupted (a problem, MANUAL, a restart of anything) is taken again when control is back;
+        `ScanSet.interruptions` says when and why.
+
+        Args:
+            region: where; None: what is set.
+            shape: (rows, columns); None: what is set.
+            key: makes it happen once in this run: a component that is killed and started again gets the scan of its
+                earlier life. Keys are the component's own, each for one measurement.
+        """
+        with self._call():
+            plan = self._plans.scan(region, shape)
+            result = self._measuring.take(plan, key, self._link.until(timeout_s))
+            return ScanSet(result.things, result.interruptions)
 
     def spectrum(
         self,
@@ -57,11 +109,40 @@ class Scope:
         kind: str | None = None,
         key: str | None = None,
         timeout_s: float | None = None,
-    ) -> Spectrum: ...
+    ) -> Spectrum:
+        """Take a spectrum; interruptions and `key` as with `scan`.
 
-    def set(self, parameter: str, value: float | str, unit: str | None = None) -> float | str: ...
+        Args:
+            at: (x, y) in m, where the probe is moved to; None: where it stands.
+            kind: e.g. "IV" (the parameter `x-spec-kind`); None: what is set.
+        """
+        with self._call():
+            plan = self._plans.spectrum(at, kind)
+            result = self._measuring.take(plan, key, self._link.until(timeout_s))
+            spectrum: Spectrum = result.things[0]
+            return spectrum
 
-    def get(self, parameter: str, unit: str | None = None) -> float | str: ...
+    # --- setting and getting ---
+
+    def set(self, parameter: str, value: Value, unit: str | None = None, *, timeout_s: float | None = None) -> Value:
+        """Set a parameter and return what is then in force, in the same unit.
+
+        Args:
+            value: a number, in `unit` (SI without one), a quantity as text ("0.5 V"), True, "on" …
+        """
+        with self._call():
+            asked = to_parameter(parameter, value, unit)
+            response = self._command(ControlRequest.PARAM, asked, timeout_s)
+            return self._value_in(response, asked, asked.unit)
+
+    def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
+        """The value of a parameter in `unit`; without one in SI, or as it came if it is not a base one."""
+        with self._call():
+            asked = Parameter(parameter)
+            response = self._read(ControlRequest.PARAM, asked, timeout_s)
+            if not response.ok:
+                raise refused(ControlRequest.PARAM, response, parameter)
+            return self._value_in(response, asked, unit)
 
     def set_feedback(
         self,
@@ -70,46 +151,188 @@ class Scope:
         proportional_gain: float | None = None,
         integral_gain: float | None = None,
         setpoint: float | None = None,
-    ) -> None: ...
+        timeout_s: float | None = None,
+    ) -> None:
+        """Set what is given of the z feedback; the rest stays as it is."""
+        with self._call():
+            feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
+            view, count = self._link.view, self._link.view.count("ZCtrlParameters")
+            changes = _changes(view.feedback, feedback)
+            self._command(ControlRequest.SET_ZCTRL_PARAMS, feedback, timeout_s)
+            if changes:  # so that `feedback` then tells it
+                self._link.wait(lambda: view.count("ZCtrlParameters") != count, self._link.until(SETTLED_WITHIN_S))
 
-    def move_probe(self, xy_m: tuple[float, float]) -> None: ...
+    def move_probe(self, xy_m: tuple[float, float], *, timeout_s: float | None = None) -> None:
+        """Move the probe to (x, y) in m; returns when it stands there."""
+        with self._call():
+            until_s = self._link.until(timeout_s)
+            with self._holding.hold(until_s=until_s):
+                self._plans.move_probe((float(xy_m[0]), float(xy_m[1])), until_s)
 
-    def action(self, name: str) -> None: ...
+    def action(self, name: str, *, timeout_s: float | None = None) -> None:
+        """Have the microscope do something by its name; returns when it has accepted it."""
+        with self._call():
+            self._command(ControlRequest.ACTION, name, timeout_s)
 
-    def supports(self, action: str) -> bool: ...
+    def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:
+        """Whether the microscope has an action of this name."""
+        with self._call():
+            response = self._read(ControlRequest.ACTION_SUPPORT, action, timeout_s)
+            if response.code in (ControlResponse.ACTION_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED):
+                return False
+            if not response.ok:
+                raise refused(ControlRequest.ACTION_SUPPORT, response, action)
+            return True
 
-    def control(
-        self, *, solving: int | str | None = None, timeout_s: float | None = None
-    ) -> AbstractContextManager[None]: ...
+    # --- control ---
 
-    def flag(self, problem: int | str) -> None: ...
+    @contextmanager
+    def control(self, *, solving: int | str | None = None, timeout_s: float | None = None) -> Iterator[None]:
+        """Keep control over all calls in the block; waits for it first.
 
-    def clear(self, problem: int | str) -> None: ...
+        Within the block control may still be lost: to a problem, to MANUAL. The next call then waits until it is back.
+        When the problem being solved has been cleared, it raises ControlLost: there is nothing left to do.
 
-    def set_mode(self, mode: ControlMode) -> None: ...
-
-    def end_experiment(self) -> None: ...
-
-    def events(self, *envelopes: str, timeout_s: float | None = None) -> Iterator[Event]: ...
-
-    def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> None: ...
-
-    def sleep(self, experiment_s: float) -> None: ...
+        Args:
+            solving: the flagged problem that will be solved, by name or number.
+        """
+        number = Problem.NONE if solving is None else self.problems.number(solving)
+        with self._holding.hold(solving=number, until_s=self._link.until(timeout_s)):
+            yield
 
     @property
-    def state(self) -> ScopeState: ...
+    def in_control(self) -> bool:
+        """Whether control is ours now."""
+        self._catch_up()
+        return self._holding.held
+
+    def flag(self, problem: int | str) -> None:
+        """Flag a problem, by name or number: control is taken from whoever has it, until the problem is cleared."""
+        self._tell(ControlRequest.ADD_EXP_PRBLM, self.problems.number(problem))
+
+    def clear(self, problem: int | str) -> None:
+        """Remove the flag of a problem; that it was not flagged is no error."""
+        self._tell(ControlRequest.RMV_EXP_PRBLM, self.problems.number(problem))
+
+    def set_mode(self, mode: ControlMode) -> None:
+        """Set MANUAL (nobody has control) or AUTOMATED."""
+        self._tell(ControlRequest.SET_CONTROL_MODE, int(mode))
+
+    def end_experiment(self) -> None:
+        """End the experiment for everybody, this process included: the next call raises ExperimentEnded."""
+        self._tell(ControlRequest.END_EXPERIMENT, None)
+
+    # --- looking ---
 
     @property
-    def mode(self) -> ControlMode: ...
+    def state(self) -> ScopeState:
+        """What the microscope is doing."""
+        self._catch_up()
+        return self._link.view.state
 
     @property
-    def control_state(self) -> ControlState: ...
+    def control_state(self) -> ControlState:
+        """Mode, holder and problems."""
+        self._catch_up()
+        return self._link.view.control or ControlState(ControlMode.UNDEFINED)
 
     @property
-    def scan_parameters(self) -> ScanParameters | None: ...
+    def mode(self) -> ControlMode:
+        """MANUAL or AUTOMATED."""
+        return self.control_state.mode
 
     @property
-    def feedback(self) -> Feedback | None: ...
+    def scan_parameters(self) -> ScanParameters | None:
+        """Where and how the next scan will be taken; None if the microscope has not said."""
+        self._catch_up()
+        return self._link.view.scan_parameters
 
     @property
-    def probe_position(self) -> ProbePosition | None: ...
+    def feedback(self) -> Feedback | None:
+        """The z feedback; None if the microscope has not said."""
+        self._catch_up()
+        return self._link.view.feedback
+
+    @property
+    def probe_position(self) -> ProbePosition | None:
+        """Where the probe stands; None if the microscope has not said."""
+        self._catch_up()
+        return self._link.view.probe_position
+
+    def events(self, *envelopes: str, timeout_s: float | None = None) -> Events:
+        """Iterate over what is published from now on, as `Event(envelope, message, time_ns)`.
+
+        Args:
+            envelopes: prefixes of those wanted; none: all.
+            timeout_s: ends the iteration when nothing came for that long.
+        """
+        return Events(self._link, envelopes, timeout_s)
+
+    def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> bool:
+        """Wait until `condition()`, tried whenever something was published; False when the time is up."""
+        with self._call():
+            return self._link.wait(condition, self._link.until(timeout_s))
+
+    def sleep(self, experiment_s: float) -> None:
+        """Let time pass in the experiment. Unlike `time.sleep` it ends with the experiment, and keeps its clock."""
+        if not experiment_s >= 0.0:
+            raise InvalidValue(f"can't wait for {experiment_s} s")
+        clock = self._link.clock
+        end_s = clock.now_s() + experiment_s
+        with self._call():
+            while (left_s := end_s - clock.now_s()) > 0.0:
+                self._link.wait(lambda: False, self._link.until(clock.real_s(left_s)))
+
+    # --- within ---
+
+    def release_inherited(self) -> None:
+        """Give back control that an earlier life of this component died with. Called by the component's loop."""
+        self._holding.release_inherited()
+
+    @contextmanager
+    def _call(self) -> Iterator[None]:
+        """A call of the user; when the outermost is done, what arrived meanwhile is handled."""
+        self._link.check()
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+        if self._depth == 0:
+            self._between()
+
+    def _catch_up(self) -> None:
+        """Take in what has arrived, so that what is told is not from before the last computation."""
+        self._link.wait_caught_up()
+        self._link.pump(0.0)
+
+    def _command(self, kind: ControlRequest, subject: Any, timeout_s: float | None) -> Response:
+        until_s = self._link.until(timeout_s)
+        with self._holding.hold(until_s=until_s):
+            return self._asker.ask(kind, subject, until_s=until_s)
+
+    def _read(self, kind: ControlRequest, subject: Any, timeout_s: float | None) -> Response:
+        """Ask for what anybody may know; schedulers of version 1 tell only who is in control."""
+        until_s = self._link.until(timeout_s)
+        response = self._asker.send(kind, subject, until_s=until_s)
+        if response.code != ControlResponse.NOT_IN_CONTROL:
+            return response
+        with self._holding.hold(until_s=until_s):
+            return self._asker.send(kind, subject, until_s=until_s)
+
+    def _tell(self, kind: ControlRequest, subject: int | None) -> None:
+        """Ask the scheduler itself, which needs no control."""
+        with self._call():
+            response = self._link.request(kind, subject)
+            if not response.ok:
+                raise refused(kind, response, self._link.name)
+
+    def _value_in(self, response: Response, asked: Parameter, unit: str | None) -> Value:
+        if not response.payload:  # a peer that only says that it did it
+            return from_parameter(asked, unit)
+        return from_parameter(wire.decode_parameter(response.payload), unit)
+
+
+def _changes(now: Feedback | None, wanted: Feedback) -> bool:
+    """Whether setting `wanted` changes anything."""
+    return now is None or any(value is not None and value != getattr(now, name) for name, value in vars(wanted).items())

@@ -1,0 +1,127 @@
+"""Commands to the microscope that are seen through: asked for again where that helps, refused loudly where not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from afspm.errors import NoResponse, Refused
+from afspm.model import ControlRequest, ControlResponse, Response, ScopeState
+from afspm.runtime.holding import Holding
+from afspm.runtime.link import Link
+
+PATIENCE_S = 60.0  # real time that a translator may take to be there again
+NOT_THERE_S = 1.0  # before one that can't be reached is asked again, when nothing is published in between
+SETTLED_WITHIN_S = 2.0  # what was set is published, if it changed anything
+ASK_FREE_AGAIN_S = 5.0  # should the state FREE never reach us
+
+_NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
+
+
+class Asker:
+    """Asks the microscope for something, through the scheduler, in control."""
+
+    def __init__(self, link: Link, holding: Holding) -> None:
+        self._link = link
+        self._holding = holding
+
+    def ask(
+        self,
+        kind: ControlRequest,
+        subject: Any = None,
+        *,
+        until_s: float | None = None,
+    ) -> Response:
+        """Ask for a command until it succeeds. Control must be held around it; where it is lost it is waited for.
+
+        Raises:
+            Refused: the microscope, or a limit, says no.
+            NoResponse: the microscope stays silent, or is not free until `until_s`.
+            ControlLost: control was not back until `until_s`.
+        """
+        while True:
+            self._holding.regain(until_s)
+            states = self._link.view.count("ScopeStateMsg")
+            response = self.send(kind, subject, until_s=until_s)
+            if response.ok:
+                return response
+            self.get_over(kind, response, states, until_s)
+
+    def send(
+        self, kind: ControlRequest, subject: Any = None, *, request_id: str = "", until_s: float | None = None
+    ) -> Response:
+        """Ask once, but have patience with a microscope that is silent: same id, so it is executed once.
+
+        Raises:
+            NoResponse: it stays silent.
+        """
+        clock = self._link.clock
+        request_id = request_id or self._link.next_id()
+        give_up_s = clock.monotonic_s() + PATIENCE_S
+        if until_s is not None:
+            give_up_s = min(give_up_s, until_s)
+        told = False
+        while True:
+            response = self._link.request(kind, subject, request_id=request_id, until_s=until_s)
+            if response.code != ControlResponse.NO_RESPONSE:
+                return response
+            if clock.monotonic_s() >= give_up_s:
+                raise NoResponse(
+                    f"the microscope does not answer {kind.name}",
+                    where=self._link.name,
+                    hint="is its translator running? whether it was carried out is not known",
+                )
+            if not told:
+                self._link.log.warning("the microscope does not answer %s; asking again", kind.name)
+                told = True
+            self._wait_for_something(min(give_up_s, clock.monotonic_s() + NOT_THERE_S))
+
+    def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
+        """After a response that is no success: wait for what stands in the way, or raise Refused.
+
+        Args:
+            states: how many states had been published before it was asked.
+        """
+        if response.code in _NOT_IN_CONTROL:
+            self._holding.lost(response.reason)
+        elif response.code == ControlResponse.NOT_FREE:
+            self.wait_free(states, until_s)
+        else:
+            raise refused(kind, response, self._link.name)
+
+    def wait_free(self, states: int, until_s: float | None = None) -> None:
+        """Wait until the microscope says that it is free, later than `states`; not for ever, should that get lost.
+
+        Raises:
+            NoResponse: it is not free until `until_s`.
+        """
+        link, view = self._link, self._link.view
+        again_s = link.clock.monotonic_s() + ASK_FREE_AGAIN_S
+        link.wait(
+            lambda: view.state is ScopeState.FREE and view.count("ScopeStateMsg") != states,
+            again_s if until_s is None else min(again_s, until_s),
+        )
+        if until_s is not None and link.clock.monotonic_s() >= until_s:
+            raise NoResponse(f"the microscope was not free in time: it is {view.state.name}", where=link.name)
+
+    def settle(self, message: str, count: int, until_s: float | None = None) -> None:
+        """After a success: wait until `message` was published more than `count` times, and moving has ended.
+
+        A microscope that publishes nothing, since nothing changed, is not waited for long.
+        """
+        link, view = self._link, self._link.view
+        soon_s = link.clock.monotonic_s() + SETTLED_WITHIN_S
+        if link.wait(lambda: view.count(message) != count, soon_s if until_s is None else min(soon_s, until_s)):
+            link.wait(lambda: view.state is not ScopeState.MOVING, until_s)
+
+    def _wait_for_something(self, until_s: float) -> None:
+        """Until the microscope says anything, or `until_s`."""
+        view = self._link.view
+        count = view.count("ScopeStateMsg")
+        self._link.wait(lambda: view.count("ScopeStateMsg") != count, until_s)
+
+
+def refused(kind: ControlRequest, response: Response, where: str) -> Refused:
+    """A response as the error that it is."""
+    known = response.code in ControlResponse._value2member_map_
+    code = ControlResponse(response.code).name if known else str(response.code)
+    return Refused(response.code, f"{kind.name} was refused: {response.reason or code}", where=where, hint=code)

@@ -1,0 +1,77 @@
+"""Packets that wait to be handled: in order, none lost, in bounded memory however long one is busy."""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+from collections import deque
+from typing import IO
+
+from afspm.model import Packet
+
+MEMORY_LIMIT_BYTES = 256 << 20
+_LENGTHS = struct.Struct("<IQq?")  # envelope, payload, time, whether there is one
+
+
+class Backlog:
+    """A queue of packets. Those beyond `limit_bytes` wait in a temporary file, which goes when it is empty."""
+
+    def __init__(self, limit_bytes: int = MEMORY_LIMIT_BYTES) -> None:
+        self._limit_bytes = limit_bytes
+        self._memory: deque[Packet] = deque()
+        self._memory_bytes = 0
+        self._file: IO[bytes] | None = None
+        self._read_at = 0
+        self._on_disk = 0
+
+    def __len__(self) -> int:
+        return len(self._memory) + self._on_disk
+
+    def put(self, packet: Packet) -> None:
+        size = len(packet.payload)
+        # once some wait on disk all later ones must too, or they would overtake
+        if self._file is None and (not self._memory or self._memory_bytes + size <= self._limit_bytes):
+            self._memory.append(packet)
+            self._memory_bytes += size
+        else:
+            self._put_on_disk(packet)
+
+    def take(self) -> Packet | None:
+        """The oldest packet; None if there is none."""
+        if not self._memory:
+            return self._take_from_disk()
+        packet = self._memory.popleft()
+        self._memory_bytes -= len(packet.payload)
+        return packet
+
+    def close(self) -> None:
+        """Drop everything."""
+        self._memory.clear()
+        self._memory_bytes = self._on_disk = self._read_at = 0
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _put_on_disk(self, packet: Packet) -> None:
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="afspm-")  # noqa: SIM115 - open for as long as it is needed
+        envelope = packet.envelope.encode()
+        time_ns = packet.time_ns
+        self._file.seek(0, 2)
+        self._file.write(_LENGTHS.pack(len(envelope), len(packet.payload), time_ns or 0, time_ns is not None))
+        self._file.write(envelope)
+        self._file.write(packet.payload)
+        self._on_disk += 1
+
+    def _take_from_disk(self) -> Packet | None:
+        if self._file is None:
+            return None
+        self._file.seek(self._read_at)
+        envelope_len, payload_len, time_ns, has_time = _LENGTHS.unpack(self._file.read(_LENGTHS.size))
+        envelope = self._file.read(envelope_len).decode()
+        packet = Packet(envelope, self._file.read(payload_len), time_ns if has_time else None)
+        self._read_at = self._file.tell()
+        self._on_disk -= 1
+        if self._on_disk == 0:
+            self.close()
+        return packet

@@ -1,0 +1,72 @@
+"""One scan or spectrum, followed through what the scheduler publishes. Pure: packets in, an outcome out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum, auto
+from typing import Any
+
+from afspm.model import ScopeState
+
+
+class Outcome(Enum):
+    """How it ended."""
+
+    COMPLETED = auto()
+    INTERRUPTED = auto()
+    """The microscope says that it was stopped."""
+    VANISHED = auto()
+    """The microscope is free and there is nothing: it was started anew in the middle, say."""
+
+
+class Cycle:
+    """The state `busy`, then results, then FREE.
+
+    Args:
+        busy: the state while it runs, SCANNING or SPEC.
+        fits: whether a result can be what was asked for.
+        since_ns: what is not newer than this belongs to something earlier; None: nothing was published before.
+        resumed: it was asked for in an earlier life of ours; somebody else may have measured since then, and only
+            results that fit count. Otherwise all count once `busy` was seen: only we are in control, and a correction
+            of drift may move a region. While a connection was lost the cache may have kept the results and not
+            `busy`: then, too, results that fit are taken for ours.
+    """
+
+    def __init__(
+        self, busy: ScopeState, fits: Callable[[Any], bool], *, since_ns: int | None = None, resumed: bool = False
+    ) -> None:
+        self._busy = busy
+        self._fits = fits
+        self._since_ns = since_ns
+        self._resumed = resumed
+        self.begun = False
+        self.outcome: Outcome | None = None
+        self.results: list[Any] = []
+
+    def on_state(self, state: ScopeState, time_ns: int | None) -> None:
+        """The microscope said what it is doing."""
+        if self.outcome is not None or self._is_old(time_ns):
+            return
+        if state is self._busy:
+            self.results.clear()  # what came before this began belongs to another
+            self.begun = True
+        elif not self.begun:
+            return
+        elif state is ScopeState.INTERRUPTED:
+            self.outcome = Outcome.INTERRUPTED
+        elif state is ScopeState.FREE:
+            self.outcome = Outcome.COMPLETED if self.results else Outcome.VANISHED
+
+    def on_result(self, result: Any, time_ns: int | None) -> None:
+        """A channel of a scan, or a spectrum, was published."""
+        if self.outcome is not None or self._is_old(time_ns):
+            return
+        if (self._resumed or not self.begun) and not self._fits(result):
+            return
+        self.begun = True
+        self.results.append(result)
+
+    def _is_old(self, time_ns: int | None) -> bool:
+        if time_ns is None:  # a peer that does not say: only what we wait for right now can be ours
+            return self._resumed
+        return self._since_ns is not None and time_ns <= self._since_ns

@@ -1,0 +1,122 @@
+"""`python -m afspm.runtime.host`: hosts one process of an experiment, as the line on its standard input says."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from afspm.clock import Clock, ExperimentClock
+from afspm.errors import AfspmError, ConfigError
+from afspm.runtime import log
+from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.launch import Launch
+from afspm.runtime.loading import load
+from afspm.runtime.messages import register_all
+from afspm.runtime.parent import Parent, end_within, read_launch_line
+from afspm.runtime.process import Activity, Context
+from afspm.runtime.stopping import StopRequested
+from afspm.runtime.view import KEPT
+from afspm.transport.heartbeat import HeartbeatSender
+from afspm.transport.launching import open_port
+from afspm.transport.network import Network
+from afspm.transport.port import ParentGone, Port
+
+FAREWELL_S = 1.0  # that exit handlers and threads of libraries have, once everything of ours is done
+MEASURED = frozenset({"Scan2d", "Spec1d"})
+
+
+def main() -> int:
+    """Returns the exit code, with which the caller is to end the process."""
+    # Ctrl-C reaches the whole terminal; whether it ends us is the parent's decision
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        launch = Launch.from_json(read_launch_line())
+    except ConfigError as error:
+        log.set_up("host", "INFO").error("%s", error)
+        return ExitCode.CONFIG
+    logger = log.set_up(launch.name, launch.log_level)
+    parent = Parent(ExitCode.ORPHAN)
+    parent.watch()
+    signal.signal(signal.SIGTERM, lambda *_: parent.let_go())
+    _detach_stdin()
+    try:
+        return _host(launch, logger, parent)
+    except ConfigError as error:
+        logger.error("%s", error)
+        return ExitCode.CONFIG
+    except StopRequested:
+        return ExitCode.ORPHAN
+    except Exception as error:
+        if parent.gone:
+            logger.debug("while ending: %s", error, exc_info=True)
+            return ExitCode.ORPHAN
+        logger.exception("%s", error if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}")
+        return ExitCode.CRASHED
+
+
+def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
+    clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
+    activity = Activity(clock)
+    with _Beating(launch, activity):
+        with activity.step():  # importing may take its time
+            register_all(launch.messages)
+            process = load(launch)
+        context = Context(
+            launch,
+            clock,
+            open_port=lambda: _open_port(launch, clock, parent),
+            log=logger,
+            activity=activity,
+            when_stopping=parent.when_gone,
+            session=os.urandom(4).hex(),
+        )
+        return process.run_process(context)
+
+
+class _Beating:
+    """Heartbeats while in the block. Only an end on purpose is announced: after an error the silence tells."""
+
+    def __init__(self, launch: Launch, activity: Activity) -> None:
+        self._network: Network | None = None
+        if launch.sockets.heartbeat is None:
+            return
+        self._network = Network.from_launch(launch.name, launch.keys)
+        self._sender = HeartbeatSender(
+            self._network,
+            launch.sockets.heartbeat,
+            launch.beat_period_s,
+            activity.age_s,
+            lambda: activity.longest_step_s,
+        )
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._network is not None and kind is None:
+            self._sender.close()
+            self._network.close()
+
+
+def _open_port(launch: Launch, clock: Clock, parent: Parent) -> Port:
+    """The port of a component: hears, besides what it subscribed to, what `Scope` has to know."""
+    if launch.envelopes is not None and launch.sockets.control is not None:
+        launch = replace(launch, envelopes=tuple(sorted({*launch.envelopes, *KEPT, *MEASURED})))
+    port = open_port(launch, clock)
+    parent.when_gone(lambda: port.wake_up(ParentGone()))
+    return port
+
+
+def _detach_stdin() -> None:
+    """What a component reads from sys.stdin is not what keeps us alive."""
+    sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115 - as long as the process lives
+
+
+if __name__ == "__main__":
+    exit_code = int(main())
+    end_within(FAREWELL_S, exit_code)
+    sys.exit(exit_code)

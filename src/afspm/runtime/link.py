@@ -1,0 +1,244 @@
+"""The one place that waits: takes what the port brings to whom it is for, and asks the scheduler."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from afspm import wire
+from afspm.clock import Clock
+from afspm.errors import ExperimentEnded, NoResponse, WireError
+from afspm.model import ControlRequest, Packet, Request, Response
+from afspm.runtime.process import Activity
+from afspm.runtime.stopping import StopRequested
+from afspm.runtime.view import KEPT, View
+from afspm.transport.port import (
+    CaughtUp,
+    ControlConnected,
+    ControlDisconnected,
+    Incoming,
+    Killed,
+    PacketReceived,
+    ParentGone,
+    Port,
+    ReplyReceived,
+)
+
+CAUGHT_UP_WITHIN_S = 2.0  # a scheduler of version 1 replays without saying when it is done
+Listener = Callable[[Packet, bool], None]
+
+
+class Link:
+    """A component's connection to its experiment, for use from one thread.
+
+    Args:
+        source: the address of the scheduler's publisher, whose packets tell the state; None: all do.
+        session: differs between two lives of a component of the same name.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        name: str,
+        *,
+        source: str | None = None,
+        session: str = "0",
+        request_timeout_s: float = 5.0,
+        request_retries: int = 3,
+        activity: Activity | None = None,
+        log: logging.Logger | None = None,
+    ) -> None:
+        self.port = port
+        self.name = name
+        self.clock: Clock = port.clock
+        self.view = View()
+        self.activity = activity or Activity(self.clock)
+        self.log = log or logging.getLogger(f"afspm.{name}")
+        self.ended = False
+        self.stopping = False
+        self.connections = 0
+        self.connected = False
+        self.request_timeout_s = request_timeout_s
+        self._retries = request_retries
+        self._source = source
+        self._session = session
+        self._requests = 0
+        self._asked = ""
+        self._answer: Response | None = None
+        self._ids_are_echoed: bool | None = None
+        self._caught_up: set[str] = set()
+        self._listeners: dict[int, Listener] = {}
+        self._listened = 0
+
+    # --- waiting ---
+
+    def wait(self, done: Callable[[], bool], until_s: float | None = None) -> bool:
+        """Wait until `done()`, which is tried after whatever arrives; False if `until_s` (monotonic) comes first.
+
+        Raises:
+            ExperimentEnded, StopRequested: there is nothing more to wait for.
+        """
+        with self.activity.waiting():
+            while not done():
+                left_s = None if until_s is None else until_s - self.clock.monotonic_s()
+                if left_s is not None and left_s <= 0.0:
+                    return False
+                self.pump(left_s)
+        return True
+
+    def pump(self, timeout_s: float | None) -> None:
+        """Wait for what arrives, once, and bring it to whom it is for."""
+        self.check()
+        for incoming in self.port.poll(timeout_s):
+            self._take(incoming)
+        self.check()
+
+    def check(self) -> None:
+        """Raises ExperimentEnded or StopRequested if it is so."""
+        if self.stopping:
+            raise StopRequested
+        if self.ended:
+            raise ExperimentEnded("the experiment has ended", where=self.name)
+
+    def wait_caught_up(self) -> None:
+        """Wait until everything the scheduler has cached is here; once that is so, returns at once."""
+        if self.wait(self.is_caught_up, self.clock.monotonic_s() + CAUGHT_UP_WITHIN_S):
+            return
+        self._caught_up.add(self._source or "")
+
+    def is_caught_up(self) -> bool:
+        return self._source in self._caught_up if self._source else bool(self._caught_up)
+
+    # --- listening ---
+
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        """`listener(packet, ours)` is called with every packet from now on; `ours`: it is the scheduler's.
+
+        Returns what ends that.
+        """
+        self._listened += 1
+        number = self._listened
+        self._listeners[number] = listener
+
+        def forget() -> None:
+            self._listeners.pop(number, None)
+
+        return forget
+
+    @contextmanager
+    def listening(self, listener: Listener) -> Iterator[None]:
+        """`listen` while in the block."""
+        forget = self.listen(listener)
+        try:
+            yield
+        finally:
+            forget()
+
+    # --- asking ---
+
+    def next_id(self) -> str:
+        """An id for a request, not used before in any life of this component."""
+        self._requests += 1
+        return f"{self.name}/{self._session}/{self._requests}"
+
+    def request(
+        self, kind: ControlRequest, subject: Any = None, *, request_id: str = "", until_s: float | None = None
+    ) -> Response:
+        """Ask the scheduler and wait for its answer, whatever it is.
+
+        A request that stays unanswered is repeated with its id, which has it executed once. While the scheduler is
+        gone it is waited for.
+
+        Raises:
+            NoResponse: no answer to any repetition, or none until `until_s` (monotonic).
+        """
+        request = Request(kind, subject, id=request_id or self.next_id())
+        frames = wire.encode_request(request)
+        self._asked, self._answer = request.id, None
+        sent = 0
+        try:
+            while sent < self._tries(kind):
+                if not self.wait(lambda: self.connected, until_s):
+                    raise NoResponse("the scheduler is not there", where=self.name, hint="is the experiment running?")
+                connection = self.connections
+                self.port.send(frames)
+                answer = self._await_answer(connection, self._earlier(self.request_timeout_s, until_s))
+                if answer is not None:
+                    return answer
+                if until_s is not None and self.clock.monotonic_s() >= until_s:
+                    break
+                # a connection that was lost is the scheduler's restart, not its silence
+                sent += connection == self.connections
+                self.log.debug("%s (%s) is asked again", kind.name, request.id)
+        finally:
+            self._asked = ""
+        raise NoResponse(
+            f"{kind.name} was not answered, asked {max(sent, 1)} times",
+            where=self.name,
+            hint="whether it was carried out is not known",
+        )
+
+    def send_only(self, kind: ControlRequest, subject: Any = None) -> None:
+        """Ask without waiting for the answer, for what is done on the way out."""
+        self.port.send(wire.encode_request(Request(kind, subject, id=self.next_id())))
+
+    def until(self, timeout_s: float | None) -> float | None:
+        """A timeout as the moment, in monotonic time, when it is over."""
+        return None if timeout_s is None else self.clock.monotonic_s() + timeout_s
+
+    def _earlier(self, timeout_s: float, until_s: float | None) -> float:
+        soon_s = self.clock.monotonic_s() + timeout_s
+        return soon_s if until_s is None else min(soon_s, until_s)
+
+    def _tries(self, kind: ControlRequest) -> int:
+        # a scheduler of version 1 does not know ids: what it may have done must not be asked for twice
+        if kind is ControlRequest.ACTION and self._ids_are_echoed is False:
+            return 1
+        return 1 + self._retries
+
+    def _await_answer(self, connection: int, until_s: float) -> Response | None:
+        self.wait(lambda: self._answer is not None or self.connections != connection, until_s)
+        return self._answer
+
+    def _take(self, incoming: Incoming) -> None:
+        match incoming:
+            case PacketReceived(packet, source):
+                self._take_packet(packet, source)
+            case ReplyReceived(response):
+                self._take_reply(response)
+            case CaughtUp(source):
+                self._caught_up.add(source)
+            case ControlConnected():
+                self.connections += 1
+                self.connected = True
+            case ControlDisconnected():
+                self.connected = False
+            case Killed():
+                self.ended = True
+            case ParentGone():
+                self.stopping = True
+
+    def _take_reply(self, response: Response) -> None:
+        if not self._asked:
+            return  # late: it was given up on
+        if response.id in ("", self._asked):
+            self._ids_are_echoed = bool(response.id)
+            self._answer = response
+
+    def _take_packet(self, packet: Packet, source: str) -> None:
+        ours = self._source is None or source == self._source
+        if ours:
+            self.view.take_time(packet.time_ns)
+            self._look_at(packet)
+        for listener in tuple(self._listeners.values()):
+            listener(packet, ours)
+
+    def _look_at(self, packet: Packet) -> None:
+        try:
+            message = wire.message_of(packet.envelope)
+            if message in KEPT:
+                self.view.take(message, wire.decode(message, packet.payload))
+        except WireError as error:
+            self.log.debug("a packet that can't be read: %s", error)

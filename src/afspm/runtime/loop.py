@@ -1,0 +1,175 @@
+"""What runs a component: one thread that waits in one place, and calls one handler at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from afspm import wire
+from afspm.clock import Clock
+from afspm.errors import ConfigError, ExperimentEnded
+from afspm.model import Packet
+from afspm.runtime.backlog import Backlog
+from afspm.runtime.component import Component
+from afspm.runtime.dispatch import Dispatcher, overrides
+from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.link import Link
+from afspm.runtime.memory import Memory
+from afspm.runtime.process import Context
+from afspm.runtime.scope import Scope
+from afspm.runtime.stopping import StopRequested
+
+NS_PER_S = 1_000_000_000
+AT_ONCE = 16  # packets handled before the port is looked at again: a KILL must not wait for a long backlog
+
+
+class ComponentLoop:
+    """Runs one component until the experiment ends, it is stopped, or its `run` returns."""
+
+    def __init__(self, component: Component, context: Context) -> None:
+        self._component = component
+        self._context = context
+        self._activity = context.activity
+        self._activity.longest_step_s = component.longest_step_s
+        self._is_script = overrides(component, Component, "run")
+        self._backlog = Backlog()
+        launch = context.launch
+        state_dir = Path(launch.state_dir) if launch.state_dir else None
+        self._dispatcher = Dispatcher(component, Component, launch.envelopes, context.log)
+        self._ticker = None if self._is_script else _ticker(component, context.clock)
+        port = context.open_port()
+        self._link = Link(
+            port,
+            launch.name,
+            source=launch.sockets.subscribe[0] if launch.sockets.subscribe else None,
+            session=context.session,
+            request_timeout_s=launch.request_timeout_s,
+            request_retries=launch.request_retries,
+            activity=self._activity,
+            log=context.log,
+        )
+        between = self._handle_what_came if self._is_script and self._dispatcher.wants_anything else _nothing
+        self._scope = Scope(self._link, context.problems, state_dir, between)
+        self._link.listen(self._keep)
+        self._give_attributes(state_dir)
+
+    def run(self) -> int:
+        """Returns the exit code."""
+        code = ExitCode.CRASHED
+        try:
+            code = self._run()
+        finally:
+            self._backlog.close()
+            self._link.port.close()
+        return code
+
+    def _run(self) -> ExitCode:
+        try:
+            self._begin()
+            if self._is_script:
+                with self._activity.step():
+                    self._component.run()
+            else:
+                self._serve()
+            code = ExitCode.ENDED if self._link.ended else ExitCode.DONE
+        except ExperimentEnded:
+            code = ExitCode.ENDED
+        except StopRequested:
+            code = ExitCode.ORPHAN
+        self._end()
+        return code
+
+    def _begin(self) -> None:
+        with self._activity.step():
+            self._component.on_start()
+        if not self._is_script:
+            self._link.wait_caught_up()
+            self._scope.release_inherited()
+
+    def _serve(self) -> None:
+        """Handle what comes, and tick, until something ends it."""
+        while True:
+            due_s = self._ticker.due_in_s() if self._ticker else None
+            if due_s is not None and due_s <= 0.0 and self._ticker:
+                with self._activity.step():
+                    self._component.on_tick()
+                self._ticker.done()
+                due_s = 0.0
+            self._link.pump(0.0 if len(self._backlog) else due_s)
+            self._handle_what_came(AT_ONCE)
+
+    def _handle_what_came(self, at_most: int | None = None) -> None:
+        while (at_most is None or at_most > 0) and (packet := self._backlog.take()) is not None:
+            with self._activity.step():
+                self._dispatcher.give(packet)
+            at_most = None if at_most is None else at_most - 1
+
+    def _end(self) -> None:
+        """Say good-bye to the component. What it can't do any more must not hide why we ended."""
+        try:
+            with self._activity.step():
+                self._component.on_end()
+        except (ExperimentEnded, StopRequested):
+            self._context.log.debug("on_end asked for something after the end")
+        except Exception:
+            self._context.log.exception("on_end failed")
+
+    def _keep(self, packet: Packet, ours: bool) -> None:
+        if self._dispatcher.wants(packet):
+            self._backlog.put(packet)
+
+    def _give_attributes(self, state_dir: Path | None) -> None:
+        component, context = self._component, self._context
+        component.scope = self._scope
+        component.clock = context.clock
+        component.log = context.log
+        component.name = context.name
+        component.memory = Memory(state_dir / f"{context.name}.json" if state_dir else None)
+        component.run_dir = Path(context.launch.run_dir or ".")
+        component.packet = None
+        component._publish = self._publish
+
+    def _publish(self, message: object, envelope: str | None) -> None:
+        name, payload = wire.encode(message)
+        if envelope is not None and wire.message_of(envelope) != name:
+            raise ConfigError(
+                f"the envelope {envelope!r} does not begin with the message's name {name!r}",
+                where=self._context.name,
+                hint=f"e.g. {name}_{envelope}",
+            )
+        self._link.port.publish(envelope or name, payload)
+
+
+class _Ticker:
+    """When the next tick is due: by the beat of the first, not of the end of the last."""
+
+    def __init__(self, period: int, now: Callable[[], int], real_s: Callable[[int], float]) -> None:
+        self._period = period
+        self._now = now
+        self._real_s = real_s
+        self._next = now()
+
+    def due_in_s(self) -> float:
+        """Real seconds until the next tick; at most 0 if it is due."""
+        left = self._next - self._now()
+        return self._real_s(left) if left > 0 else 0.0
+
+    def done(self) -> None:
+        """It was made; those missed meanwhile are not made up for."""
+        missed = max(0, self._now() - self._next) // self._period
+        self._next += (missed + 1) * self._period
+
+
+def _ticker(component: Component, clock: Clock) -> _Ticker | None:
+    if component.period_s is None:
+        return None
+    if not component.period_s > 0.0:
+        raise ConfigError(f"a period of {component.period_s} s can't be kept", where=type(component).__name__)
+    period = max(1, round(component.period_s * NS_PER_S))
+    if component.period_time == "real":
+        return _Ticker(period, lambda: round(clock.monotonic_s() * NS_PER_S), lambda ns: ns / NS_PER_S)
+    return _Ticker(period, clock.now_ns, lambda ns: clock.real_s(ns / NS_PER_S))
+
+
+def _nothing() -> None:
+    """Between the calls of a script without handlers."""

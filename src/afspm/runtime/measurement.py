@@ -1,0 +1,250 @@
+"""Taking one scan or spectrum, whatever gets in between, exactly once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+from afspm import wire
+from afspm.errors import NoResponse, WireError
+from afspm.model import ControlRequest, Packet, ScopeState
+from afspm.runtime.asking import Asker
+from afspm.runtime.cycle import Cycle, Outcome
+from afspm.runtime.holding import Holding
+from afspm.runtime.link import Link
+from afspm.runtime.results import Result, Results, check_key
+
+BEGUN_WITHIN_S = 5.0  # from the success of the action to the state that says so
+MOST_FAILURES = 5  # in a row, that nothing explains: then a person should look
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be measured.
+
+    Attributes:
+        what: for a person: "scan", "spectrum".
+        action: what begins it.
+        busy: the state of the microscope while it runs.
+        message: what its results are published as.
+        prepare: sets what it needs, if it isn't set; called in control before each attempt, with when to give up.
+        fits: whether a result can be of this plan.
+        facts: the plan in JSON's types, to recognise it in a later life.
+        name_of: what must not be there twice in one result (the channel of a scan).
+    """
+
+    what: str
+    action: str
+    busy: ScopeState
+    message: str
+    prepare: Callable[[float | None], None]
+    fits: Callable[[Any], bool]
+    facts: dict[str, Any]
+    name_of: Callable[[Any], str]
+
+
+@dataclass
+class _Progress:
+    """How far a measurement has come."""
+
+    plan: Plan
+    key: str | None
+    stem: str
+    until_s: float | None
+    attempt: int = 0
+    failures: int = 0
+    interruptions: list[str] = field(default_factory=list)
+
+    def request_id(self) -> str:
+        """Of the action that begins it: another in every attempt, the same in every life."""
+        return f"{self.stem}/{self.attempt}"
+
+
+class Measuring:
+    """Takes measurements over one link, one at a time."""
+
+    def __init__(self, link: Link, holding: Holding, asker: Asker, results: Results) -> None:
+        self._link = link
+        self._holding = holding
+        self._asker = asker
+        self._results = results
+        self._channels: dict[str, frozenset[str]] = {}
+        self._resumed: Cycle | None = None
+        self._forget_resumed: Callable[[], None] = lambda: None
+
+    def resume(self, busy: dict[str, tuple[ScopeState, str]], fits: Callable[[dict[str, Any], Any], bool]) -> None:
+        """Look out, from the first packet on, for what an earlier life asked for and did not get.
+
+        Args:
+            busy: by what is measured, the state while it runs and the message of its results.
+            fits: whether a result can be of a plan of these facts.
+        """
+        intent = self._results.pending
+        if intent is None or intent["plan"]["what"] not in busy:
+            return
+        facts = intent["plan"]
+        state, message = busy[facts["what"]]
+        since_ns = -1 if intent["since_ns"] is None else intent["since_ns"]
+        self._resumed = Cycle(state, lambda result: fits(facts, result), since_ns=since_ns, resumed=True)
+        self._forget_resumed = self._link.listen(self._listener(self._resumed, message))
+
+    def take(self, plan: Plan, key: str | None, until_s: float | None) -> Result:
+        """Measure until there is a complete result; with a key, once in all lives of the component.
+
+        Raises:
+            Refused: the microscope, or a limit, says no.
+            NoResponse: not until `until_s`, or the microscope fails again and again.
+            ControlLost: control was not given until `until_s`.
+        """
+        if key is not None and (found := self._results.find(check_key(key), plan.facts)) is not None:
+            return found
+        self._link.wait_caught_up()  # what is cached must not be taken for ours
+        progress = _Progress(plan, key, f"{self._link.name}/{key}" if key else self._link.next_id(), until_s)
+        cycle = self._taken_up(progress)
+        if cycle is not None and self._is_complete(progress, cycle):
+            self._holding.release_inherited()
+        else:
+            with self._holding.hold(until_s=until_s):
+                cycle = self._measure(progress, cycle)
+        result = Result(_newest_of_each(plan, cycle.results), progress.interruptions)
+        self._channels[plan.what] = frozenset(map(plan.name_of, result.things))
+        if key is not None:
+            self._results.fulfil(key, plan.facts, result)
+        return result
+
+    def _taken_up(self, progress: _Progress) -> Cycle | None:
+        """What an earlier life was at, if it was this."""
+        intent, cycle = self._results.pending, self._resumed
+        self._resumed = None
+        if intent is None or cycle is None or intent["key"] != progress.key or intent["plan"] != progress.plan.facts:
+            self._forget_resumed()
+            return None
+        progress.attempt = intent["attempt"]
+        progress.interruptions = intent["interruptions"]
+        self._link.log.info("%s %s: taken up where it was", progress.plan.what, progress.key)
+        return cycle
+
+    def _is_complete(self, progress: _Progress, cycle: Cycle) -> bool:
+        """Whether what was begun in an earlier life is, or gets, complete without asking again."""
+        if cycle.begun and cycle.outcome is None:
+            self._link.wait(lambda: cycle.outcome is not None, progress.until_s)
+        if cycle.outcome is not None:
+            self._forget_resumed()
+        return cycle.outcome is Outcome.COMPLETED
+
+    def _measure(self, progress: _Progress, cycle: Cycle | None) -> Cycle:
+        """Attempt after attempt, until one is complete."""
+        again = cycle is not None and cycle.outcome is None
+        while True:
+            if not again:
+                self._forget_resumed()
+                progress.attempt += 1
+                cycle = None
+            again = False
+            cycle = self._attempt(progress, cycle)
+            if cycle is not None and self._is_done(progress, cycle):
+                return cycle
+
+    def _attempt(self, progress: _Progress, resumed: Cycle | None) -> Cycle | None:
+        """Prepare and begin once, follow to the end; None if it could not be begun and is to be tried again.
+
+        What was asked for in an earlier life is asked for with the same id: it is not executed twice.
+        """
+        link, plan = self._link, progress.plan
+        self._holding.regain(progress.until_s)
+        if resumed is None:
+            self._write_down(progress)
+        plan.prepare(progress.until_s)
+        states = link.view.count("ScopeStateMsg")
+        cycle = resumed or Cycle(plan.busy, plan.fits, since_ns=link.view.newest_ns)
+        forget = self._forget_resumed if resumed else link.listen(self._listener(cycle, plan.message))
+        try:
+            response = self._asker.send(
+                ControlRequest.ACTION, plan.action, request_id=progress.request_id(), until_s=progress.until_s
+            )
+            if not response.ok:
+                self._asker.get_over(ControlRequest.ACTION, response, states, progress.until_s)
+                return None
+            self._follow(progress, cycle)
+            return cycle
+        finally:
+            forget()
+
+    def _write_down(self, progress: _Progress) -> None:
+        if progress.key is None:
+            return
+        self._results.intend(
+            {
+                "key": progress.key,
+                "plan": progress.plan.facts,
+                "attempt": progress.attempt,
+                "since_ns": self._link.view.newest_ns,
+                "interruptions": progress.interruptions,
+            }
+        )
+
+    def _follow(self, progress: _Progress, cycle: Cycle) -> None:
+        """From the success of the action to the end of it."""
+        link, until_s = self._link, progress.until_s
+        begun_s = link.clock.monotonic_s() + BEGUN_WITHIN_S
+        if not link.wait(
+            lambda: cycle.begun or cycle.outcome is not None, begun_s if until_s is None else min(begun_s, until_s)
+        ):
+            cycle.outcome = Outcome.VANISHED
+        elif not link.wait(lambda: cycle.outcome is not None, until_s):
+            raise NoResponse(
+                f"the {progress.plan.what} was not finished in time",
+                where=link.name,
+                hint="it goes on; stop it with scope.action('stop-scan') if it should not",
+            )
+
+    def _is_done(self, progress: _Progress, cycle: Cycle) -> bool:
+        """Whether the result is complete; else says why not, before the next attempt."""
+        plan = progress.plan
+        missing = self._channels.get(plan.what, frozenset()) - frozenset(map(plan.name_of, cycle.results))
+        if cycle.outcome is Outcome.COMPLETED and not missing:
+            return True
+        if cycle.outcome is Outcome.COMPLETED:
+            del self._channels[plan.what]  # the same again: then these channels are not recorded any more
+            why = f"without {', '.join(sorted(missing))}, which it had before"
+        elif not self._holding.held:
+            why = f"control was lost: {self._holding.why_lost}"
+        elif cycle.outcome is Outcome.INTERRUPTED:
+            why = "it was stopped, not by us"
+        else:
+            why = "the microscope is free again without a result; was it started anew?"
+        self._note(progress, why)
+        # losing control explains itself and is waited for; all else must not go on for a night
+        progress.failures = progress.failures + 1 if self._holding.held else 0
+        if progress.failures >= MOST_FAILURES:
+            raise NoResponse(f"the {plan.what} failed {progress.failures} times: {why}", where=self._link.name)
+        return False
+
+    def _note(self, progress: _Progress, why: str) -> None:
+        when = datetime.fromtimestamp(self._link.clock.now_s(), UTC)
+        progress.interruptions.append(f"{when:%Y-%m-%d %H:%M:%S} UTC: {why}")
+        self._link.log.warning("%s interrupted: %s; it will be taken again", progress.plan.what, why)
+
+    def _listener(self, cycle: Cycle, message: str) -> Callable[[Packet, bool], None]:
+        view = self._link.view
+
+        def on_packet(packet: Packet, ours: bool) -> None:
+            if not ours:
+                return
+            try:
+                name = wire.message_of(packet.envelope)
+                if name == "ScopeStateMsg":
+                    cycle.on_state(view.state, packet.time_ns)
+                elif name == message:
+                    cycle.on_result(wire.decode(name, packet.payload), packet.time_ns)
+            except WireError as error:
+                self._link.log.warning("a %s that can't be read: %s", packet.envelope, error)
+
+        return on_packet
+
+
+def _newest_of_each(plan: Plan, things: list[Any]) -> list[Any]:
+    """One result of each name: a translator that was started anew may have published one twice."""
+    return list({plan.name_of(thing): thing for thing in things}.values())

@@ -1,0 +1,152 @@
+"""What a scan and a spectrum are made of: what to set before, how to begin, and how to know the result."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from afspm.model import (
+    ControlRequest,
+    Frame,
+    Parameter,
+    ProbePosition,
+    Region,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    Spectrum,
+    names,
+)
+from afspm.runtime.asking import Asker
+from afspm.runtime.measurement import Plan
+from afspm.runtime.view import View
+
+SAME = 1e-6  # of the size: closer than any controller positions
+FITS = 1e-2  # of the size: a controller's rounding, not another region
+SAME_PLACE_M = 1e-9
+
+MEASURED = {"scan": (ScopeState.SCANNING, "Scan2d"), "spectrum": (ScopeState.SPEC, "Spec1d")}
+"""By what is measured: the state of the microscope meanwhile, and the message of the results."""
+
+
+class Plans:
+    """Makes the plans of one component."""
+
+    def __init__(self, view: View, asker: Asker) -> None:
+        self._view = view
+        self._asker = asker
+        self._set: tuple[ScanParameters, ScanParameters | None] | None = None
+
+    def scan(self, region: Region | None, shape: tuple[int, int] | None) -> Plan:
+        wanted = ScanParameters(region, shape)
+        facts = {"what": "scan", "region": _region_facts(region), "shape": list(shape) if shape else None}
+        return Plan(
+            what="scan",
+            action=names.START_SCAN,
+            busy=ScopeState.SCANNING,
+            message="Scan2d",
+            prepare=lambda until_s: self._set_scan(wanted, until_s),
+            fits=lambda result: fits(facts, result),
+            facts=facts,
+            name_of=lambda scan: str(scan.channel),
+        )
+
+    def spectrum(self, at_m: tuple[float, float] | None, kind: str | None) -> Plan:
+        facts = {"what": "spectrum", "at_m": [float(at_m[0]), float(at_m[1])] if at_m else None, "kind": kind}
+
+        def prepare(until_s: float | None) -> None:
+            if kind is not None:
+                self._asker.ask(ControlRequest.PARAM, Parameter(names.SPEC_KIND, kind), until_s=until_s)
+            if at_m is not None:
+                self.move_probe(at_m, until_s)
+
+        return Plan(
+            what="spectrum",
+            action=names.START_SPEC,
+            busy=ScopeState.SPEC,
+            message="Spec1d",
+            prepare=prepare,
+            fits=lambda result: fits(facts, result),
+            facts=facts,
+            name_of=lambda spectrum: str(spectrum.kind),
+        )
+
+    def move_probe(self, xy_m: tuple[float, float], until_s: float | None) -> None:
+        """Move the probe, unless it stands there."""
+        now = self._view.probe_position
+        if now is not None and now.xy_m == xy_m:
+            return
+        count = self._view.count("ProbePosition")
+        self._asker.ask(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), until_s=until_s)
+        self._asker.settle("ProbePosition", count, until_s)
+
+    def _set_scan(self, wanted: ScanParameters, until_s: float | None) -> None:
+        """Set region and shape, unless they are set."""
+        if wanted.region is None and wanted.shape is None:
+            return
+        # in sample coordinates the same region is another place of the tip a while later
+        fixed = not (isinstance(wanted.region, Region) and wanted.region.frame is Frame.SAMPLE)
+        now = self._view.scan_parameters
+        if fixed and (_is_set(wanted, now) or (now is not None and (wanted, now) == self._set)):
+            return
+        count = self._view.count("ScanParameters2d")
+        self._asker.ask(ControlRequest.SET_SCAN_PARAMS, wanted, until_s=until_s)
+        self._asker.settle("ScanParameters2d", count, until_s)
+        # a controller may round: then this is what our wish looks like when it is set
+        self._set = (wanted, self._view.scan_parameters)
+
+
+def fits(facts: dict[str, Any], result: Any) -> bool:
+    """Whether a published result can be what a plan of these facts asked for."""
+    return _FITS[facts["what"]](facts, result)
+
+
+def _scan_fits(facts: dict[str, Any], scan: Scan) -> bool:
+    if facts["shape"] is not None and list(scan.shape) != facts["shape"]:
+        return False
+    if facts["region"] is None:
+        return True
+    *numbers, frame = facts["region"]
+    return _is_near(_region_of(numbers, frame), scan.region, FITS)
+
+
+def _spectrum_fits(facts: dict[str, Any], spectrum: Spectrum) -> bool:
+    if facts["kind"] is not None and spectrum.kind != facts["kind"]:
+        return False
+    if facts["at_m"] is None or spectrum.position_m is None:
+        return True
+    return math.dist(facts["at_m"], spectrum.position_m) <= SAME_PLACE_M
+
+
+_FITS: dict[str, Callable[[dict[str, Any], Any], bool]] = {"scan": _scan_fits, "spectrum": _spectrum_fits}
+
+
+def _region_facts(region: Region | None) -> list[Any] | None:
+    if region is None:
+        return None
+    return [*region.center_m, *region.size_m, region.angle_rad, region.frame.value]
+
+
+def _region_of(numbers: list[float], frame: str) -> Region:
+    x, y, width, height, angle = numbers
+    return Region((x, y), (width, height), angle, Frame(frame))
+
+
+def _is_set(wanted: ScanParameters, now: ScanParameters | None) -> bool:
+    if now is None or (wanted.shape is not None and wanted.shape != now.shape):
+        return False
+    if not isinstance(wanted.region, Region):
+        return wanted.region is None
+    return isinstance(now.region, Region) and _is_near(wanted.region, now.region, SAME)
+
+
+def _is_near(a: Region, b: Region, tolerance: float) -> bool:
+    """Whether two regions differ by less than `tolerance` of their size everywhere."""
+    size_m = math.hypot(*a.size_m)
+    turned = math.remainder(a.angle_rad - b.angle_rad, math.tau)
+    return (
+        math.dist(a.center_m, b.center_m) <= tolerance * size_m
+        and math.dist(a.size_m, b.size_m) <= tolerance * size_m
+        and abs(turned) <= tolerance
+    )
