@@ -16,6 +16,8 @@ SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security"
 
 # Keys of a component's table that are for us; everything else is a setting of its class or command.
 OWN_KEYS: Final = frozenset({"component", "class", "command", "envelopes", "listens_to", "role", *WIRE_KEYS})
+SIMULATED = "simulated"
+"""For a translator that is a command: whether its microscope is simulated, as a class says by an attribute."""
 DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")
 
 
@@ -112,7 +114,7 @@ def _component(name: str, table: dict[str, Any], document: Document, findings: F
         near = "" if class_path else _misspelt(table, ("class", "command"))
         findings.error(f"component [{name}] has {both}", place, near or "one of them says what to run")
         return None
-    own_keys = OWN_KEYS if class_path else OWN_KEYS | set(DECLARED_KEYS)
+    own_keys = OWN_KEYS if class_path else OWN_KEYS | {SIMULATED, *DECLARED_KEYS}
     return Part(
         name=name,
         class_path=COMPONENT_ALIASES.get(class_path, class_path),

@@ -14,7 +14,7 @@ from afspm.experiment.caching import Caching
 from afspm.experiment.classes import Declared
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
-from afspm.experiment.parts import Part, Parts, Role
+from afspm.experiment.parts import SIMULATED, Part, Parts, Role
 from afspm.experiment.wiring import Net, Wires
 from afspm.logic.limits import Limits
 from afspm.model import ProblemNames
@@ -72,9 +72,12 @@ class Resolved:
 
     @property
     def simulated(self) -> bool:
-        """Whether the microscope is a simulated one, as its class says with `simulated = True`."""
-        translators = [self.classes.get(part.name) for part in self.with_role(Role.TRANSLATOR)]
-        return bool(translators) and all(getattr(t, "simulated", False) is True for t in translators)
+        """Whether the microscope is a simulated one, as its class (a command: its table) says: simulated = True."""
+        translators = self.with_role(Role.TRANSLATOR)
+        return bool(translators) and all(
+            (part.own.get(SIMULATED) if part.command else getattr(self.classes.get(part.name), SIMULATED, False)) is True
+            for part in translators
+        )
 
 
 def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:

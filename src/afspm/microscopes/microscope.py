@@ -127,6 +127,8 @@ class Microscope(ABC):
 
     parameters_file: ClassVar[Path]
     max_pixels: ClassVar[int] = 4096 * 4096
+    simulated: ClassVar[bool] = False
+    """No tip can break: the experiment's clock may go at another speed than the real one."""
     memory_is_all: ClassVar[bool] = False
     """The microscope has no state outside of `memory` (a simulated one): nothing was done that is not in there."""
 

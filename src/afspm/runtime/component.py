@@ -64,6 +64,19 @@ class Component:
         period_time: whether that is experiment time or real time.
     """
 
+    solves: ClassVar[tuple[str, ...]] = ()
+    """Problems that it puts right."""
+    flags: ClassVar[tuple[str, ...]] = ()
+    """Problems that it may flag; the experiment file must have somebody who solves each."""
+    publishes: ClassVar[tuple[str, ...]] = ()
+    """Envelopes that it publishes itself: it then gets an address to do so."""
+    listens: ClassVar[tuple[str, ...] | None] = None
+    """Envelopes, or how they begin, that it subscribes to where the experiment file doesn't say; None: all."""
+    needs_actions: ClassVar[tuple[str, ...]] = ()
+    """Actions that the microscope must have."""
+    needs_parameters: ClassVar[tuple[str, ...]] = ()
+    """Parameters that the microscope must have."""
+
     longest_step_s: ClassVar[float] = 30.0
     period_s: float | None = None
     period_time: Literal["experiment", "real"] = "experiment"
