@@ -81,6 +81,8 @@ class ZmqServerPort:
             if b"" not in parts[1:]:
                 continue  # not what REQ or DEALER peers send: there is no telling where an answer would go
             start = parts.index(b"", 1) + 1
+            if start == len(parts):
+                continue  # somebody says its name, as to a scheduler
             self._asker = parts[:start]
             user = user_of(frames[-1]) if self._network.keys is not None else None
             if self._allowed is None or self._network.keys is None or user == self._allowed:

@@ -1,0 +1,57 @@
+"""What the tests of the transport share: ports that are closed at the end, and waiting with a deadline."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+import zmq
+
+
+@pytest.fixture
+def open_() -> Iterator[Callable[[Any], Any]]:
+    """`open_(thing)` returns `thing`, and closes it at the end of the test."""
+    with ExitStack() as stack:
+
+        def opened(thing: Any) -> Any:
+            stack.callback(thing.close)
+            return thing
+
+        yield opened
+
+
+@pytest.fixture
+def plain() -> Iterator[Callable[..., Any]]:
+    """`plain(zmq.SUB)`: a socket as a peer of version 1 has it, with nothing of ours."""
+    context: zmq.Context[Any] = zmq.Context()
+
+    def socket(kind: int) -> Any:
+        made = context.socket(kind)
+        made.setsockopt(zmq.LINGER, 0)
+        made.setsockopt(zmq.RCVTIMEO, 5000)
+        return made
+
+    yield socket
+    context.destroy(linger=0)
+
+
+@pytest.fixture
+def until() -> Callable[..., Any]:
+    """See `wait_until`."""
+    return wait_until
+
+
+def wait_until(condition: Callable[[], Any], *pumped: Any, timeout_s: float = 10.0) -> Any:
+    """Poll the ports in turn, collecting what they receive, until `condition()` is true; returns its value.
+
+    `pumped` are pairs (port, list to append to).
+    """
+    deadline_s = time.monotonic() + timeout_s
+    while not (value := condition()):
+        assert time.monotonic() < deadline_s, "it did not happen in time"
+        for port, found in pumped:
+            found += port.poll(0.005)
+    return value
