@@ -12,7 +12,7 @@ from enum import Enum, auto
 from types import MappingProxyType
 from typing import Any
 
-from afspm.model import ControlMode, ControlResponse, ControlState
+from afspm.model import ControlMode, ControlResponse, ControlState, ProblemNames
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
@@ -123,7 +123,7 @@ class Rules:
     """What the table takes from the experiment file: roles, and the problems there are."""
 
     roles: Roles = Roles()
-    known_problems: Collection[int] = range(1, 256)
+    problems: ProblemNames = field(default_factory=ProblemNames)
 
 
 @dataclass(slots=True)
@@ -149,7 +149,8 @@ class Row:
 
     Attributes:
         response: of a request; None where the translator answers, or nobody asked.
-        why: why it is so. Of a refusal it is the reason given, with {who}, {holder}, {number} and {problems} filled in.
+        why: why it is so. Of a refusal it is the reason given, with {who}, {holder}, {number}, {problem} and {problems}
+            filled in.
         cause: why control is taken, where it is.
     """
 
@@ -183,7 +184,7 @@ SOLVES_NONE = Condition("problems are flagged and it names none", lambda c, a, r
 SOLVES_UNFLAGGED = Condition(
     "it names a problem that is not flagged", lambda c, a, r: bool(a.number) and a.number not in c.problems
 )
-UNKNOWN_PROBLEM = Condition("the experiment knows no such problem", lambda c, a, r: a.number not in r.known_problems)
+UNKNOWN_PROBLEM = Condition("the experiment knows no such problem", lambda c, a, r: a.number not in r.problems.values())
 IS_FLAGGED = Condition("it is flagged already", lambda c, a, r: a.number in c.problems)
 NOT_FLAGGED = Condition("it is not flagged", lambda c, a, r: a.number not in c.problems)
 HOLDER_SOLVES_NOTHING = Condition(
@@ -218,7 +219,7 @@ TABLE: tuple[Row, ...] = (
         SOLVES_UNFLAGGED,
         _R.WRONG_EXP_PROBLEM,
         (),
-        "problem {number} is not flagged; flagged: {problems}",
+        "{problem} is not flagged; flagged: {problems}",
     ),
     Row(
         _E.REQUEST_CONTROL,
@@ -240,7 +241,9 @@ TABLE: tuple[Row, ...] = (
     Row(_E.REQUEST_CONTROL, OTHERWISE, _R.SUCCESS, (Do.GRANT,), "nobody is in control: the first to ask gets it"),
     Row(_E.RELEASE_CONTROL, ASKER_HOLDS, _R.SUCCESS, (Do.TAKE,), "its own decision", Cause.RELEASED),
     Row(_E.RELEASE_CONTROL, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is; nothing changed"),
-    Row(_E.FLAG, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem {number}"),
+    Row(
+        _E.FLAG, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem with the number {number}"
+    ),
     Row(_E.FLAG, IS_FLAGGED, _R.SUCCESS, (), "what was asked for is so: two may notice the same"),
     Row(
         _E.FLAG,
@@ -251,14 +254,16 @@ TABLE: tuple[Row, ...] = (
         Cause.PROBLEM,
     ),
     Row(_E.FLAG, OTHERWISE, _R.SUCCESS, (Do.FLAG,), "a solver stays in control while its own problem is flagged"),
-    Row(_E.CLEAR, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem {number}"),
+    Row(
+        _E.CLEAR, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem with the number {number}"
+    ),
     Row(_E.CLEAR, NOT_FLAGGED, _R.SUCCESS, (), "what was asked for is so: classifier and corrector may both clear"),
     Row(
         _E.CLEAR,
         MAY_NOT_CLEAR,
         _R.FAILURE,
         (),
-        "{who} has not flagged problem {number} and has not the role 'clear' ([control] roles)",
+        "{who} has not flagged {problem} and has not the role 'clear' ([control] roles)",
     ),
     Row(
         _E.CLEAR,
@@ -313,7 +318,7 @@ def apply(row: Row, control: Control, ask: Ask) -> Control:
     return control
 
 
-def reason(row: Row, control: Control, ask: Ask) -> str:
+def reason(row: Row, control: Control, ask: Ask, rules: Rules) -> str:
     """The reason given with a refusal; empty for a success."""
     if row.response in (None, ControlResponse.SUCCESS):
         return ""
@@ -321,7 +326,8 @@ def reason(row: Row, control: Control, ask: Ask) -> str:
         who=ask.who,
         holder=control.holder or "nobody",
         number=ask.number,
-        problems=", ".join(map(str, sorted(control.problems))) or "none",
+        problem=rules.problems.name(ask.number),
+        problems=", ".join(map(rules.problems.name, sorted(control.problems))) or "none",
     )
 
 

@@ -27,21 +27,23 @@ class Job:
 
     Attributes:
         client: who asked; empty for the scheduler's own.
+        connection: the one it was asked by.
         deadline_s: when (real) it must be answered at the latest.
         command: whether it is a command, which only who is in control may give.
         sent_s: when it was sent; None while it waits.
         answered: the client has been told that there was no response in time.
-        link: which connection to the translator it was sent over.
+        states_seen: how many states the microscope had told when it was sent on its way.
     """
 
-    number: int
     client: str
     request: Request
-    deadline_s: float
     command: bool
+    number: int = 0
+    deadline_s: float = 0.0
     sent_s: float | None = None
     answered: bool = False
-    link: int = 0
+    connection: int = -1
+    states_seen: int = 0
 
 
 class End(Enum):
@@ -78,7 +80,6 @@ class Forwarder:
         self.longest_queue = longest_queue
         self.outbox: list[Forward] = []
         self.up = False
-        self.link = 0
         self.flight: Job | None = None
         self.number = 0
         self._own: deque[Job] = deque()
@@ -89,7 +90,6 @@ class Forwarder:
         """The translator can be asked, for the first time or again. (A reconnection is a loss before it.)"""
         settled = self.lost() if self.up else []
         self.up = True
-        self.link += 1
         return settled
 
     def lost(self) -> list[Settled]:
@@ -105,10 +105,10 @@ class Forwarder:
         self._queue.clear()
         return settled + [_not_sent(job, "the translator is not connected") for job in waiting]
 
-    def ask(self, client: str, request: Request, now_s: float, *, command: bool) -> Settled | None:
+    def ask(self, job: Job, now_s: float) -> Settled | None:
         """Send a client's request, now or when its turn comes. Returns what it was refused with, if it was."""
         self.number += 1
-        job = Job(self.number, client, request, now_s + self.timeout_s, command)
+        job.number, job.deadline_s = self.number, now_s + self.timeout_s
         if not self.up:
             return _not_sent(job, "the translator is not connected")
         if self.flight is None:
@@ -124,7 +124,7 @@ class Forwarder:
         if not self.up:
             return None
         self.number += 1
-        job = Job(self.number, "", request, now_s + self.timeout_s, command=True)
+        job = Job("", request, command=True, number=self.number, deadline_s=now_s + self.timeout_s)
         if self.flight is None:
             self._send(job, now_s)
         else:
@@ -151,13 +151,21 @@ class Forwarder:
         for queue in (self._own, self._queue):
             while queue and now_s >= queue[0].deadline_s:
                 settled.append(_not_sent(queue.popleft(), f"the translator was busy for {self.timeout_s:g} s"))
-        if job is not None and now_s >= job.deadline_s + self.patience_s:
+        if job is not None and job.answered and now_s >= self._patience_ends_s(job):
             self._overdue[job.number] = job
             if len(self._overdue) > self.longest_queue:
                 self._overdue.popitem(last=False)
             self.flight = None
             self._next(now_s)
         return settled
+
+    def ask_again(self, client: str, request_id: str, now_s: float) -> bool:
+        """The client repeats a request that it was told is overdue: if it still is, it waits for it once more."""
+        job = self.flight
+        if job is None or job.client != client or job.request.id != request_id:
+            return False
+        job.answered, job.deadline_s = False, now_s + self.timeout_s
+        return True
 
     def call_back(self, which: Callable[[Job], bool]) -> list[Job]:
         """Take back what waits and has not been sent; the caller answers it."""
@@ -170,13 +178,17 @@ class Forwarder:
         """When `expire` has something to do."""
         times = [queue[0].deadline_s for queue in (self._own, self._queue) if queue]
         if self.flight is not None:
-            times.append(self.flight.deadline_s + (self.patience_s if self.flight.answered else 0.0))
+            times.append(self._patience_ends_s(self.flight) if self.flight.answered else self.flight.deadline_s)
         return min(times, default=None)
 
     def _send(self, job: Job, now_s: float) -> None:
-        job.sent_s, job.link = now_s, self.link
+        job.sent_s = now_s
         self.flight = job
         self.outbox.append(Forward(job.number, job.request))
+
+    def _patience_ends_s(self, job: Job) -> float:
+        assert job.sent_s is not None
+        return job.sent_s + self.timeout_s + self.patience_s
 
     def _next(self, now_s: float) -> None:
         if self._own:

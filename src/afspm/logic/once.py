@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from enum import Enum, auto
 
-from afspm.model import Response
+from afspm.model import ControlResponse, Request, Response
 
 
 class Fate(Enum):
@@ -28,28 +28,39 @@ class OnceTable:
     def __init__(self, per_client: int = 256, clients: int = 256) -> None:
         self._per_client = per_client
         self._clients = clients
-        self._table: OrderedDict[str, OrderedDict[str, Fate | Response]] = OrderedDict()
+        self._table: OrderedDict[str, OrderedDict[str, tuple[int, Fate | Response]]] = OrderedDict()
 
-    def look_up(self, client: str, request_id: str) -> Fate | Response | None:
-        """None: the id is new, or long forgotten."""
+    def look_up(self, client: str, request: Request) -> Fate | Response | None:
+        """None: the id is new, or long forgotten, or there is none."""
         of_client = self._table.get(client)
-        return None if of_client is None else of_client.get(request_id)
+        entry = None if of_client is None else of_client.get(request.id)
+        if entry is None:
+            return None
+        if entry[0] != _fingerprint(request):
+            return Response(ControlResponse.FAILURE, reason="its id was used for another request before", id=request.id)
+        return entry[1]
 
-    def note(self, client: str, request_id: str, outcome: Fate | Response) -> None:
+    def note(self, client: str, request: Request, outcome: Fate | Response) -> None:
         """Remember what became of a request; of one without an id nothing is."""
-        if not request_id:
+        if not request.id:
             return
         of_client = self._table.get(client)
         if of_client is None:
             of_client = self._table[client] = OrderedDict()
             if len(self._table) > self._clients:
                 self._table.popitem(last=False)
-        of_client[request_id] = outcome
+        else:
+            self._table.move_to_end(client)
+        of_client[request.id] = (_fingerprint(request), outcome)
         if len(of_client) > self._per_client:
             of_client.popitem(last=False)
 
-    def forget(self, client: str, request_id: str) -> None:
+    def forget(self, client: str, request: Request) -> None:
         """It was not done and may be tried anew."""
         of_client = self._table.get(client)
         if of_client is not None:
-            of_client.pop(request_id, None)
+            of_client.pop(request.id, None)
+
+
+def _fingerprint(request: Request) -> int:
+    return hash((request.kind, request.payload))

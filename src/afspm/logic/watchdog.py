@@ -5,7 +5,7 @@ It stops the scan or spectrum that is running, and retracts the tip when its hol
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -48,7 +48,8 @@ class Result(Enum):
 class Watchdog:
     """Knows what the microscope is doing, and what the scheduler wants it to do.
 
-    The caller sends `next_action()` before anything else, reports by `answered`, and lets nobody command while `busy`.
+    The caller sends `next_action()` before anything else, reports by `answered`, and lets nobody command while it
+    `wants_retract`.
     """
 
     def __init__(self, settings: WatchdogSettings | None = None) -> None:
@@ -60,12 +61,16 @@ class Watchdog:
         self._wanted: list[str] = []
         self._sent = False
         self._attempts = 0
+        self._can_retract = True  # as far as we know
         self._refused_at = -1  # states seen when the microscope last was not free
 
     @property
-    def busy(self) -> bool:
-        """Something is wanted of the microscope that must not be disturbed."""
-        return bool(self._wanted)
+    def wanted(self) -> tuple[str, ...]:
+        """What is not done yet, to be kept over a restart of the scheduler."""
+        return tuple(self._wanted)
+
+    def restore(self, wanted: Iterable[str]) -> None:
+        self._wanted = list(wanted)
 
     @property
     def wants_retract(self) -> bool:
@@ -99,6 +104,11 @@ class Watchdog:
         if states_seen == self._states_seen:
             self._starting = _STARTS.get(action, self._starting)
 
+    def cannot(self, action: str) -> None:
+        """The microscope has no such action."""
+        if action == self._settings.retract:
+            self._can_retract = False
+
     def control_taken(self, cause: Cause, in_flight: str | None) -> list[str]:
         """Control was taken for `cause` while the action `in_flight` was with the translator.
 
@@ -109,7 +119,7 @@ class Watchdog:
         stop = _STOP.get(self._state) or self._starting or _STARTS.get(in_flight or "")
         if stop is not None and cause in self._settings.stop_when:
             wanted.append(stop)
-        if cause is Cause.DEAD and self._settings.retract is not None and self._is_dangerous():
+        if cause is Cause.DEAD and self._settings.retract is not None and self._can_retract and self._is_dangerous():
             wanted.append(self._settings.retract)
         self._wanted += [action for action in wanted if action not in self._wanted]
         return wanted
