@@ -12,6 +12,7 @@ from __future__ import annotations
 from afspm.simulation.scanning import SimulatedScan
 from afspm.simulation.surfaces.readers import READERS, Heightmap
 from afspm.simulation.tip import TipState
-from afspm.simulation.world import World, WorldSettings
+from afspm.simulation.world import World
+from afspm.simulation.world_settings import WorldSettings
 
 __all__ = ["READERS", "Heightmap", "SimulatedScan", "TipState", "World", "WorldSettings"]

@@ -48,7 +48,9 @@ class Grid:
     def axes_m(self) -> tuple[Array, Array]:
         """x as one row, y as one column."""
         ny, nx = self.shape
-        return (self.x0_m + self.dx_m * np.arange(nx))[None, :], (self.y0_m + self.dy_m * np.arange(ny))[:, None]
+        x: Array = self.x0_m + self.dx_m * np.arange(nx, dtype=np.float64)
+        y: Array = self.y0_m + self.dy_m * np.arange(ny, dtype=np.float64)
+        return x[None, :], y[:, None]
 
     def rows(self, start: int, stop: int) -> Grid:
         """Only these rows."""

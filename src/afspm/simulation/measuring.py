@@ -195,9 +195,10 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
         return np.full(lines.shape, lines.mean() + loop.settings.range_m / 2)
     nx = course.shape[1]
     lead = min(nx, 6 + nx // 16)
-    path = np.concatenate([lines[:, lead:0:-1] if nx > 1 else lines[:, :1], lines], axis=1).T
-    start_v = random.normal(0.0, 1e-6, path.shape[1]) if loop.oscillates else np.zeros(path.shape[1])
-    z = loop.follow(np.ascontiguousarray(path), course.line_s / (2 * nx), start_v)
+    path: Array = np.concatenate([lines[:, lead:0:-1] if nx > 1 else lines[:, :1], lines], axis=1).T
+    # An oscillation grows out of whatever there is; a quiet loop starts at rest.
+    start_v: Array = (1e-6 if loop.oscillates else 0.0) * random.standard_normal(path.shape[1])
+    z: Array = loop.follow(np.ascontiguousarray(path), course.line_s / (2 * nx), start_v)
     return z[-2 * nx :].T
 
 

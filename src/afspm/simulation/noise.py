@@ -56,10 +56,10 @@ def disturbances(
     """
     series = np.zeros((len(tips), 2 * nx))
     scarred = np.nonzero(random.random(len(tips)) < settings.scar_probability)[0]
-    for line in scarred:
+    for scarred_line in scarred:
         start = int(random.integers(2 * nx))
         length = 1 + int(random.exponential(0.4 * nx))
-        series[line, start : start + length] += settings.scar_m * abs(random.normal(1.0, 0.4))
+        series[scarred_line, start : start + length] += settings.scar_m * abs(random.normal(1.0, 0.4))
     flat = series.reshape(-1)
     dirty = np.array([tip.debris_m for tip in tips])
     jumps = random.poisson(settings.debris_jumps_per_s * line_s * np.count_nonzero(dirty)) if dirty.any() else 0
@@ -68,7 +68,7 @@ def disturbances(
         start = line * 2 * nx + int(random.integers(2 * nx))
         length = 1 + int(random.exponential(0.6 * nx))
         flat[start : start + length] += dirty[line] * random.normal(0.0, 0.25)
-    return series if len(scarred) or jumps else None
+    return series if scarred.size or jumps else None
 
 
 def height_noise(
@@ -94,7 +94,7 @@ def one_over_f(count: int, random: np.random.Generator) -> Array:
     parts = random.standard_normal(shape, dtype=np.float32) * amplitude
     spectrum = np.concatenate([np.zeros(1, np.complex64), parts[0] + 1j * parts[1]])
     series = np.fft.irfft(spectrum, size)[:count]
-    # irfft divides by size; each of the frequencies brings 4 amplitude^2 / size^2 / 2 * 2 of variance
+    # Each frequency brings a variance of (2 amplitude / size)^2.
     return np.asarray(series * (size / (2.0 * np.sqrt(np.sum(amplitude.astype(np.float64) ** 2)))), dtype=np.float64)
 
 
@@ -102,10 +102,10 @@ def flattened(values: Array, how: str) -> Array:
     """Each line less its mean ("offset") or less the straight line fitted to it ("line", Flatten1)."""
     if how == "none":
         return values
-    level = values - values.mean(axis=1, keepdims=True)
+    level: Array = values - values.mean(axis=1, keepdims=True)
     if how == "offset" or values.shape[1] < 3:
         return level
-    x = np.linspace(-1.0, 1.0, values.shape[1])
+    x: Array = np.linspace(-1.0, 1.0, values.shape[1])
     return np.asarray(level - np.outer(level @ x / (x @ x), x))
 
 

@@ -10,7 +10,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from afspm.errors import ConfigError
@@ -28,7 +28,7 @@ def build(cls: type[T], settings: object, where: str) -> T:
     if not isinstance(settings, Mapping):
         raise ConfigError(f"expected a table, got {settings!r}", where=where)
     hints = typing.get_type_hints(cls)
-    names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    names = _names(cls)
     unknown = [key for key in settings if key not in names]
     if unknown:
         raise ConfigError(f"no setting named {unknown[0]!r}", where=where, hint=nearest(str(unknown[0]), names))
@@ -64,19 +64,24 @@ def check(settings: object, *, above_zero: str = "", from_zero: str = "", fracti
 
     A fraction lies in [0, 1]. Raises ConfigError with the attribute as `where`.
     """
-    for names, wanted, holds in (
+    rules: tuple[tuple[str, str, Callable[[float], bool]], ...] = (
         (above_zero, "above zero", lambda value: value > 0),
         (from_zero, "zero or more", lambda value: value >= 0),
         (fraction, "between 0 and 1", lambda value: 0 <= value <= 1),
-    ):
+    )
+    for names, wanted, holds in rules:
         for name in names.split():
             value = getattr(settings, name)
             if not holds(value):
                 raise ConfigError(f"{value!r} is not {wanted}", where=name)
 
 
-def _is_required(cls: type, name: str) -> bool:
-    field = cls.__dataclass_fields__[name]  # type: ignore[attr-defined]
+def _names(cls: Any) -> list[str]:
+    return [field.name for field in dataclasses.fields(cls)]
+
+
+def _is_required(cls: Any, name: str) -> bool:
+    field = cls.__dataclass_fields__[name]
     return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
@@ -89,7 +94,8 @@ def _convert(hint: Any, value: object, where: str) -> object:
     if origin is tuple:
         return _sequence(arguments, value, where)
     if dataclasses.is_dataclass(hint):
-        return value if isinstance(value, typing.cast(type, hint)) else build(typing.cast(type, hint), value, where)
+        made: type[object] = hint  # type: ignore[assignment]
+        return value if isinstance(value, made) else build(made, value, where)
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         if not math.isfinite(value):
             raise ConfigError(f"{value!r} is not a finite number", where=where)

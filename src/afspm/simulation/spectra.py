@@ -162,7 +162,7 @@ def _through_preamplifier(settings: IVSettings, clean: Array, tip: TipState, ran
 
 def _mix(pair: tuple[float, float], material: float, *, logarithmic: bool = False) -> float:
     if logarithmic:
-        return pair[0] ** (1.0 - material) * pair[1] ** material
+        return float(pair[0] ** (1.0 - material) * pair[1] ** material)
     return pair[0] * (1.0 - material) + pair[1] * material
 
 

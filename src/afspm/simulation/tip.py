@@ -68,7 +68,7 @@ class TipSettings:
     condition: str = "sharp"
     blunt_radii: float = 6.0
     second_distance_radii: float = 7.0
-    second_below_radii: float = 0.25
+    second_below_radii: float = 0.1
     debris_radii: float = 1.5
     length_jump_radii: float = 0.5
     spread: float = 0.25

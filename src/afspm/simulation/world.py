@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -18,55 +18,25 @@ from numpy.typing import ArrayLike
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import chance, marks, spectra
-from afspm.simulation.drift import Drift, DriftSettings
-from afspm.simulation.feedback import FeedbackSettings, Loop
+from afspm.simulation.drift import Drift
+from afspm.simulation.feedback import Loop
 from afspm.simulation.fields import Array
 from afspm.simulation.marks import Mark
 from afspm.simulation.measuring import Setup, measure
-from afspm.simulation.noise import NoiseSettings
-from afspm.simulation.scanning import Course, ScannerSettings, SimulatedScan
+from afspm.simulation.scanning import Course, SimulatedScan
 from afspm.simulation.settings import build, nearest
-from afspm.simulation.signals import SignalSettings
 from afspm.simulation.surfaces import Relief, surface_from
 from afspm.simulation.tip import (
     TipChange,
-    TipChangeSettings,
     TipHistory,
     TipMaker,
-    TipSettings,
     TipState,
     chance_changes,
     drawn_flaw,
 )
+from afspm.simulation.world_settings import WorldSettings, read_settings
 
 STATE_VERSION = 1
-
-# What suits a sample better than the general defaults; the user's settings go on top.
-_FITTING: dict[str, dict[str, dict[str, Any]]] = {
-    # Atoms are seen by the foremost atom of the tip, not by its apex as a whole.
-    "lattice": {
-        "tip": {"radius_m": 0.12e-9, "half_angle_deg": 35.0},
-        "noise": {"white_m": 3e-12, "one_over_f_m": 3e-12, "line_offset_m": 3e-12, "scar_m": 0.05e-9},
-        "feedback": {"mode": "current", "setpoint": 100e-12},
-    },
-    "stamper": {"noise": {"white_m": 0.3e-9, "one_over_f_m": 0.5e-9, "line_offset_m": 0.5e-9, "scar_m": 8e-9}},
-    "particles": {"noise": {"white_m": 0.2e-9, "one_over_f_m": 0.2e-9, "line_offset_m": 0.2e-9, "scar_m": 4e-9}},
-}
-
-
-@dataclass(frozen=True)
-class WorldSettings:
-    """All but the surface, which has settings of its kind."""
-
-    tip: TipSettings = field(default_factory=TipSettings)
-    tip_changes: TipChangeSettings = field(default_factory=TipChangeSettings)
-    drift: DriftSettings = field(default_factory=DriftSettings)
-    feedback: FeedbackSettings = field(default_factory=FeedbackSettings)
-    scanner: ScannerSettings = field(default_factory=ScannerSettings)
-    noise: NoiseSettings = field(default_factory=NoiseSettings)
-    signals: SignalSettings = field(default_factory=SignalSettings)
-    iv: spectra.IVSettings = field(default_factory=spectra.IVSettings)
-    force: spectra.ForceSettings = field(default_factory=spectra.ForceSettings)
 
 
 class World:
@@ -99,17 +69,7 @@ class World:
         Raises:
             ConfigError: unknown names or values without sense. FileError: the surface's file.
         """
-        settings = dict(settings)
-        names = ["surface", *WorldSettings.__dataclass_fields__]
-        for name in settings:
-            if name not in names:
-                raise ConfigError(f"no setting named {name!r}", where="simulation", hint=nearest(name, names))
-        surface = settings.pop("surface", "steps")
-        kind = surface.get("kind", "steps") if isinstance(surface, Mapping) else surface
-        for name, fitting in _FITTING.get(str(kind), {}).items():
-            own = settings.get(name, {})
-            settings[name] = {**fitting, **own} if isinstance(own, Mapping) else own
-        built = build(WorldSettings, settings, "simulation")
+        surface, built = read_settings(settings)
         return cls(surface, built, seed=seed, start_s=start_s)
 
     # -- measuring

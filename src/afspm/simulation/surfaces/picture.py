@@ -96,8 +96,6 @@ def _taps(position: Array, count: int) -> list[tuple[Array, Array]]:
 def _cubic(image: Array, u: Array, v: Array) -> Array:
     rows, columns = _taps(v, image.shape[0]), _taps(u, image.shape[1])
     if is_separable(u, v):
-        along = sum(image[:, column[0]] * weight for column, weight in columns)
-        result: Array = sum(along[row[:, 0]] * weight for row, weight in rows)  # type: ignore[index,assignment]
-        return result
-    total: Array = sum(image[r, c] * (rw * cw) for r, rw in rows for c, cw in columns)  # type: ignore[assignment]
-    return total
+        along = np.asarray(sum(image[:, column[0]] * weight for column, weight in columns))
+        return np.asarray(sum(along[row[:, 0]] * weight for row, weight in rows))
+    return np.asarray(sum(image[r, c] * (rw * cw) for r, rw in rows for c, cw in columns))

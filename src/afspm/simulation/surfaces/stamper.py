@@ -66,7 +66,7 @@ class Stamper:
         to_end = np.where(is_bump, 1.0, -1.0) * np.minimum(bits - start, end - bits) * self.bit_m
         half = self.width_m / 2
         past = np.maximum(half - to_end, 0.0)  # beyond the centre of the round end
-        return half - np.hypot(past, offset)
+        return np.asarray(half - np.hypot(past, offset))
 
 
 @lru_cache(maxsize=4096)
