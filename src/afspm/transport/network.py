@@ -39,6 +39,7 @@ class Network:
         self.keys = keys
         self._insecure = insecure
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._sockets: list[zmq.Socket[bytes]] = []
         self._authenticator = None
         if keys is not None:
             from afspm.transport.zap import Authenticator
@@ -62,6 +63,7 @@ class Network:
     def socket(self, kind: int, *, max_bytes: int = MAX_REQUEST_BYTES) -> zmq.Socket[bytes]:
         """A socket with the house's limits; frames over `max_bytes` end the connection that they come by."""
         socket = self._context.socket(kind)
+        self._sockets.append(socket)  # else one that its owner forgets is closed at some time or other
         for option, value in (
             (zmq.LINGER, _LINGER_MS),
             (zmq.SNDHWM, QUEUE_LENGTH),

@@ -1,0 +1,158 @@
+"""What is let in: this computer, or the owners of keys."""
+
+from __future__ import annotations
+
+import stat
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+
+from afspm.clock import ExperimentClock
+from afspm.errors import TransportError
+from afspm.transport import keys
+from afspm.transport.network import Network, is_local
+from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, RequestReceived
+from afspm.transport.zmq_port import ZmqPort
+from afspm.transport.zmq_server import ZmqServerPort
+
+ANY = "tcp://127.0.0.1:0"
+CLOCK = ExperimentClock.real()
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:1", "tcp://localhost:1", "tcp://[::1]:1", "ipc:///tmp/a", "inproc://a"]
+)
+def test_addresses_of_this_computer(address: str) -> None:
+    assert is_local(address)
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["tcp://*:1", "tcp://0.0.0.0:1", "tcp://192.168.0.2:1", "tcp://spm.example.org:1", "tcp://localhost.evil.org:1",
+     "tcp://eth0:1", "epgm://239.0.0.1:1", "tcp://192.168.0.2:1;127.0.0.1:1", "nonsense", ""],
+)  # fmt: skip
+def test_addresses_that_are_not_for_this_computer_only_are_refused_without_keys(open_: Any, address: str) -> None:
+    assert not is_local(address)
+    network = open_(Network())
+    for use in (network.bind, network.connect):
+        with pytest.raises(TransportError, match="no keys") as refused:
+            use(network.socket(zmq.PUB), address)
+        assert "insecure" in refused.value.hint
+
+
+def test_insecure_has_to_be_said(open_: Any) -> None:
+    network = open_(Network.from_launch("A", {"insecure": "true"}))
+    assert network.bind(network.socket(zmq.PUB), "tcp://0.0.0.0:0").startswith("tcp://0.0.0.0:")
+    assert open_(Network.from_launch("A", None)).keys is None
+
+
+def test_a_taken_port_is_said(open_: Any) -> None:
+    network = open_(Network())
+    address = network.bind(network.socket(zmq.PUB), ANY)
+    with pytest.raises(TransportError, match="can't bind") as refused:
+        network.bind(network.socket(zmq.PUB), address)
+    assert "another program" in refused.value.hint
+
+
+def test_generated_keys_are_kept_and_secrets_are_for_the_owner_only(tmp_path: Path) -> None:
+    written = keys.generate(tmp_path, ["Experiment", "Tip Corrector"])
+    assert {file.name for file in written} == {
+        "Experiment.key", "Experiment.key_secret", "Tip Corrector.key", "Tip Corrector.key_secret",
+    }  # fmt: skip
+    before = keys.load(tmp_path, "Experiment")
+    assert [f.name for f in keys.generate(tmp_path, ["Experiment", "New"])] == ["New.key", "New.key_secret"]
+    assert keys.load(tmp_path, "Experiment").secret == before.secret
+    assert before.peers[before.public] == "Experiment"
+    if sys.platform != "win32":
+        secret = tmp_path / "private" / "Experiment.key_secret"
+        assert stat.S_IMODE(secret.stat().st_mode) == 0o600
+    assert before.secret.decode() not in repr(before)
+
+
+@pytest.mark.parametrize("name", ["../evil", "", "a/b", ".hidden", "x" * 200])
+def test_a_name_that_is_no_file_name_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(TransportError):
+        keys.generate(tmp_path, [name])
+
+
+def test_missing_and_broken_keys_are_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(TransportError, match="can't be read"):
+        keys.load(tmp_path, "Nobody")
+    keys.generate(tmp_path, ["A"])
+    (tmp_path / "private" / "A.key_secret").write_text("nonsense")
+    with pytest.raises(TransportError, match="no public key"):
+        keys.load(tmp_path, "A")
+
+
+def locked_server(folder: Path) -> ZmqServerPort:
+    own = keys.load(folder, "translator")
+    return ZmqServerPort(Network(own), CLOCK, serve=ANY, publish=ANY, allowed="scheduler")
+
+
+def locked_component(folder: Path, name: str, server: ZmqServerPort, claimed: str = "") -> ZmqPort:
+    assert server.publish_address is not None
+    servers = {server.serve_address: "translator", server.publish_address: "translator"}
+    network = Network(keys.load(folder, name, servers))
+    return ZmqPort(network, claimed or name, CLOCK, subscribe=[server.publish_address], control=server.serve_address)
+
+
+def test_with_keys_the_server_knows_who_asks_and_packets_arrive(tmp_path: Path, open_: Any, until: Any) -> None:
+    keys.generate(tmp_path, ["translator", "scheduler"])
+    server = open_(locked_server(tmp_path))
+    server.publish("Scan2d", b"scan")
+    port = open_(locked_component(tmp_path, "scheduler", server, claimed="whatever it says"))
+    found, asked = [], []  # type: ignore[var-annotated]
+    until(
+        lambda: ControlConnected() in found and any(isinstance(i, CaughtUp) for i in found),
+        (server, []), (port, found),
+    )  # fmt: skip
+    assert [bytes(i.packet.payload) for i in found if isinstance(i, PacketReceived)] == [b"scan"]
+    port.send([b"\1", b"", b""])
+    until(lambda: any(isinstance(a, RequestReceived) for a in asked), (server, asked))
+    assert RequestReceived([b"\1", b"", b""], "scheduler") in asked
+
+
+def test_a_known_key_that_is_not_the_schedulers_may_not_ask_a_translator(
+    tmp_path: Path, open_: Any, until: Any
+) -> None:
+    keys.generate(tmp_path, ["translator", "scheduler", "visitor"])
+    server = open_(locked_server(tmp_path))
+    port = open_(locked_component(tmp_path, "visitor", server, claimed="scheduler"))
+    found, asked = [], []  # type: ignore[var-annotated]
+    until(lambda: ControlConnected() in found, (server, asked), (port, found))
+    port.send([b"\1", b"", b""])
+    until(lambda: any(getattr(i, "response", None) for i in found), (server, asked), (port, found))
+    response = next(i.response for i in found if getattr(i, "response", None))
+    assert not response.ok
+    assert "only scheduler may ask" in response.reason
+    assert not any(isinstance(a, RequestReceived) for a in asked)
+
+
+@pytest.mark.parametrize("stranger", ["a key of its own", "no key"])
+def test_strangers_are_not_let_in(tmp_path: Path, open_: Any, until: Any, plain: Any, stranger: str) -> None:
+    keys.generate(tmp_path, ["translator", "scheduler"])
+    server = open_(locked_server(tmp_path))
+    requester = plain(zmq.DEALER)
+    if stranger == "a key of its own":
+        public, secret = zmq.curve_keypair()
+        requester.curve_publickey, requester.curve_secretkey = public, secret
+        requester.curve_serverkey = keys.load(tmp_path, "translator").public
+    requester.connect(server.serve_address)
+    requester.send_multipart([b"", b"\1"])
+    friend, found, asked = open_(locked_component(tmp_path, "scheduler", server)), [], []  # type: ignore[var-annotated]
+    until(lambda: ControlConnected() in found, (server, asked), (friend, found))
+    friend.send([b"\7", b"", b"friend"])
+    until(lambda: any(isinstance(a, RequestReceived) for a in asked), (server, asked))
+    assert [a.frames for a in asked if isinstance(a, RequestReceived)] == [[b"\7", b"", b"friend"]]
+
+
+def test_an_address_whose_owner_is_not_known_is_refused(tmp_path: Path, open_: Any) -> None:
+    keys.generate(tmp_path, ["A", "B"])
+    network = open_(Network(keys.load(tmp_path, "A", {"tcp://127.0.0.1:5": "C"})))
+    with pytest.raises(TransportError, match="not known whose key"):
+        network.connect(network.socket(zmq.SUB), "tcp://127.0.0.1:4")
+    with pytest.raises(TransportError, match="no public key of 'C'"):
+        network.connect(network.socket(zmq.SUB), "tcp://127.0.0.1:5")

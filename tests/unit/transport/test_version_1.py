@@ -1,0 +1,142 @@
+"""Peers of version 1, as plain sockets with the golden bytes, in every place that they can take."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+
+from afspm import wire
+from afspm.clock import ExperimentClock
+from afspm.transport.network import Network
+from afspm.transport.port import CaughtUp, ControlConnected, Killed, PacketReceived, ReplyReceived
+from afspm.transport.zmq_port import ZmqPort
+from afspm.transport.zmq_server import ZmqServerPort
+
+ANY = "tcp://127.0.0.1:0"
+CLOCK = ExperimentClock.real()
+
+
+def golden() -> dict[str, Any]:
+    for folder in Path(__file__).resolve().parents:
+        for file in (folder / "tests/unit/wire/golden.json", folder / "shared/wire/golden.json"):
+            if file.exists():
+                found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+                return found
+    pytest.fail("golden.json is not to be found")
+
+
+GOLDEN = golden()
+REQUESTS = [[bytes.fromhex(frame) for frame in entry["frames"]] for entry in GOLDEN["requests"]]
+RESPONSES = [[bytes.fromhex(frame) for frame in entry["frames"]] for entry in GOLDEN["responses"]]
+PACKETS = [[bytes.fromhex(frame) for frame in entry["frames"]] for entry in GOLDEN["published"]]
+
+
+def random_port(socket: Any) -> str:
+    return f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
+
+
+def test_a_plain_req_socket_asks_our_server(open_: Any, plain: Any, until: Any) -> None:
+    server, requester = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None)), plain(zmq.REQ)
+    requester.connect(server.serve_address)
+    for request, response in zip(REQUESTS, RESPONSES * len(REQUESTS), strict=False):
+        asked: list[Any] = []
+        requester.send_multipart(request)
+        until(lambda asked=asked: asked, (server, asked))
+        assert asked[0].frames == request
+        server.reply(response)
+        assert requester.recv_multipart() == response
+
+
+def test_our_component_asks_a_plain_router(open_: Any, plain: Any, until: Any) -> None:
+    router, found = plain(zmq.ROUTER), []
+    port = open_(ZmqPort(Network(), "Component", CLOCK, control=random_port(router)))
+    until(lambda: ControlConnected() in found, (port, found))
+    for request, response in zip(REQUESTS, RESPONSES * len(REQUESTS), strict=False):
+        found.clear()
+        port.send(request)
+        assert router.recv_multipart() == [b"Component", b"", *request]
+        router.send_multipart([b"Component", b"", *response])
+        until(lambda: found, (port, found))
+        assert found == [ReplyReceived(wire.decode_response(response))]
+
+
+def test_our_component_says_nothing_to_a_router_before_it_has_something_to_ask(
+    open_: Any, plain: Any, until: Any
+) -> None:
+    router, found = plain(zmq.ROUTER), []
+    port = open_(ZmqPort(Network(), "Component", CLOCK, control=random_port(router)))
+    until(lambda: ControlConnected() in found, (port, found))
+    assert not router.poll(50)
+
+
+@pytest.mark.parametrize("with_time", [True, False])
+def test_our_component_subscribes_to_a_plain_pub(open_: Any, plain: Any, until: Any, with_time: bool) -> None:
+    publisher, found = plain(zmq.XPUB), []
+    port = open_(ZmqPort(Network(), "Component", CLOCK, subscribe=[random_port(publisher)], envelopes=["Scan2d"]))
+    seen = set()
+    while b"\1Scan2d" not in seen:  # the plain prefix, beside a marker that means nothing to this peer
+        port.poll(0.0)
+        seen.add(publisher.recv())
+    for frames in PACKETS:
+        publisher.send_multipart(frames if with_time else frames[:2])
+    publisher.send(b"KILL")
+    until(lambda: Killed() in found, (port, found))
+    got = [[i.packet.envelope.encode(), bytes(i.packet.payload)] for i in found if isinstance(i, PacketReceived)]
+    assert got == [frames[:2] for frames in PACKETS if frames[0].startswith(b"Scan2d")]
+    assert not any(isinstance(incoming, CaughtUp) for incoming in found)
+
+
+def test_our_component_drops_what_a_plain_pub_repeats(open_: Any, plain: Any, until: Any) -> None:
+    publisher, found = plain(zmq.XPUB), []
+    port = open_(ZmqPort(Network(), "Component", CLOCK, subscribe=[random_port(publisher)]))
+    while publisher.recv() != b"\1":
+        port.poll(0.0)
+    for _ in range(3):
+        for frames in PACKETS:
+            publisher.send_multipart(frames)
+    publisher.send(b"KILL")
+    until(lambda: Killed() in found, (port, found))
+    envelopes = [i.packet.envelope.encode() for i in found if isinstance(i, PacketReceived)]
+    assert envelopes == list(dict.fromkeys(envelopes))
+
+
+@pytest.mark.parametrize("prefix", [b"", b"Scan2d"])
+def test_a_plain_sub_gets_what_was_published_before_oldest_first_and_then_what_follows(
+    open_: Any, plain: Any, until: Any, prefix: bytes
+) -> None:
+    publisher, subscriber = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)), plain(zmq.SUB)
+    for n in range(10):
+        publisher.publish(f"Scan2d_{n % 2}", b"%d" % n)
+    subscriber.setsockopt(zmq.SUBSCRIBE, prefix)
+    subscriber.setsockopt(zmq.SUBSCRIBE, b"KILL")
+    subscriber.connect(publisher.publish_address)
+    until(lambda: subscriber.poll(0), (publisher, []))
+    publisher.publish("Scan2d_0", b"live")
+    publisher.kill()
+    got = []
+    while (frames := subscriber.recv_multipart()) != [b"KILL"]:
+        got.append(frames)
+    assert [payload for _, payload, _ in got] == [b"%d" % n for n in range(10)] + [b"live"]
+    times = [wire.decode_packet(frames).time_ns for frames in got]
+    assert times == sorted(set(times))
+
+
+def test_a_plain_sub_to_everything_does_not_see_the_replay_for_one_of_ours(open_: Any, plain: Any, until: Any) -> None:
+    publisher, subscriber = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)), plain(zmq.SUB)
+    subscriber.setsockopt(zmq.SUBSCRIBE, b"")
+    subscriber.connect(publisher.publish_address)
+    joined: list[Any] = []
+    until(lambda: joined, (publisher, joined))
+    publisher.publish("Scan2d", b"one")
+    found: list[Any] = []
+    late = open_(ZmqPort(Network(), "Late", CLOCK, subscribe=[publisher.publish_address]))
+    until(lambda: any(isinstance(i, CaughtUp) for i in found), (publisher, []), (late, found))
+    publisher.kill()
+    got = []
+    while (frames := subscriber.recv_multipart()) != [b"KILL"]:
+        got.append(frames[:2])
+    assert got == [[b"Scan2d", b"one"]]
