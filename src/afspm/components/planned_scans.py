@@ -11,7 +11,7 @@ from afspm.components.plan import XY, Rhythm, ScanPlan, Step, grid_centers, roun
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region
 from afspm.runtime.component import Component
-from afspm.units import Angle, Duration, Length, parse_quantity
+from afspm.units import Angle, Duration, Length
 
 Pixels = tuple[int, int]
 
@@ -38,13 +38,13 @@ class PlannedScans(Component):
         parameters: Mapping[str, str | float] | None = None,
     ) -> None:
         self.plan = plan
-        self.period_s = period_s
+        self.beat_s = period_s
         self.end_when_done = end_when_done
         self.parameters = dict(parameters or {})
 
     def run(self) -> None:
         self.memory.setdefault("start_s", self.clock.now_s())
-        rhythm = Rhythm(float(self.memory["start_s"]), self.period_s)
+        rhythm = Rhythm(float(self.memory["start_s"]), self.beat_s)
         self.memory.save()
         self._set_parameters()
         done = int(self.memory.get("done", 0))
@@ -60,8 +60,7 @@ class PlannedScans(Component):
     def _set_parameters(self) -> None:
         with self.scope.control():
             for name, quantity in self.parameters.items():
-                value, unit = parse_quantity(quantity) if isinstance(quantity, str) else (quantity, "")
-                self.scope.set(name, value, unit or None)
+                self.scope.set(name, quantity)
 
     def _await(self, step: Step, rhythm: Rhythm) -> None:
         if not step.starts_round or self.memory.get("begun") == step.index:

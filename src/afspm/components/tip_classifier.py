@@ -1,0 +1,115 @@
+"""`TipClassifier`: sees in the scans that the tip has changed, and that it is good again."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from afspm.components import verdicts
+from afspm.components.tip_judge import Counter, Opinion, Reference, TipJudge, Tolerance, Verdict
+from afspm.components.tip_scans import HeightPair, Pairing
+from afspm.errors import UnitError
+from afspm.model import ControlState, Scan
+from afspm.runtime.component import Component
+
+_SCORES = {Opinion.GOOD: verdicts.GOOD, Opinion.BAD: verdicts.BAD, Opinion.UNCLEAR: verdicts.UNCLEAR}
+
+
+class TipClassifier(Component):
+    """Flags `tip-shape-changed` when scans say that the tip is blunt, double or carries debris, and clears it again.
+
+    It learns what a good tip shows from the first scans, so the tip has to be good then; scans of another pixel size
+    are not judged. What it thinks of each it publishes as a `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
+
+    Args:
+        channel: of the heights.
+        retrace_channel: their retrace; empty where it is not recorded (then debris is not seen).
+        reference_scans: how many scans it learns from.
+        flag_after: bad scans in a row until the problem is flagged.
+        clear_after: good scans in a row until it is cleared.
+        detail: share of the fine detail below which the tip is blunt.
+        ghost: correlation of a ghost image above which the tip is double.
+        unrest: factor on the disagreement of trace and retrace above which it carries debris.
+        sigmas: standard deviations of the reference beyond which a scan must lie to be bad.
+        problem: what it flags.
+    """
+
+    flags: ClassVar = ("tip-shape-changed",)
+    publishes: ClassVar = (verdicts.MESSAGE,)
+    listens: ClassVar = ("Scan2d", "ControlState")
+
+    def __init__(
+        self,
+        channel: str = "Height",
+        retrace_channel: str = "Height Retrace",
+        reference_scans: int = 4,
+        flag_after: int = 1,
+        clear_after: int = 1,
+        detail: float = Tolerance.detail,
+        ghost: float = Tolerance.ghost,
+        unrest: float = Tolerance.unrest,
+        sigmas: float = Tolerance.sigmas,
+        problem: str = "tip-shape-changed",
+    ) -> None:
+        self.pairing = Pairing(channel, retrace_channel)
+        self.judge = TipJudge(reference_scans, Tolerance(detail, ghost, unrest, sigmas))
+        self.counter = Counter(flag_after, clear_after)
+        self.problem = problem
+        self._problems: tuple[int, ...] = ()
+
+    def on_start(self) -> None:
+        if "reference" in self.memory:
+            self.judge.reference = Reference.from_dict(self.memory["reference"])
+        self.counter.bad, self.counter.good = self.memory.get("counter", (0, 0))
+
+    def on_control(self, control_state: ControlState) -> None:
+        was, self._problems = self._is_flagged, control_state.problems
+        if self._is_flagged and not was and self.counter.bad < self.counter.flag_after:
+            self.counter.good = 0  # somebody else saw something: only scans from now on can tell that it is over
+
+    def on_scan(self, scan: Scan) -> None:
+        pair = self.pairing.add(scan)
+        # a replay after a restart brings what was judged already
+        if pair is None or (scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1)):
+            return
+        self._judge(pair)
+
+    @property
+    def _is_flagged(self) -> bool:
+        return self.scope.problems.number(self.problem) in self._problems
+
+    def _judge(self, pair: HeightPair) -> None:
+        if not self.judge.has_learnt and self._problems:
+            self.log.info("not learnt from %s: a problem is flagged", _name(pair.trace))
+            return
+        try:
+            verdict = pair.judged_by(self.judge)
+        except UnitError as error:
+            self.log.warning("%s is no height: %s", pair.trace.channel, error)
+            return
+        self.counter.count(verdict.opinion)
+        self._tell(pair.trace, verdict)
+        self._remember(pair.trace, verdict)
+
+    def _tell(self, scan: Scan, verdict: Verdict) -> None:
+        """Flag or clear; then the verdict, so that who waits for it finds the flag as it should be."""
+        self.log.info("%s: %s (%s)", _name(scan), verdict.opinion.value, verdict.why)
+        if self.counter.wants_flag and not self._is_flagged:
+            self.log.warning("the tip has changed: %s", verdict.why)
+            self.scope.flag(self.problem)
+        elif self.counter.wants_clear and self._is_flagged:
+            self.log.info("the tip is good again: %s", verdict.why)
+            self.scope.clear(self.problem)
+        if verdict.opinion in _SCORES:
+            self.publish(verdicts.verdict_message(scan, _SCORES[verdict.opinion]), f"{verdicts.MESSAGE}_{self.name}")
+
+    def _remember(self, scan: Scan, verdict: Verdict) -> None:
+        if scan.time_ns is not None:
+            self.memory["newest_ns"] = scan.time_ns
+        self.memory["counter"] = self.counter.state
+        if verdict.opinion is Opinion.LEARNING and self.judge.reference is not None:
+            self.memory["reference"] = self.judge.reference.to_dict()
+        self.memory.save()
+
+
+def _name(scan: Scan) -> str:
+    return scan.filename.replace("\\", "/").rsplit("/", 1)[-1] or f"the scan of {scan.time}"

@@ -1,0 +1,251 @@
+"""`TipCorrector`: makes the tip good again when somebody flagged it, within what it is allowed to do."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from afspm import wire
+from afspm.components import verdicts
+from afspm.components.planned_scans import pair
+from afspm.components.tip_judge import Opinion, Reference, TipJudge, Tolerance
+from afspm.components.tip_scans import Pairing
+from afspm.components.treatments import Pulse, Treatment, clearance_m, fresh_place, treatments
+from afspm.components.verdicts import read_verdict
+from afspm.errors import ConfigError, ControlLost, Refused
+from afspm.model import Problem, Region, Scan, ScanSet, names
+from afspm.runtime.component import Component
+from afspm.runtime.events import Events
+from afspm.units import Duration, Length, Speed, Voltage
+
+VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
+MOST_LOOKS = 3  # test scans after one treatment, while the verdict is unclear or more good ones are wanted
+DONE_ACTION = "ActionMsg"
+_REGION_PARAMETERS = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
+
+
+class TipCorrector(Component):
+    """Solves `tip-shape-changed`: pulses of the bias, one after the other, then controlled crashes, deeper and deeper.
+
+    After each it takes a test scan elsewhere, of the size of the experiment's scans. Whoever judges scans (the
+    `TipClassifier`) clears the flag when the tip is good, which takes control from the corrector: the experiment goes
+    on. The lists below are all that one repair may do, over restarts too; what a limit of the experiment file or the
+    microscope refuses is told and left out. When nothing is left it flags `device-malfunction` and waits for a person:
+    the experiment stands still rather than measuring with a bad tip. Once that flag is removed it may try again.
+
+    What it does to the sample it does at fresh places about `workshop_center`, and never within `keep_away` of the
+    experiment's region or of the test scan. It publishes each action done as an `ActionMsg`.
+
+    Args:
+        workshop_center: (x, y) about which pulses and crashes are made.
+        test_center: (x, y) of the middle of the test scans.
+        pulse_voltages: those of one repair, in order.
+        pulse_duration: of each pulse.
+        crash_depths: those of one repair, in order, after the pulses.
+        crash_speed: of each crash.
+        place_spacing: between the places of two treatments.
+        keep_away: least distance of a treatment from the experiment's region and the test scans.
+        judge: "classifier" waits for whoever judges scans to clear the flag; "self" judges the test scans by the first
+            scans of the experiment, and clears it.
+        channel, retrace_channel: of the heights, for judge = "self".
+        reference_scans: for judge = "self".
+        problem: what it solves.
+    """
+
+    solves: ClassVar = ("tip-shape-changed",)
+    flags: ClassVar = ("device-malfunction",)
+    publishes: ClassVar = (DONE_ACTION,)
+
+    def __init__(
+        self,
+        workshop_center: tuple[Length, Length],
+        test_center: tuple[Length, Length],
+        pulse_voltages: tuple[Voltage, ...] = (3.0, -4.0, 5.0),
+        pulse_duration: Duration = 50e-3,
+        crash_depths: tuple[Length, ...] = (5e-9, 10e-9, 20e-9),
+        crash_speed: Speed = 50e-9,
+        place_spacing: Length = 300e-9,
+        keep_away: Length = 500e-9,
+        judge: Literal["classifier", "self"] = "classifier",
+        channel: str = "Height",
+        retrace_channel: str = "Height Retrace",
+        reference_scans: int = 4,
+        problem: str = "tip-shape-changed",
+    ) -> None:
+        self.workshop_center, self.test_center = pair(workshop_center), pair(test_center)
+        self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
+        self.place_spacing, self.keep_away = place_spacing, keep_away
+        self.problem = problem
+        if place_spacing <= 0.0 or keep_away < 0.0:
+            raise ConfigError("`place_spacing` must be above zero, `keep_away` not below")
+        self.pairing = Pairing(channel, retrace_channel)
+        self.judge = TipJudge(reference_scans, Tolerance()) if judge == "self" else None
+
+    def run(self) -> None:
+        if self.judge is not None and "reference" in self.memory:
+            self.judge.reference = Reference.from_dict(self.memory["reference"])
+        wanted = ("ControlState",) if self.judge is None else ("ControlState", "Scan2d")
+        with self.scope.events(*wanted) as events:
+            self._look()
+            for event in events:
+                if isinstance(event.message, Scan):
+                    self._learn(event.message)
+                else:
+                    self._look()
+
+    def _look(self) -> None:
+        """Repair if that is wanted."""
+        if self.memory.get("given_up"):
+            if self._is_flagged(self.problem) and self._is_flagged(Problem.DEVICE_MALFUNCTION):
+                return
+            self.log.info("somebody has looked after the tip: it may be repaired again")
+            self._begin_anew()
+        if not self._is_flagged(self.problem):
+            if self.memory.get("tried"):
+                self._begin_anew()
+            return
+        try:
+            with self.scope.control(solving=self.problem):
+                self._repair()
+        except ControlLost as lost:
+            self.log.info("the repair is over: %s", lost.what)
+
+    def _repair(self) -> None:
+        region, shape = self._of_experiment()
+        if region is None:
+            self._give_up("the microscope does not say where the experiment scans: no place is known to be safe")
+            return
+        test = Region(self.test_center, region.size_m, region.angle_rad)
+        tried = int(self.memory.get("tried", 0))
+        self.log.info("repairing the tip%s", f" ({tried} treatments were tried already)" if tried else "")
+        with self.scope.events("ControlState", verdicts.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
+            if tried and self._is_cured(test, shape, answers):  # a kill may have come between treatment and test
+                return
+            for treatment in self.allowed[tried:]:
+                if self._treat(treatment, (region, test)) and self._is_cured(test, shape, answers):
+                    self.log.info("the tip is repaired")
+                    return
+        self._restore(region)
+        self._give_up(f"all {len(self.allowed)} treatments that are allowed were tried")
+
+    def _of_experiment(self) -> tuple[Region | None, tuple[int, int] | None]:
+        """Region and shape of the experiment's scans, as they were before we moved away."""
+        if "region" not in self.memory:
+            parameters = self.scope.scan_parameters
+            if parameters is None or not isinstance(parameters.region, Region):
+                return None, None
+            region = parameters.region
+            self.memory["region"] = [*region.center_m, *region.size_m, region.angle_rad]
+            self.memory["shape"] = parameters.shape
+            self.memory.save()
+        x, y, width, height, angle = self.memory["region"]
+        shape = self.memory["shape"]
+        return Region((x, y), (width, height), angle), (shape[0], shape[1]) if shape else None
+
+    def _treat(self, treatment: Treatment, safe: tuple[Region, Region]) -> bool:
+        """Whether it was done."""
+        number = int(self.memory.get("places", 0))
+        place = fresh_place(self.workshop_center, self.place_spacing, number)
+        # counted before it is done: a kill must not make it happen twice
+        self.memory["tried"], self.memory["places"] = int(self.memory.get("tried", 0)) + 1, number + 1
+        self.memory.save()
+        if (away := min(clearance_m(place, region) for region in safe)) < self.keep_away:
+            self.log.error("no %s: its place is only %.0f nm away from what is scanned", treatment, away * 1e9)
+            return False
+        action = names.PULSE if isinstance(treatment, Pulse) else names.CRASH
+        try:
+            if not self.scope.supports(action):
+                self.log.warning("no %s: the microscope has no %s", treatment, action)
+                return False
+            self.scope.move_probe(place)
+            self._prepare(treatment)
+            self.scope.action(action)
+        except Refused as refused:
+            self.log.warning("no %s, it was refused: %s", treatment, refused.reason)
+            return False
+        self.log.info("%s at (%.0f, %.0f) nm", treatment, place[0] * 1e9, place[1] * 1e9)
+        self.publish(wire.message_type(DONE_ACTION)(action=action), f"{DONE_ACTION}_{self.name}")
+        return True
+
+    def _prepare(self, treatment: Treatment) -> None:
+        if isinstance(treatment, Pulse):
+            self.scope.set(names.PULSE_VOLTAGE, treatment.voltage_v, "V")
+            self.scope.set(names.PULSE_DURATION, treatment.duration_s, "s")
+        else:
+            self.scope.set(names.CRASH_DEPTH, treatment.depth_m, "m")
+            self.scope.set(names.CRASH_SPEED, treatment.speed_m_per_s, "m/s")
+
+    def _is_cured(self, test: Region, shape: tuple[int, int] | None, answers: Events) -> bool:
+        """Test scans until it is known whether the tip is good."""
+        for _ in range(MOST_LOOKS):
+            scans = self.scope.scan(test, shape=shape)
+            score = self._own_score(scans) if self.judge is not None else self._score_of_others(scans, answers)
+            if not self._is_flagged(self.problem):
+                return True
+            if score == verdicts.BAD:
+                return False
+        return False
+
+    def _own_score(self, scans: ScanSet) -> float:
+        """Judge, and clear the flag of a good tip."""
+        for scan in scans.values():
+            pair = self.pairing.add(scan)
+            if pair is not None and self.judge is not None and self.judge.has_learnt:
+                verdict = pair.judged_by(self.judge)
+                self.log.info("test scan: %s (%s)", verdict.opinion.value, verdict.why)
+                if verdict.opinion is Opinion.GOOD:
+                    self._restore(self._of_experiment()[0])
+                    self.scope.clear(self.problem)
+                    self._wait_flag(self.problem, flagged=False)
+                return verdicts.BAD if verdict.opinion is Opinion.BAD else verdicts.UNCLEAR
+        self.log.warning("a test scan that can't be judged: no reference, or without the channels")
+        return verdicts.UNCLEAR
+
+    def _score_of_others(self, scans: ScanSet, answers: Events) -> float:
+        """Wait for the verdict on these scans, or for the flag to be removed."""
+        times = {scan.time_ns for scan in scans.values()}
+        for event in answers:
+            if not self._is_flagged(self.problem):
+                return verdicts.GOOD
+            verdict = read_verdict(event.message) if event.envelope.startswith(verdicts.MESSAGE) else None
+            if verdict is not None and verdict[0] in times:
+                return verdict[1]
+        self.log.warning("nobody judged the test scan within %.0f s: taken for bad", VERDICT_WITHIN_S)
+        return verdicts.BAD
+
+    def _learn(self, scan: Scan) -> None:
+        if self.judge is None or self.judge.has_learnt or self.scope.control_state.problems:
+            return
+        pair = self.pairing.add(scan)
+        if pair is not None and pair.judged_by(self.judge).opinion is Opinion.LEARNING and self.judge.reference:
+            self.memory["reference"] = self.judge.reference.to_dict()
+            self.memory.save()
+
+    def _restore(self, region: Region | None) -> None:
+        """Set the scan region back to the experiment's: its next scan may take what it finds."""
+        if region is None:
+            return
+        values = zip(_REGION_PARAMETERS, (*region.size_m, *region.top_left_m), strict=True)
+        try:
+            for name, value_m in values:
+                self.scope.set(name, value_m, "m")
+        except Refused as refused:
+            self.log.warning("the experiment's region could not be set again: %s", refused.reason)
+
+    def _give_up(self, why: str) -> None:
+        self.log.error("the tip can't be repaired: %s. A person has to look; nothing is scanned until then", why)
+        self.scope.flag(Problem.DEVICE_MALFUNCTION)
+        self._wait_flag(Problem.DEVICE_MALFUNCTION, flagged=True)
+        self.memory["given_up"] = True
+        self.memory.save()
+
+    def _wait_flag(self, problem: int | str, *, flagged: bool) -> None:
+        """Until the scheduler's word for it is here: what is older must not be taken for a change."""
+        self.scope.wait_until(lambda: self._is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
+
+    def _begin_anew(self) -> None:
+        for key in ("tried", "region", "shape", "given_up"):
+            self.memory.pop(key, None)
+        self.memory.save()
+
+    def _is_flagged(self, problem: int | str) -> bool:
+        return self.scope.problems.number(problem) in self.scope.control_state.problems

@@ -1,0 +1,206 @@
+"""What a scan says about the tip that took it, in numbers that depend little on where it was taken.
+
+Whatever the tip touches it blunts, doubles or shakes in the same way, so that three properties of a scan tell of the
+tip rather than of the place:
+
+- `detail`: the power of the slopes at short wavelengths against that at long ones. Every edge of the sample has both;
+  a blunt tip loses the short ones. (Heights of terraces, or how many particles there are, scale both.) The power is
+  the cross spectrum of trace and retrace, to which noise does not add up.
+- `ghost`: the autocorrelation of the slopes away from zero. A second apex repeats everything at one distance.
+- `unrest`: how far trace and retrace disagree over stretches of a line, which edges do not cause but loose debris does.
+
+(Villarrubia 1997 for what a tip does to an image; the rest is standard signal analysis.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+
+Array = NDArray[np.float64]
+
+FEWEST_PIXELS = 32
+LARGEST_HOLES = 0.2  # share of pixels that may be missing
+SHORT_PX = (3.0, 8.0)  # wavelengths that a blunt tip loses
+LONG_PX = (8.0, 32.0)  # wavelengths that it keeps
+CORE_PX = 6.0  # lags that an edge correlates over by itself
+STRETCH = 10  # a stretch of a line is a tenth of it
+LEAST_CONTRAST = 2.0  # slopes common to trace and retrace against those of noise
+
+
+@dataclass(frozen=True)
+class TipMetrics:
+    """Of one scan.
+
+    Attributes:
+        detail: short-wave against long-wave power of the slopes.
+        ghost: largest autocorrelation of the slopes beside the centre, 0 to 1, beyond what was expected there.
+        unrest_m: disagreement of trace and retrace over stretches, exceeded in a tenth of the lines; 0 without retrace.
+        contrast: how far the sample's slopes stand above noise; below `LEAST_CONTRAST` the others mean nothing.
+    """
+
+    detail: float
+    ghost: float
+    unrest_m: float
+    contrast: float
+
+    def to_dict(self) -> dict[str, float]:
+        """JSON-able."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TipMetrics:
+        return cls(**{f.name: float(values[f.name]) for f in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """The slopes of a scan along its lines, ready to be analysed: trace and retrace, (rows, columns - 1)."""
+
+    trace: Array
+    retrace: Array | None
+    difference: Array | None
+
+
+def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
+    """Take what does not tell of the tip out of a scan: offsets and tilt of its lines, missing pixels.
+
+    Args:
+        trace, retrace: heights in m, [y, x], retrace turned round as scans are; NaN where nothing was measured.
+
+    Raises:
+        InvalidValue: too small, too many holes, or two pictures of different shape.
+    """
+    if min(trace.shape) < FEWEST_PIXELS:
+        raise InvalidValue(f"a scan of {trace.shape} pixels is too small to tell", hint=f"{FEWEST_PIXELS} at least")
+    if retrace is not None and retrace.shape != trace.shape:
+        raise InvalidValue(f"trace {trace.shape} and retrace {retrace.shape} don't belong together")
+    level = _levelled(trace)
+    if retrace is None:
+        return Slopes(_clipped(np.diff(level, axis=1)), None, None)
+    back = _levelled(retrace)
+    return Slopes(_clipped(np.diff(level, axis=1)), _clipped(np.diff(back, axis=1)), level - back)
+
+
+def autocorrelation(of: Slopes, reach_px: int) -> Array:
+    """How much the slopes look like themselves elsewhere, 1 at no distance.
+
+    Returns:
+        Lags of 0 … reach rows by -reach … reach columns; the other half is the same by symmetry.
+    """
+    ny, nx = of.trace.shape
+    window = np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
+    size = (2 * ny, 2 * nx)
+
+    def spectrum(values: Array) -> NDArray[np.complex128]:
+        return np.fft.rfft2(values * window, size)
+
+    first = spectrum(of.trace)
+    second = first if of.retrace is None else spectrum(of.retrace)
+    power = (first * second.conj()).real
+    correlation = np.fft.irfft2(power, size)
+    overlap = np.fft.irfft2(np.abs(np.fft.rfft2(window, size)) ** 2, size)
+    rows, columns = np.arange(reach_px + 1), np.arange(-reach_px, reach_px + 1)
+    part = correlation[np.ix_(rows, columns)] / overlap[np.ix_(rows, columns)]
+    peak = float(part[0, reach_px]) if of.retrace is None else float(part[:2, reach_px - 2 : reach_px + 3].max())
+    normalised: Array = part / peak if peak > 0 else np.zeros_like(part)
+    return normalised
+
+
+def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> TipMetrics:
+    """The numbers of one scan.
+
+    Args:
+        correlation: its `autocorrelation`.
+        expected: that of a good tip on this sample, which may be periodic; None: nothing is expected.
+    """
+    short, long, noise = _band_powers(of)
+    return TipMetrics(
+        detail=short / long if long > 0 else 0.0,
+        ghost=ghost(correlation, expected),
+        unrest_m=_unrest_m(of.difference),
+        contrast=(short + long) / noise if noise > 0 else float(short + long > 0) * 1e3,
+    )
+
+
+def ghost(correlation: Array, expected: Array | None = None) -> float:
+    """The largest correlation beside the centre, less what was expected there."""
+    beyond = _smoothed(correlation if expected is None else correlation - expected)
+    reach = correlation.shape[0] - 1
+    rows, columns = np.mgrid[0 : reach + 1, -reach : reach + 1]
+    aside = np.hypot(rows, columns) > CORE_PX
+    return max(0.0, float(beyond[aside].max()))
+
+
+def _levelled(heights: Array) -> Array:
+    """Each line less its median and the common tilt, holes filled."""
+    values = _filled(np.array(heights, dtype=np.float64))
+    tilt = np.median(np.diff(values, axis=1))
+    values = values - tilt * np.arange(values.shape[1])
+    levelled: Array = values - np.median(values, axis=1, keepdims=True)
+    return levelled
+
+
+def _filled(values: Array) -> Array:
+    holes = ~np.isfinite(values)
+    if holes.mean() > LARGEST_HOLES:
+        raise InvalidValue(f"{holes.mean():.0%} of the scan are missing")
+    for row in np.nonzero(holes.any(axis=1))[0]:
+        there = values[row][~holes[row]]
+        values[row][holes[row]] = np.median(there) if there.size else 0.0
+    return values
+
+
+def _clipped(slope: Array) -> Array:
+    """Less the common slope, the few steepest limited: one large particle must not outweigh all else."""
+    slope = slope - np.median(slope)
+    limit = np.quantile(np.abs(slope), 0.995)
+    return np.clip(slope, -limit, limit) if limit > 0 else slope
+
+
+def _band_powers(of: Slopes) -> tuple[float, float, float]:
+    """Power of the slopes in the short and the long band, and that of noise in both."""
+    nx = of.trace.shape[1]
+    window = np.hanning(nx + 2)[1:-1]
+    first = np.fft.rfft(of.trace * window, axis=1)
+    frequency = np.fft.rfftfreq(nx)
+    if of.retrace is None:
+        # the next line looks at nearly the same place with other noise
+        pairs, alone = first[1:] * first[:-1].conj(), np.abs(first) ** 2
+    else:
+        second = np.fft.rfft(of.retrace * window, axis=1)
+        pairs, alone = first * second.conj(), (np.abs(first) ** 2 + np.abs(second) ** 2) / 2
+    # feedback lags, so that trace and retrace are shifted against each other: a phase, not a loss
+    common, total = np.abs(pairs.mean(axis=0)), alone.mean(axis=0)
+    noise = np.maximum(total - common, 0.0)
+
+    def band(power: Array, wavelengths: tuple[float, float]) -> float:
+        chosen = (frequency >= 1 / wavelengths[1]) & (frequency < 1 / wavelengths[0])
+        return float(power[chosen].sum())
+
+    bias = 1.0 / np.sqrt(len(pairs))  # what the modulus of a mean of that many random phases keeps
+    common = np.maximum(common - bias * noise, 0.0)
+    return band(common, SHORT_PX), band(common, LONG_PX), band(noise, (LONG_PX[1], SHORT_PX[0]))
+
+
+def _unrest_m(difference: Array | None) -> float:
+    if difference is None:
+        return 0.0
+    width = max(3, difference.shape[1] // STRETCH)
+    # the median of a stretch ignores what edges do to trace and retrace
+    stretches = np.lib.stride_tricks.sliding_window_view(difference, width, axis=1)[:, :: max(1, width // 2)]
+    levels = np.median(stretches, axis=-1)
+    return float(np.quantile(np.ptp(levels, axis=1), 0.9))
+
+
+def _smoothed(correlation: Array) -> Array:
+    """The mean of each 3 x 3: a ghost is as wide as an edge, chance is not."""
+    padded = np.pad(correlation, 1, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    smooth: Array = windows.mean(axis=(-1, -2))
+    return smooth

@@ -1,0 +1,75 @@
+"""What is tried to make a tip good again, in which order and where: pure, so that nothing surprising is ever done."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from afspm.errors import ConfigError
+from afspm.model import Region
+
+XY = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """A pulse of the bias voltage."""
+
+    voltage_v: float
+    duration_s: float
+
+    def __str__(self) -> str:
+        return f"pulse of {self.voltage_v:+g} V, {self.duration_s * 1e3:g} ms"
+
+
+@dataclass(frozen=True)
+class Crash:
+    """The tip driven into the sample, so deep and so fast."""
+
+    depth_m: float
+    speed_m_per_s: float
+
+    def __str__(self) -> str:
+        return f"crash of {self.depth_m * 1e9:g} nm at {self.speed_m_per_s * 1e9:g} nm/s"
+
+
+Treatment = Pulse | Crash
+
+
+def treatments(
+    pulse_voltages_v: Sequence[float],
+    pulse_duration_s: float,
+    crash_depths_m: Sequence[float],
+    crash_speed_m_per_s: float,
+) -> tuple[Treatment, ...]:
+    """The gentle ones first: pulses as listed, then crashes as listed. This is all that one repair may do.
+
+    Raises:
+        ConfigError: nothing is listed, or a value that is no treatment.
+    """
+    if not pulse_voltages_v and not crash_depths_m:
+        raise ConfigError("nothing is allowed to be done", hint="list `pulse_voltages`, `crash_depths` or both")
+    if any(v == 0.0 for v in pulse_voltages_v) or (pulse_voltages_v and pulse_duration_s <= 0.0):
+        raise ConfigError("a pulse needs a voltage and a duration", where="pulse_voltages")
+    if any(depth <= 0.0 for depth in crash_depths_m) or (crash_depths_m and crash_speed_m_per_s <= 0.0):
+        raise ConfigError("a crash needs a depth and a speed above zero", where="crash_depths")
+    pulses = tuple(Pulse(float(v), float(pulse_duration_s)) for v in pulse_voltages_v)
+    crashes = tuple(Crash(float(depth), float(crash_speed_m_per_s)) for depth in crash_depths_m)
+    return pulses + crashes
+
+
+def fresh_place(center_m: XY, spacing_m: float, number: int) -> XY:
+    """The number-th place around a centre that no other lies within `spacing_m` of: sunflower seeds (Vogel 1979)."""
+    radius = 1.2 * spacing_m * math.sqrt(number)
+    angle = number * math.pi * (3.0 - math.sqrt(5.0))
+    return center_m[0] + radius * math.cos(angle), center_m[1] + radius * math.sin(angle)
+
+
+def clearance_m(place_m: XY, region: Region) -> float:
+    """How far a place lies outside of a region; 0 within."""
+    cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
+    dx, dy = place_m[0] - region.center_m[0], place_m[1] - region.center_m[1]
+    u, v = dx * cos + dy * sin, -dx * sin + dy * cos
+    beside = (max(abs(u) - region.size_m[0] / 2, 0.0), max(abs(v) - region.size_m[1] / 2, 0.0))
+    return math.hypot(*beside)

@@ -1,0 +1,32 @@
+"""What a judge of scans tells others: the places it looked at, each with a score, as a message of the contract."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from afspm import wire
+from afspm.model import Scan
+
+MESSAGE = "SpatialROIWithScoreList"
+GOOD, UNCLEAR, BAD = 1.0, 0.5, 0.0
+
+
+def verdict_message(scan: Scan, score: float) -> Any:
+    """A `SpatialROIWithScoreList` with one place: that of the scan, whose time and channel it carries."""
+    message: Any = wire.message_type(MESSAGE)(channel=scan.channel)
+    if scan.time_ns is not None:
+        message.timestamp.FromNanoseconds(scan.time_ns)
+    entry = message.spatials.add(score=score)
+    (left, low), (width, height) = scan.region.top_left_m, scan.region.size_m
+    entry.spatial.roi.top_left.x, entry.spatial.roi.top_left.y = left, low
+    entry.spatial.roi.size.x, entry.spatial.roi.size.y = width, height
+    entry.spatial.roi.angle = scan.region.angle_rad
+    entry.spatial.length_units, entry.spatial.angular_units = "m", "rad"
+    return message
+
+
+def read_verdict(message: Any) -> tuple[int, float] | None:
+    """(time of the scan in ns, score) of such a message; None if it says nothing of a scan."""
+    if not message.spatials or not message.HasField("timestamp"):
+        return None
+    return message.timestamp.ToNanoseconds(), float(message.spatials[0].score)
