@@ -1,0 +1,124 @@
+"""Experiment files for tests, with a module of components beside them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from afspm.experiment import Experiment, Finding, load
+
+COMPONENTS = """
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+
+from afspm.microscopes.microscope import Microscope
+from afspm.runtime.component import Component
+from afspm.units import Angle, Duration, Length, Voltage
+
+
+class Style(Enum):
+    QUICK = "quick"
+    SLOW = "slow"
+
+
+class Scanner(Component):
+    listens = ("Scan2d", "ControlState")
+
+    def __init__(self, size: tuple[Length, Length], every: Duration = 60.0, angle: Angle = 0.0, count: int = 3,
+                 style: Style = Style.QUICK, image: Path | None = None, names: list[str] | None = None): ...
+
+
+class Classifier(Component):
+    flags = ("tip-shape-changed",)
+    listens = ("Scan2d",)
+
+
+class Corrector(Component):
+    solves = ("tip-shape-changed",)
+
+    def __init__(self, voltage: Voltage = 3.0): ...
+
+
+class Peaks(Component):
+    publishes = ("PeakList",)
+    listens = ("Scan2d",)
+
+
+class Chooser(Component):
+    listens = ("PeakList",)
+
+
+class Anything(Component):
+    def __init__(self, **settings): ...
+
+
+class Derived(Scanner):
+    def __init__(self, extra: int = 0, **settings):
+        super().__init__(**settings)
+
+
+class Simulated(Microscope):
+    simulated = True
+
+
+class Real(Microscope):
+    pass
+
+
+class NoComponent:
+    pass
+"""
+
+# commands, so that these tests are about the file and not about what is ready-made
+FRAME = f"""
+[scheduler]
+component = true
+role = "scheduler"
+command = [{json.dumps(sys.executable)}]
+
+[microscope]
+component = true
+role = "translator"
+command = [{json.dumps(sys.executable)}]
+simulated = true
+"""
+
+Write = Callable[..., Experiment]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    """Writes an experiment file (with scheduler and translator, unless `frame` is empty) and loads it."""
+    (tmp_path / "parts.py").write_text(COMPONENTS, encoding="utf-8")
+
+    def write(text: str, *overlays: str, frame: str = FRAME) -> Experiment:
+        files = []
+        for i, content in enumerate([text + frame, *overlays]):
+            file = tmp_path / ("night.toml" if i == 0 else f"over{i}.toml")
+            file.write_text(content, encoding="utf-8")
+            files.append(file)
+        return load(*files)
+
+    return write
+
+
+def line_of(experiment: Experiment, start: str, file: str = "night.toml") -> int:
+    """The line (from 1) of a file of the experiment that begins with `start`."""
+    lines = (experiment.folder / file).read_text(encoding="utf-8").splitlines()
+    return next(i for i, line in enumerate(lines, 1) if line.startswith(start))
+
+
+def errors(experiment: Experiment) -> list[Finding]:
+    return [finding for finding in experiment.check() if finding.is_error]
+
+
+def only_error(experiment: Experiment) -> Finding:
+    found = errors(experiment)
+    assert len(found) == 1, "\n".join(map(str, found)) or "no error was found"
+    return found[0]

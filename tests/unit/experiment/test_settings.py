@@ -1,0 +1,138 @@
+"""A component's settings are checked against its constructor: names, types, units; and reach it in SI."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from .conftest import Write, errors, line_of, only_error
+
+
+def scanner(settings: str = "", size: str = 'size = ["1 um", "1 um"]') -> str:
+    return f'[scan]\ncomponent = true\nclass = "parts.Scanner"\n{size}\n{settings}\n'
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ('every = "15 min"', 900.0),
+        ("every = 7", 7.0),
+        ('angle = "180 deg"', pytest.approx(3.14159265)),
+        ("count = 5", 5),
+        ('style = "slow"', "slow"),
+        ('names = ["a"]', ["a"]),
+    ],
+)
+def test_a_setting_reaches_the_process_in_si_and_as_json(write: Write, setting: str, value: object) -> None:
+    experiment = write(scanner(setting))
+    assert not errors(experiment)
+    settings = experiment.resolved.settings["scan"]
+    assert settings[setting.split(" ")[0]] == value
+    json.dumps(settings)
+
+
+def test_a_relative_file_is_one_beside_the_experiment_file(write: Write) -> None:
+    experiment = write(scanner('image = "surface.png"'))
+    assert Path(experiment.resolved.settings["scan"]["image"]) == experiment.folder / "surface.png"
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ('every = "3 mV"', "mV can't be converted to s"),
+        ('every = "soon"', "not a number with a unit"),
+        ("every = true", "not a quantity"),
+        ("every = nan", "not a finite number"),
+        ('every = "inf s"', "not a finite number"),
+        ('count = "many"', "valid integer"),
+        ("count = 2.5", "integer"),
+        ('style = "fast"', "'quick' or 'slow'"),
+        ('names = "a"', "valid list"),
+    ],
+)
+def test_a_wrong_value_is_an_error_on_its_line(write: Write, setting: str, said: str) -> None:
+    experiment = write(scanner(setting))
+    error = only_error(experiment)
+    assert said in error.what
+    assert "[scan]" in error.what
+    assert error.place.line == line_of(experiment, setting.split(" ")[0])
+
+
+def test_a_wrong_element_of_a_list_is_named(write: Write) -> None:
+    error = only_error(write(scanner(size='size = ["1 um", "2 s"]')))
+    assert "[scan] size[1]" in error.what
+
+
+def test_an_unknown_setting_is_an_error_with_the_nearest_name(write: Write) -> None:
+    error = only_error(write(scanner('evry = "15 min"')))
+    assert "no setting 'evry'" in error.what
+    assert "'every'" in error.hint
+
+
+def test_a_missing_setting_is_an_error(write: Write) -> None:
+    experiment = write(scanner(size=""))
+    error = only_error(experiment)
+    assert "lacks its setting 'size'" in error.what
+    assert error.place.line == line_of(experiment, "[scan]")
+
+
+def test_a_misspelt_required_setting_is_told_once(write: Write) -> None:
+    error = only_error(write(scanner(size='sise = ["1 um", "1 um"]')))
+    assert "'size'" in error.hint
+
+
+def test_a_class_that_takes_anything_gets_anything(write: Write) -> None:
+    experiment = write('[a]\ncomponent = true\nclass = "parts.Anything"\nwhatever = { x = [1, "two"] }\n')
+    assert not errors(experiment)
+    assert experiment.resolved.settings["a"] == {"whatever": {"x": [1, "two"]}}
+
+
+def test_settings_that_are_handed_on_to_the_base_class_are_checked_by_it(write: Write) -> None:
+    text = '[a]\ncomponent = true\nclass = "parts.Derived"\nextra = 1\nsize = ["1 um", "1 um"]\n'
+    assert not errors(write(text))
+    assert "'every'" in only_error(write(text + "evry = 3\n")).hint
+
+
+def test_all_errors_are_found_at_once(write: Write) -> None:
+    experiment = write(scanner('every = "3 mV"\ncuont = 3\nstyle = "fast"') + "[clock]\nsped = 2\n")
+    assert len(errors(experiment)) == 4
+
+
+def test_findings_are_in_the_order_of_the_lines(write: Write) -> None:
+    lines = [e.place.line for e in errors(write(scanner('style = "fast"\nevery = "3 mV"') + "[clock]\nsped = 2\n"))]
+    assert lines == sorted(lines)
+    assert len(lines) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "hint"),
+    [
+        ("parts.Scaner", "has no 'Scaner'", "Scanner"),
+        ("part.Scanner", "no module 'part'", "parts"),
+        ("parts.NoComponent", "is not a component", "Component"),
+        ("ScanSerie", "no ready-made class 'ScanSerie'", "ScanSeries"),
+        ("broken.X", "SyntaxError", ""),
+        ("raising.X", "ZeroDivisionError", ""),
+        ("needing.X", "needs 'not_there_at_all'", "install"),
+    ],
+)
+def test_a_class_that_can_t_be_had_is_an_error(write: Write, tmp_path: Path, name: str, said: str, hint: str) -> None:
+    (tmp_path / "broken.py").write_text("def f(:\n")
+    (tmp_path / "raising.py").write_text("1 / 0\n")
+    (tmp_path / "needing.py").write_text("import not_there_at_all\n")
+    experiment = write(f'[a]\ncomponent = true\nclass = "{name}"\n')
+    error = only_error(experiment)
+    assert said in error.what
+    assert hint in error.hint
+    assert error.place.line == line_of(experiment, "class")
+
+
+def test_modules_of_two_experiments_with_the_same_name_are_kept_apart(write: Write, tmp_path: Path) -> None:
+    text = '[a]\ncomponent = true\nclass = "own.Own"\n'
+    own = "from afspm.runtime.component import Component\nclass Own(Component):\n    def __init__(self, {}: int): ...\n"
+    (tmp_path / "own.py").write_text(own.format("first"))
+    assert "'first'" in only_error(write(text)).what
+    (tmp_path / "own.py").write_text(own.format("another"))
+    assert "'another'" in only_error(write(text)).what
