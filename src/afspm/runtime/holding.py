@@ -79,7 +79,8 @@ class Holding:
             version, connections = view.count("ControlState"), self._link.connections
             response = self._link.request(ControlRequest.REQUEST_CTRL, int(solving), until_s=until_s)
             if response.ok:
-                self.held, self._seen = True, False
+                # the state that names us may have come before the answer
+                self.held, self._seen = True, view.control is not None and view.control.holder == self._link.name
                 break
             if response.code not in _WAIT_FOR:
                 raise Refused(response.code, response.reason or "control was refused", where=self._link.name)

@@ -6,6 +6,8 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +24,6 @@ from afspm.runtime.stopping import StopRequested
 from afspm.runtime.view import KEPT
 from afspm.transport.heartbeat import HeartbeatSender
 from afspm.transport.launching import open_port
-from afspm.transport.network import Network
 from afspm.transport.port import ParentGone, Port
 
 FAREWELL_S = 1.0  # that exit handlers and threads of libraries have, once everything of ours is done
@@ -61,7 +62,7 @@ def main() -> int:
 def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
     clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
     activity = Activity(clock)
-    with _Beating(launch, activity):
+    with _beating(launch, activity):
         with activity.step():  # importing may take its time
             register_all(launch.messages)
             process = load(launch)
@@ -77,29 +78,17 @@ def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
         return process.run_process(context)
 
 
-class _Beating:
+@contextmanager
+def _beating(launch: Launch, activity: Activity) -> Iterator[None]:
     """Heartbeats while in the block. Only an end on purpose is announced: after an error the silence tells."""
-
-    def __init__(self, launch: Launch, activity: Activity) -> None:
-        self._network: Network | None = None
-        if launch.sockets.heartbeat is None:
-            return
-        self._network = Network.from_launch(launch.name, launch.keys)
-        self._sender = HeartbeatSender(
-            self._network,
-            launch.sockets.heartbeat,
-            launch.beat_period_s,
-            activity.age_s,
-            lambda: activity.longest_step_s,
-        )
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._network is not None and kind is None:
-            self._sender.close()
-            self._network.close()
+    if launch.sockets.heartbeat is None:
+        yield
+        return
+    sender = HeartbeatSender(
+        launch.sockets.heartbeat, launch.beat_period_s, activity.age_s, lambda: activity.longest_step_s
+    )
+    yield
+    sender.close()
 
 
 def _open_port(launch: Launch, clock: Clock, parent: Parent) -> Port:

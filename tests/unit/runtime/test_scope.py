@@ -1,0 +1,467 @@
+"""Scope, over a scheduler that decides by the real table and a microscope in memory."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from runtime_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
+
+from afspm import model
+from afspm.errors import ControlLost, ExperimentEnded, InvalidValue, NoResponse, Refused, UnitError
+from afspm.model import ControlMode, ControlRequest, ControlResponse, Problem, Response, Scan, ScopeState, ScopeStatus
+from afspm.runtime.link import Link
+from afspm.runtime.scope import Scope
+from afspm.runtime.stopping import StopRequested
+
+TIP = Problem.TIP_SHAPE_CHANGED
+
+
+def test_a_scan_comes_with_all_channels_at_the_place_that_was_asked_for(lab: Lab, scope: Scope) -> None:
+    scans = scope.scan(REGION, shape=(4, 6))
+    assert list(scans) == ["Height", "Phase"]
+    assert scans.region == REGION
+    assert scans.first.shape == (4, 6)
+    assert scans.interruptions == ()
+
+
+def test_control_is_asked_for_by_itself_and_given_back(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    assert lab.control.holder is None
+    assert lab.count(ControlRequest.REQUEST_CTRL) == lab.count(ControlRequest.RELEASE_CTRL) == 1
+
+
+def test_an_explicit_block_keeps_control_over_several_calls(lab: Lab, scope: Scope) -> None:
+    with scope.control():
+        scope.scan(REGION)
+        assert lab.control.holder == lab.name
+        assert scope.in_control
+        scope.scan(OTHER_REGION)
+    assert lab.control.holder is None
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 1
+
+
+def test_the_region_is_set_only_when_it_differs(lab: Lab, scope: Scope) -> None:
+    for _ in range(3):
+        scope.scan(REGION, shape=(8, 8))
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 1
+    scope.scan(OTHER_REGION)
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 2
+
+
+def test_a_region_in_sample_coordinates_is_set_each_time(lab: Lab, scope: Scope) -> None:
+    region = model.Region((0.0, 0.0), (1e-6, 1e-6), frame=model.Frame.SAMPLE)
+    scope.scan(region)
+    scope.scan(region)
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 2
+
+
+def test_a_controller_that_rounds_is_not_set_again_and_again(lab: Lab, scope: Scope) -> None:
+    coarse = model.Region((1e-9, 0.0), (1e-6, 1e-6))
+    publish = lab._move
+    lab._move = lambda thing: publish(model.ScanParameters(coarse, (8, 8)))  # type: ignore[method-assign]
+    scope.scan(REGION)
+    scope.scan(REGION)
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 1
+
+
+def test_a_problem_interrupts_and_the_scan_is_taken_when_it_is_cleared(lab: Lab, scope: Scope) -> None:
+    lab.at(30.0, lambda: lab.flag(TIP))
+    lab.at(500.0, lambda: lab.clear(TIP))
+    scans = scope.scan(REGION)
+    assert lab.clock.passed_s == pytest.approx(500.0 + SCAN_S, abs=5.0)
+    assert len(scans.interruptions) == 1
+    assert "tip-shape-changed" in scans.interruptions[0]
+    assert lab.begun_scans == 2
+
+
+def test_manual_mode_interrupts_and_says_so(lab: Lab, scope: Scope) -> None:
+    lab.at(30.0, lambda: lab.set_mode(ControlMode.MANUAL))
+    lab.at(60.0, lambda: lab.set_mode(ControlMode.AUTOMATED))
+    scans = scope.scan(REGION)
+    assert "MANUAL" in scans.interruptions[0]
+
+
+def test_a_scan_asked_for_while_a_problem_is_flagged_waits_without_asking_again_and_again(
+    lab: Lab, scope: Scope
+) -> None:
+    lab.flag(TIP)
+    lab.at(3600.0, lambda: lab.clear(TIP))
+    scans = scope.scan(REGION)
+    assert scans.interruptions == ()
+    # once at the beginning, once at the end, and now and then in between should a message have been lost
+    assert lab.count(ControlRequest.REQUEST_CTRL) <= 2 + 3600.0 / 10.0
+
+
+def test_another_solver_in_control_is_waited_for(lab: Lab, scope: Scope) -> None:
+    from afspm.logic.arbitration import Event
+
+    lab.does(Event.REQUEST_CONTROL, "other")
+    lab.at(7.0, lambda: lab.does(Event.RELEASE_CONTROL, "other"))
+    scope.scan(REGION)
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 2
+
+
+def test_the_region_is_set_again_after_somebody_else_has_moved_the_tip(lab: Lab, scope: Scope) -> None:
+    def repair() -> None:
+        lab.parameters = model.ScanParameters(OTHER_REGION, (8, 8))
+        lab.publish(lab.parameters)
+        lab.clear(TIP)
+
+    lab.at(30.0, lambda: lab.flag(TIP))
+    lab.at(60.0, repair)
+    assert scope.scan(REGION).region == REGION
+
+
+def test_a_translator_that_starts_anew_in_the_middle_costs_one_attempt(lab: Lab, scope: Scope) -> None:
+    lab.at(50.0, lab.restart_translator)
+    scans = scope.scan(REGION)
+    assert lab.begun_scans == 2
+    assert "started anew" in scans.interruptions[0]
+
+
+def test_a_scan_that_was_accepted_and_never_begins_is_asked_for_anew(lab: Lab, scope: Scope) -> None:
+    swallowed = []
+
+    def swallow(request: model.Request) -> Response | str:
+        if request.subject == "start-scan" and not swallowed:
+            swallowed.append(request.id)
+            return Response(ControlResponse.SUCCESS)
+        return "go on"
+
+    lab.intercept = swallow
+    scope.scan(REGION)
+    ids = [request.id for request in lab.requests if request.subject == "start-scan"]
+    assert len(set(ids)) == 2
+
+
+def test_channels_that_got_lost_with_the_translator_are_noticed(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+
+    def die_while_publishing() -> None:
+        lab.publish(Scan(REGION, "Height", "m", np.zeros((8, 8)), lab.clock.now_ns()))
+        lab.restart_translator()
+
+    lab.at(50.0, die_while_publishing)
+    scans = scope.scan(REGION)
+    assert list(scans) == ["Height", "Phase"]
+    assert "without Phase" in scans.interruptions[0]
+
+
+def test_a_channel_that_is_switched_off_costs_one_scan_and_no_more(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    lab.channels = ("Height",)
+    assert list(scope.scan(REGION)) == ["Height"]
+    scope.scan(REGION)
+    assert lab.begun_scans == 4
+
+
+def test_a_scan_that_somebody_stops_again_and_again_is_given_up(lab: Lab, scope: Scope) -> None:
+    for i in range(20):
+        lab.at(50.0 * (i + 1), lab.stop)
+    with pytest.raises(NoResponse, match="failed 5 times"):
+        scope.scan(REGION)
+
+
+def test_what_was_published_before_is_not_taken_for_the_scan(lab: Lab, scope: Scope) -> None:
+    lab.publish_scan(OTHER_REGION)
+    lab.publish(ScopeStatus(ScopeState.FREE))
+    assert scope.scan(REGION).region == REGION
+
+
+def test_a_scan_whose_beginning_was_lost_with_the_connection_is_recognised(lab: Lab, scope: Scope) -> None:
+    lose = lab._go
+
+    def without_busy(state: ScopeState) -> None:
+        if state is ScopeState.SCANNING:
+            lab.state = state
+        else:
+            lose(state)
+
+    lab._go = without_busy  # type: ignore[method-assign]
+    lab.at(2.0, lambda: lab.publish_scan(REGION))
+    lab.at(2.1, lambda: lose(ScopeState.FREE))
+    scope.scan(REGION)
+    assert lab.begun_scans == 1
+
+
+def test_a_refusal_is_raised_with_its_reason(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: (
+        Response(ControlResponse.PARAM_ERROR, reason="the limit of scan-size-x is 1 um")
+        if request.kind == ControlRequest.SET_SCAN_PARAMS
+        else "go on"
+    )
+    with pytest.raises(Refused, match="limit of scan-size-x") as caught:
+        scope.scan(REGION)
+    assert caught.value.response == ControlResponse.PARAM_ERROR
+    assert lab.control.holder is None
+
+
+def test_a_microscope_that_is_busy_is_waited_for(lab: Lab, scope: Scope) -> None:
+    lab.state = ScopeState.BUSY_PARAM
+    lab.at(12.0, lambda: lab._go(ScopeState.FREE))
+    scope.scan(REGION)
+    assert lab.begun_scans == 1
+    assert lab.clock.passed_s > 12.0 + SCAN_S
+
+
+def test_a_lost_answer_repeats_the_request_with_its_id_and_executes_it_once(lab: Lab, scope: Scope) -> None:
+    lost: list[str] = []
+
+    def lose_first(request: model.Request) -> Response | None | str:
+        if request.subject == "start-scan" and not lost:
+            lost.append(request.id)
+            lab._answer_once(request)
+            return None
+        return "go on"
+
+    lab.intercept = lose_first
+    scope.scan(REGION)
+    starts = [request.id for request in lab.requests if request.subject == "start-scan"]
+    assert len(starts) == 2
+    assert len(set(starts)) == 1
+    assert lab.begun_scans == 1
+
+
+def test_a_translator_that_is_silent_for_a_while_is_asked_with_the_same_id(lab: Lab, scope: Scope) -> None:
+    def silent(request: model.Request) -> Response | str:
+        late = lab.clock.passed_s < 20.0 and request.kind == ControlRequest.SET_SCAN_PARAMS
+        return Response(ControlResponse.NO_RESPONSE) if late else "go on"
+
+    lab.intercept = silent
+    scope.scan(REGION)
+    sets = {request.id for request in lab.requests if request.kind == ControlRequest.SET_SCAN_PARAMS}
+    assert len(sets) == 1
+
+
+def test_a_translator_that_stays_silent_is_told(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: (
+        Response(ControlResponse.NO_RESPONSE) if request.kind == ControlRequest.PARAM else "go on"
+    )
+    with pytest.raises(NoResponse, match="does not answer"):
+        scope.set("tip-bias-voltage", 1.0)
+
+
+def test_a_scheduler_that_never_answers_is_told(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: None
+    with pytest.raises(NoResponse, match="asked 4 times"):
+        scope.flag(TIP)
+
+
+def test_a_scheduler_that_is_restarted_is_asked_again_with_the_same_id(lab: Lab, scope: Scope) -> None:
+    down: list[str] = []
+
+    def dies(request: model.Request) -> None | str:
+        if request.kind == ControlRequest.ADD_EXP_PRBLM and not down:
+            down.append(request.id)
+            lab.at(0.1, lab.disconnect)
+            lab.at(90.0, lab.connect)
+            return None
+        return "go on"
+
+    lab.intercept = dies
+    scope.flag(TIP)
+    assert [request.id for request in lab.requests] == down * 2
+    assert 90.0 < lab.clock.passed_s < 92.0
+    assert TIP in lab.control.problems
+
+
+def test_the_answer_to_an_earlier_request_is_not_taken_for_this_ones(lab: Lab, scope: Scope) -> None:
+    from afspm.transport.port import ReplyReceived
+
+    late = Response(ControlResponse.FAILURE, reason="of another", id="experiment/0/other")
+    lab.intercept = lambda request: (lab._inbox.append(ReplyReceived(late)), "go on")[1]
+    scope.flag(TIP)
+
+
+def test_a_version_1_scheduler_is_never_asked_twice_for_an_action(lab: Lab, scope: Scope) -> None:
+    """It knows no ids: it would execute the action twice."""
+    from afspm.transport.port import ReplyReceived
+
+    def version_1(request: model.Request) -> None:
+        if request.subject != "x-pulse":
+            code = lab._answer(request).code
+            lab.at(0.01, lambda: lab._inbox.append(ReplyReceived(Response(code))))
+
+    lab.intercept = version_1
+    with pytest.raises(NoResponse, match="asked 1 times"):
+        scope.action("x-pulse")
+    assert sum(request.subject == "x-pulse" for request in lab.requests) == 1
+
+
+def test_timeouts_are_told_in_words(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(NoResponse, match="not finished in time"):
+        scope.scan(REGION, timeout_s=50.0)
+    lab.stop()
+    lab.flag(TIP)
+    with pytest.raises(ControlLost, match="not given in time"), scope.control(timeout_s=5.0):
+        pass
+    assert lab.clock.passed_s < 60.0
+
+
+def test_a_solver_gets_control_and_loses_it_when_it_has_solved(lab: Lab, scope: Scope) -> None:
+    lab.flag(TIP)
+    with scope.control(solving="tip-shape-changed"):
+        scope.action("x-pulse")
+        scope.clear("EP_TIP_SHAPE_CHANGED")
+        with pytest.raises(ControlLost, match="nothing to solve"):
+            scope.action("x-pulse")
+    assert lab.control.holder is None
+    assert not lab.control.problems
+
+
+def test_solving_what_is_not_flagged_is_refused_at_once(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(ControlLost, match="not flagged"), scope.control(solving=TIP):
+        pass
+    assert lab.clock.passed_s < 1.0
+
+
+def test_a_solver_that_waits_is_told_when_another_has_solved_it(lab: Lab, scope: Scope) -> None:
+    from afspm.logic.arbitration import Event
+
+    lab.flag(TIP)
+    lab.does(Event.REQUEST_CONTROL, "other", TIP)
+    lab.at(5.0, lambda: lab.clear(TIP))
+    with pytest.raises(ControlLost, match="nothing to solve"), scope.control(solving=TIP):
+        pass
+    assert lab.clock.passed_s < 6.0
+
+
+def test_an_error_in_the_block_still_gives_control_back(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(ZeroDivisionError), scope.control():
+        _ = 1 / 0
+    assert lab.control.holder is None
+
+
+def test_an_old_control_state_is_not_taken_for_a_loss(lab: Lab, scope: Scope) -> None:
+    """Control was granted; a state published before that arrives only now."""
+    with scope.control():
+        lab.publish(model.ControlState(ControlMode.AUTOMATED, None, ()))
+        assert scope.state is ScopeState.FREE
+        lab.control = lab.control
+    asked = lab.count(ControlRequest.REQUEST_CTRL)
+    assert asked <= 2
+
+
+def test_a_spectrum_is_taken_where_it_was_asked_for(lab: Lab, scope: Scope) -> None:
+    spectrum = scope.spectrum((2e-7, 3e-7), kind="IV")
+    assert spectrum.position_m == (2e-7, 3e-7)
+    assert lab.values["x-spec-kind"] == "IV"
+    assert lab.control.holder is None
+
+
+def test_the_probe_stands_where_it_was_moved_to_when_the_call_returns(lab: Lab, scope: Scope) -> None:
+    scope.move_probe((1e-7, 2e-7))
+    assert scope.probe_position == model.ProbePosition((1e-7, 2e-7))
+    assert scope.state is ScopeState.FREE
+
+
+def test_parameters_have_units_both_ways(lab: Lab, scope: Scope) -> None:
+    assert scope.set("tip-bias-voltage", 250.0, "mV") == pytest.approx(250.0)
+    assert scope.get("tip-bias-voltage", "mV") == pytest.approx(250.0e3)  # the laboratory told V
+    assert scope.set("tip-bias-voltage", "1.5 V") == 1.5
+    assert scope.get("tip-bias-voltage") == 1.5
+
+
+def test_a_unit_of_another_kind_is_refused(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(UnitError):
+        scope.get("tip-bias-voltage", "nm")
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_number_that_is_none_is_not_even_sent(lab: Lab, scope: Scope, value: float) -> None:
+    with pytest.raises(InvalidValue):
+        scope.set("tip-bias-voltage", value)
+    assert not any(request.kind == ControlRequest.PARAM for request in lab.requests)
+
+
+def test_switches_and_words_are_set_too(lab: Lab, scope: Scope) -> None:
+    assert scope.set("x-light", True, "") is True
+    assert lab.values["x-light"] == "true"
+    assert scope.set("x-mode", "tapping", "") == "tapping"
+    assert scope.set("x-count", np.float64(3.0), "") == 3.0
+    assert lab.values["x-count"] == "3.0"
+
+
+def test_reading_needs_no_control(lab: Lab, scope: Scope) -> None:
+    lab.flag(TIP)
+    assert scope.get("tip-bias-voltage") == 0.5
+    assert scope.supports("x-pulse")
+    assert not scope.supports("x-crash")
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 0
+
+
+def test_a_version_1_scheduler_tells_values_only_in_control(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: (
+        Response(ControlResponse.NOT_IN_CONTROL)
+        if request.kind == ControlRequest.PARAM and lab.control.holder != lab.name
+        else "go on"
+    )
+    assert scope.get("tip-bias-voltage") == 0.5
+
+
+def test_feedback_is_known_once_it_is_set(lab: Lab, scope: Scope) -> None:
+    scope.set_feedback(on=False, setpoint=2.0)
+    assert scope.feedback == model.Feedback(on=False, setpoint=2.0)
+
+
+def test_mode_and_problems_are_seen(lab: Lab, scope: Scope) -> None:
+    scope.flag(TIP)
+    scope.set_mode(ControlMode.MANUAL)
+    assert scope.mode is ControlMode.MANUAL
+    assert scope.control_state.problems == (TIP,)
+
+
+def test_the_end_of_the_experiment_ends_every_call(lab: Lab, scope: Scope) -> None:
+    lab.at(30.0, lab.kill)
+    with pytest.raises(ExperimentEnded):
+        scope.scan(REGION)
+    with pytest.raises(ExperimentEnded):
+        scope.get("tip-bias-voltage")
+
+
+def test_a_stop_goes_through_a_script_that_catches_everything(lab: Lab, scope: Scope) -> None:
+    lab.at(30.0, lab.parent_goes)
+    with pytest.raises(StopRequested):
+        try:
+            scope.scan(REGION)
+        except Exception:  # noqa: BLE001
+            pytest.fail("a script would have gone on")
+    assert lab.requests[-1].kind == ControlRequest.RELEASE_CTRL
+
+
+def test_events_are_iterated_over_and_none_is_lost_in_the_body(lab: Lab, scope: Scope) -> None:
+    seen = []
+    lab.at(1.0, lambda: lab.publish_scan(REGION))
+    with scope.events("Scan2d", timeout_s=500.0) as events:
+        for event in events:
+            assert isinstance(event.message, Scan)
+            seen.append((event.message.region, event.message.channel))
+            if len(seen) == 1:
+                scope.scan(OTHER_REGION)
+    assert seen == [(region, channel) for region in (REGION, OTHER_REGION) for channel in ("Height", "Phase")]
+
+
+def test_the_end_of_the_experiment_ends_an_iteration(lab: Lab, scope: Scope) -> None:
+    lab.at(5.0, lab.kill)
+    assert [event.envelope for event in scope.events("Scan2d")] == []
+
+
+def test_waiting_until_something_is_so(lab: Lab, scope: Scope) -> None:
+    lab.at(40.0, lambda: lab.flag(TIP))
+    assert scope.wait_until(lambda: TIP in scope.control_state.problems, timeout_s=100.0)
+    assert 40.0 <= lab.clock.passed_s < 41.0
+    assert not scope.wait_until(lambda: False, timeout_s=5.0)
+
+
+def test_sleeping_passes_the_time_of_the_experiment(lab: Lab, scope: Scope) -> None:
+    scope.sleep(900.0)
+    assert lab.clock.passed_s == pytest.approx(900.0)
+
+
+def test_a_microscope_that_says_nothing_of_itself_can_still_be_asked() -> None:
+    lab = Lab()
+    lab._inbox = lab._inbox[:1]  # connected, and neither states nor the end of the replay: a scheduler of version 1
+    scope = Scope(Link(LabPort(lab), lab.name, source=SOURCE))
+    assert scope.scan(REGION).region == REGION
