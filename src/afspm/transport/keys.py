@@ -16,7 +16,7 @@ from pathlib import Path
 
 import zmq
 
-from afspm.errors import TransportError
+from afspm.errors import ConfigError
 
 _NAME = re.compile(r"[A-Za-z0-9_. +-]{1,100}")
 _ENTRY = re.compile(r'^\s*(public-key|secret-key)\s*=\s*"([^"]{40})"\s*$', re.MULTILINE)
@@ -43,14 +43,14 @@ class Keys:
         """The public key that whoever binds `address` must have."""
         name = self.servers.get(address)
         if name is None:
-            raise TransportError(
+            raise ConfigError(
                 "it is not known whose key to expect at this address", where=address,
                 hint="name its owner in the keys of this process",
             )  # fmt: skip
         for key, owner in self.peers.items():
             if owner == name:
                 return key
-        raise TransportError(
+        raise ConfigError(
             f"there is no public key of {name!r}", where=address, hint=f"afspm keys can make one: {name}.key"
         )
 
@@ -59,13 +59,13 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
     """The keys of the component `name` out of the folder that `generate` made.
 
     Raises:
-        TransportError: no such folder or key, or a file that is no certificate.
+        ConfigError: no such folder or key, or a file that is no certificate.
     """
     folder = Path(folder)
     secret_file = folder / "private" / f"{_checked(name)}.key_secret"
     entries = _read(secret_file, name)
     if "secret-key" not in entries:
-        raise TransportError("there is no secret key in this file", where=str(secret_file))
+        raise ConfigError("there is no secret key in this file", where=str(secret_file))
     public_files = sorted((folder / "public").glob("*.key"))
     peers = {_read(file, name)["public-key"]: file.name.removesuffix(".key") for file in public_files}
     return Keys(name, entries["public-key"], entries["secret-key"], peers, dict(servers or {}))
@@ -102,7 +102,7 @@ def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
 
 def _checked(name: str) -> str:
     if not _NAME.fullmatch(name) or name.startswith("."):
-        raise TransportError(f"{name!r} can't be the name of a key file", hint="letters, digits, - _ + . and spaces")
+        raise ConfigError(f"{name!r} can't be the name of a key file", hint="letters, digits, - _ + . and spaces")
     return name
 
 
@@ -120,10 +120,10 @@ def _read(file: Path, name: str) -> dict[str, bytes]:
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise TransportError(
+        raise ConfigError(
             f"the key can't be read: {error}", where=str(file), hint=f"make it with: afspm keys … {name}"
         ) from error
     entries = {key: value.encode() for key, value in _ENTRY.findall(text)}
     if "public-key" not in entries:
-        raise TransportError("this is not a certificate: it has no public key", where=str(file))
+        raise ConfigError("this is not a certificate: it has no public key", where=str(file))
     return entries

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import zmq
 
-from afspm.errors import TransportError
+from afspm.errors import ConfigError, TransportError
 
 if TYPE_CHECKING:
     from afspm.transport.keys import Keys
@@ -83,7 +83,8 @@ class Network:
         """Bind; returns the address with the port that was found, where `address` asks for any (port 0).
 
         Raises:
-            TransportError: the address is taken or malformed, or would be open to others without keys.
+            TransportError: the address is taken or malformed.
+            ConfigError: it would be open to others, and there are no keys.
         """
         self._guard(address)
         if self.keys is not None:
@@ -100,7 +101,8 @@ class Network:
         """Connect, and again whenever the connection is lost.
 
         Raises:
-            TransportError: the address is malformed, or is another computer's and there are no keys.
+            TransportError: the address is malformed.
+            ConfigError: it is another computer's, and there are no keys.
         """
         self._guard(address)
         if self.keys is not None:
@@ -122,7 +124,7 @@ class Network:
 
     def _guard(self, address: str) -> None:
         if self.keys is None and not self._insecure and not is_local(address):
-            raise TransportError(
+            raise ConfigError(
                 "this address can be reached from other computers, and there are no keys",
                 where=address,
                 hint="make keys with `afspm keys`, or use 127.0.0.1; "

@@ -11,7 +11,7 @@ import pytest
 import zmq
 
 from afspm.clock import ExperimentClock
-from afspm.errors import TransportError
+from afspm.errors import ConfigError, TransportError
 from afspm.transport import keys
 from afspm.transport.network import Network, is_local
 from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, RequestReceived
@@ -38,7 +38,7 @@ def test_addresses_that_are_not_for_this_computer_only_are_refused_without_keys(
     assert not is_local(address)
     network = open_(Network())
     for use in (network.bind, network.connect):
-        with pytest.raises(TransportError, match="no keys") as refused:
+        with pytest.raises(ConfigError, match="no keys") as refused:
             use(network.socket(zmq.PUB), address)
         assert "insecure" in refused.value.hint
 
@@ -74,16 +74,16 @@ def test_generated_keys_are_kept_and_secrets_are_for_the_owner_only(tmp_path: Pa
 
 @pytest.mark.parametrize("name", ["../evil", "", "a/b", ".hidden", "x" * 200])
 def test_a_name_that_is_no_file_name_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(TransportError):
+    with pytest.raises(ConfigError):
         keys.generate(tmp_path, [name])
 
 
 def test_missing_and_broken_keys_are_told_apart(tmp_path: Path) -> None:
-    with pytest.raises(TransportError, match="can't be read"):
+    with pytest.raises(ConfigError, match="can't be read"):
         keys.load(tmp_path, "Nobody")
     keys.generate(tmp_path, ["A"])
     (tmp_path / "private" / "A.key_secret").write_text("nonsense")
-    with pytest.raises(TransportError, match="no public key"):
+    with pytest.raises(ConfigError, match="no public key"):
         keys.load(tmp_path, "A")
 
 
@@ -152,7 +152,7 @@ def test_strangers_are_not_let_in(tmp_path: Path, open_: Any, until: Any, plain:
 def test_an_address_whose_owner_is_not_known_is_refused(tmp_path: Path, open_: Any) -> None:
     keys.generate(tmp_path, ["A", "B"])
     network = open_(Network(keys.load(tmp_path, "A", {"tcp://127.0.0.1:5": "C"})))
-    with pytest.raises(TransportError, match="not known whose key"):
+    with pytest.raises(ConfigError, match="not known whose key"):
         network.connect(network.socket(zmq.SUB), "tcp://127.0.0.1:4")
-    with pytest.raises(TransportError, match="no public key of 'C'"):
+    with pytest.raises(ConfigError, match="no public key of 'C'"):
         network.connect(network.socket(zmq.SUB), "tcp://127.0.0.1:5")

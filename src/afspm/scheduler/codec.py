@@ -1,0 +1,31 @@
+"""The wire, as far as the scheduler's decisions need it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from afspm import wire
+from afspm.errors import AfspmError
+from afspm.model import ControlState, Parameter
+
+
+class WireCodec:
+    """See `logic.events.Codec`."""
+
+    def encode_control_state(self, state: ControlState) -> bytes:
+        return wire.encode(state)[1]
+
+    def encode_action(self, name: str) -> bytes:
+        return wire.encode_subject(name)
+
+    def decode_parameter(self, payload: bytes) -> Parameter | None:
+        try:
+            return wire.decode_parameter(payload)
+        except AfspmError:
+            return None
+
+    def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
+        try:
+            return wire.decode(message, payload)
+        except AfspmError:
+            return None

@@ -1,0 +1,155 @@
+"""The cache on disk, so that a killed scheduler finds it again.
+
+A folder with one file a packet, which follows what is cached: a thread writes what is new and deletes what went, some
+time after it happened. What was not written yet when the scheduler was killed the translator still has, and sends it
+again.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+
+from afspm.clock import Clock
+from afspm.model import Packet
+
+_PERIOD_S = 0.05
+# the thread may take this part of the time at most, so that a flood of large scans is not slowed down by the disk
+_SHARE = 0.1
+_SUFFIX = ".packet"
+
+Entry = tuple[Packet, int | None]
+"""A packet as it was published, and the time that the translator gave it."""
+
+
+class Journal:
+    """Keeps a folder like the cache.
+
+    Args:
+        folder: None: nothing is kept.
+    """
+
+    def __init__(self, folder: Path | None, clock: Clock, log: logging.Logger) -> None:
+        self._folder = folder
+        self._clock = clock
+        self._log = log
+        self._due_s: float | None = None
+        self._not_before_s = 0.0
+        self._wanted: tuple[Entry, ...] | None = None
+        self._written: set[int] = set()
+        self._condition = threading.Condition()
+        self._closing = False
+        self._failing = False
+        self._thread: threading.Thread | None = None
+
+    def load(self) -> list[Entry]:
+        """What was cached, oldest first. Damaged files are told of and deleted."""
+        if self._folder is None or not self._folder.is_dir():
+            return []
+        entries: list[Entry] = []
+        for file in sorted(self._folder.iterdir()):
+            entry = _read(file) if file.suffix == _SUFFIX else None
+            if entry is not None and entry[0].time_ns is not None:
+                entries.append(entry)
+                self._written.add(entry[0].time_ns)
+                continue
+            if file.suffix == _SUFFIX:
+                self._log.warning("deleted a damaged packet of the cache: %s", file)
+            file.unlink(missing_ok=True)
+        return entries
+
+    def changed(self) -> None:
+        """The cache is no longer what it was at the last `follow`. Costs next to nothing."""
+        if self._due_s is None and self._folder is not None:
+            self._due_s = max(self._clock.monotonic_s() + _PERIOD_S, self._not_before_s)
+
+    @property
+    def due_s(self) -> float | None:
+        """When, in real monotonic time, `follow` should be called; None: nothing has changed."""
+        return self._due_s
+
+    def follow(self, cached: Iterable[Entry]) -> None:
+        """Make the folder hold exactly `cached`, in a while and in another thread."""
+        self._due_s = None
+        with self._condition:
+            self._wanted = tuple(cached)
+            self._condition.notify()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Write what is still to be written. Safe to repeat."""
+        with self._condition:
+            self._closing = True
+            self._condition.notify()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                self._condition.wait_for(lambda: self._wanted is not None or self._closing)
+                wanted, self._wanted = self._wanted, None
+            if wanted is None:
+                return
+            began_s = self._clock.monotonic_s()
+            try:
+                self._write(wanted)
+                self._failing = False
+            except OSError as error:
+                if not self._failing:  # once, not with every packet
+                    self._log.critical("the cache is not kept, a restarted scheduler will miss scans: %s", error)
+                self._failing = True
+            now_s = self._clock.monotonic_s()
+            self._not_before_s = now_s + (now_s - began_s) / _SHARE
+
+    def _write(self, wanted: tuple[Entry, ...]) -> None:
+        folder = self._folder
+        if folder is None:
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        times = {packet.time_ns for packet, _ in wanted}
+        for packet, source_ns in wanted:
+            if packet.time_ns is not None and packet.time_ns not in self._written:
+                _store(folder / _name(packet.time_ns), packet, source_ns)
+                self._written.add(packet.time_ns)
+        # after the new ones: a kill in between leaves too much rather than too little
+        for time_ns in self._written - times:
+            (folder / _name(time_ns)).unlink(missing_ok=True)
+            self._written.discard(time_ns)
+
+
+def _name(time_ns: int) -> str:
+    return f"{time_ns:020d}{_SUFFIX}"
+
+
+def _store(file: Path, packet: Packet, source_ns: int | None) -> None:
+    """A line of JSON about the packet, then its payload as it is."""
+    about = {
+        "envelope": packet.envelope,
+        "time_ns": packet.time_ns,
+        "source_ns": source_ns,
+        "bytes": len(packet.payload),
+    }
+    aside = file.with_suffix(".new")
+    with aside.open("wb") as stream:
+        stream.write(json.dumps(about).encode() + b"\n")
+        stream.write(packet.payload)
+    aside.replace(file)
+
+
+def _read(file: Path) -> Entry | None:
+    """None: not what `_store` wrote."""
+    try:
+        line, payload = file.read_bytes().split(b"\n", 1)
+        about = json.loads(line)
+        packet = Packet(str(about["envelope"]), payload, int(about["time_ns"]))
+        source_ns = None if about["source_ns"] is None else int(about["source_ns"])
+        whole = len(payload) == int(about["bytes"]) and file.name == _name(packet.time_ns or 0)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return (packet, source_ns) if whole else None

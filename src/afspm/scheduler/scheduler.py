@@ -1,0 +1,132 @@
+"""The scheduler as the host of processes runs it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, Protocol
+
+from afspm.clock import Clock
+from afspm.errors import FileError
+from afspm.logic.scheduling import SchedulerCore
+from afspm.model import ProblemNames
+from afspm.scheduler.codec import WireCodec
+from afspm.scheduler.journal import Journal
+from afspm.scheduler.settings import scheduler_settings
+from afspm.scheduler.shell import Shell
+from afspm.scheduler.state_file import StateFile
+from afspm.transport.complaints import Complaints
+from afspm.transport.launching import Launched
+from afspm.transport.scheduler_sockets import SchedulerSockets
+
+# The numbers of `runtime.exit_codes`, which is not below us: ended with the experiment, and left by the parent.
+_ENDED, _ORPHAN = 80, 81
+
+
+class SchedulerLaunch(Launched, Protocol):
+    """The part of `runtime.launch.Launch` that is needed here."""
+
+    @property
+    def state_dir(self) -> str: ...
+    @property
+    def request_timeout_s(self) -> float: ...
+
+
+class Activity(Protocol):
+    """The part of `runtime.process.Activity` that is needed here."""
+
+    def step(self) -> AbstractContextManager[None]: ...
+
+
+class SchedulerContext(Protocol):
+    """The part of `runtime.process.Context` that is needed here."""
+
+    @property
+    def launch(self) -> SchedulerLaunch: ...
+    @property
+    def clock(self) -> Clock: ...
+    @property
+    def log(self) -> logging.Logger: ...
+    @property
+    def activity(self) -> Activity: ...
+    @property
+    def problems(self) -> ProblemNames: ...
+    @property
+    def when_stopping(self) -> Callable[[Callable[[], None]], None]: ...
+
+
+class Scheduler:
+    """Lets one component at a time command the microscope, and gives everybody what was published.
+
+    Killed and restarted it goes on where it was: mode, holder and problems are on disk before anybody is told of them,
+    and the cache is a moment later.
+
+    Args:
+        control: the section [control] of the experiment file, durations in s.
+        limits: the section [limits].
+        cache: the section [cache].
+    """
+
+    def __init__(
+        self,
+        control: Mapping[str, Any] | None = None,
+        limits: Mapping[str, Any] | None = None,
+        cache: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._control = control or {}
+        self._limits = limits or {}
+        self._cache = cache or {}
+
+    def run_process(self, context: SchedulerContext) -> int:
+        """Run until the experiment ends or we are told to stop; returns an exit code.
+
+        Raises:
+            AfspmError: an address, a setting or what was saved can't be used.
+        """
+        launch, clock, log = context.launch, context.clock, context.log
+        folder = Path(launch.state_dir) if launch.state_dir else None
+        state = StateFile(folder and folder / f"{launch.name}.json", log)
+        journal = Journal(folder and folder / f"{launch.name}.cache", clock, log)
+        core = self._core(context, state, journal)
+        complaints = Complaints(log, clock)
+        sockets = SchedulerSockets(launch, complaints, since_ns=core.newest_source_ns)
+        stopping = threading.Event()
+
+        def stop() -> None:
+            stopping.set()
+            sockets.wake_up()
+
+        context.when_stopping(stop)
+        shell = Shell(core, sockets, clock, state, journal, complaints, log)
+        try:
+            shell.start()
+            while not (shell.ended or stopping.is_set()):
+                ready = shell.wait()
+                with context.activity.step():
+                    shell.handle(ready)
+        finally:
+            sockets.close()
+            shell.close()
+        return _ENDED if shell.ended else _ORPHAN
+
+    def _core(self, context: SchedulerContext, state: StateFile, journal: Journal) -> SchedulerCore:
+        """The decisions, with what was in force before a restart."""
+        settings = scheduler_settings(
+            self._control, self._limits, self._cache, context.problems, context.launch.request_timeout_s
+        )
+        core = SchedulerCore(settings, WireCodec())
+        saved = state.load()
+        try:
+            if saved:
+                core.restore(saved)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileError(
+                f"what was in force before the restart can't be understood: {error!r}",
+                where=str(state.path),
+                hint="delete the file to begin with nobody in control",
+            ) from error
+        core.restore_cache(journal.load())
+        return core

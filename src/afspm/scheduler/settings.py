@@ -1,0 +1,87 @@
+"""The sections of the experiment file that the scheduler enforces, as the settings of its decisions."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+from afspm.errors import ConfigError
+from afspm.logic.arbitration import Cause, Roles, Rules
+from afspm.logic.envelopes import CacheRule, EnvelopeMapping, Envelopes
+from afspm.logic.limits import Limit, Limits
+from afspm.logic.scheduling import SchedulerSettings
+from afspm.logic.watchdog import WatchdogSettings
+from afspm.model import ProblemNames, Region
+
+Table = Mapping[str, Any]
+
+
+def scheduler_settings(
+    control: Table, limits: Table, cache: Table, problems: ProblemNames, request_timeout_s: float
+) -> SchedulerSettings:
+    """All of them. Raises ConfigError, naming the section."""
+    known = {"lease_s", "grace_s", "stop_scan_on_problem", "stop_scan_on_manual", "retract", "dangerous", "roles"}
+    if unknown := control.keys() - known:
+        raise ConfigError(f"unknown settings {sorted(unknown)}", where="[control]", hint=f"known: {sorted(known)}")
+    try:
+        return SchedulerSettings(
+            rules=Rules(_roles(control.get("roles") or {}), problems),
+            lease_s=control.get("lease_s"),
+            request_timeout_s=request_timeout_s,
+            watchdog=_watchdog(control),
+            limits=_limits(limits),
+            envelopes=_envelopes(cache),
+            grace_s=control.get("grace_s", SchedulerSettings.grace_s),
+        )
+    except (TypeError, ValueError, KeyError) as error:
+        raise ConfigError(f"the scheduler's settings make no sense: {error}") from error
+
+
+def _roles(table: Table) -> Roles:
+    return Roles(
+        table.get("end_experiment"), table.get("set_mode"), table.get("clear_problems"), tuple(table.get("operate", ()))
+    )
+
+
+def _watchdog(control: Table) -> WatchdogSettings:
+    default = WatchdogSettings()
+    spared = set()
+    if not control.get("stop_scan_on_problem", True):
+        spared.add(Cause.PROBLEM)
+    if not control.get("stop_scan_on_manual", True):
+        spared.add(Cause.MANUAL)
+    dangerous = control.get("dangerous")
+    return WatchdogSettings(
+        stop_when=frozenset(default.stop_when) - spared,
+        dangerous=default.dangerous if dangerous is None else frozenset(dangerous),
+        retract=default.retract if control.get("retract", True) else None,
+    )
+
+
+def _limits(table: Table) -> Limits:
+    plain = dict(table)
+    for key in ("parameters", "actions"):
+        plain[key] = {name: Limit(**limit) for name, limit in plain.get(key, {}).items()}
+    if (region := plain.get("region")) is not None:
+        center, size = tuple(region["center_m"]), tuple(region["size_m"])
+        plain["region"] = Region(center, size, region.get("angle_rad", 0.0))
+    return Limits(**plain)
+
+
+def _envelopes(table: Table) -> Envelopes:
+    rules = [CacheRule(**rule) for rule in table.get("rules", ())]
+    name = table.get("mapping")
+    return Envelopes(rules, _mapping(name) if name else None, dict(table.get("history", {})))
+
+
+def _mapping(name: str) -> EnvelopeMapping:
+    """The user's function "module.name"."""
+    module, _, function = name.rpartition(".")
+    try:
+        mapping = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"the mapping {name!r} can't be loaded: {error}", where="[cache] mapping") from error
+    if not callable(mapping):
+        raise ConfigError(f"{name!r} is no function", where="[cache] mapping")
+    return mapping  # type: ignore[no-any-return]
