@@ -14,6 +14,7 @@ TIME_STEP_NS = 1_000
 
 _OVERHEAD_BYTES = 300  # of a kept packet beside its payload, so that a flood of empty ones is bounded too
 _TIMES_REMEMBERED = 4096
+_RECENT = 64
 _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than that is not believed
 
 
@@ -44,6 +45,8 @@ class Cache:
         self._last_ns = 0
         self._sources: OrderedDict[int, None] = OrderedDict()
         self._newest_source_ns = -1
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
+        self._first_times: dict[int, int] = {}
 
     @property
     def last_ns(self) -> int:
@@ -72,9 +75,23 @@ class Cache:
                 return None
             self._saw(source_ns)
         envelope, history = self._envelopes.of(header)
+        first_ns = None if source_ns is None else self._first_times.pop(source_ns, None)
+        if source_ns is not None and first_ns is not None:
+            return self._again(Packet(envelope, packet.payload, first_ns), source_ns, history)
         said = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
         out = Packet(envelope, packet.payload, self._next_ns(source_ns if said and source_ns is not None else now_ns))
+        if source_ns is not None and out.time_ns is not None:
+            self._recent.append((source_ns, out.time_ns))
         return out, self._keep(out, source_ns, history)
+
+    def recent(self) -> list[tuple[int, int]]:
+        """(translator's time, ours) of the packets published last, for a restarted scheduler's `remember`."""
+        return list(self._recent)
+
+    def remember(self, recent: Iterable[tuple[int, int]]) -> None:
+        """These have been published already, before we were killed. Should they come again since they could not be
+        written down any more, they keep their first times, by which subscribers know that they have had them."""
+        self._first_times = {source_ns: first_ns for source_ns, first_ns in recent if source_ns not in self._sources}
 
     def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, bool]:
         """A packet of the scheduler's own, kept under its envelope."""
@@ -107,6 +124,13 @@ class Cache:
             for time_ns, kept in self._kept.items()
             if time_ns > since_ns and kept.packet.envelope.startswith(starts)
         )
+
+    def _again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, bool]:
+        kept = self._keep(packet, source_ns, history)
+        self._kept = dict(sorted(self._kept.items()))
+        for envelope, times in self._times.items():
+            self._times[envelope] = deque(sorted(times))
+        return packet, kept
 
     def __iter__(self) -> Iterator[tuple[Packet, int | None]]:
         return iter([(kept.packet, kept.source_ns) for kept in self._kept.values()])

@@ -83,6 +83,11 @@ class TranslatorDown:
     """The connection to the translator is gone."""
 
 
+@dataclass(frozen=True, slots=True)
+class TranslatorCaughtUp:
+    """All that the translator published while we were not there has been taken in."""
+
+
 @dataclass(slots=True)
 class TranslatorReply:
     """The translator answered the request that was forwarded under `number`."""
@@ -116,6 +121,7 @@ Input = (
     | SubscriberJoined
     | TranslatorUp
     | TranslatorDown
+    | TranslatorCaughtUp
     | TranslatorReply
     | ComponentDied
     | Tick

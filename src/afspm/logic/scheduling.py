@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -29,6 +30,7 @@ from afspm.logic.events import (
     SaveState,
     SubscriberJoined,
     Tick,
+    TranslatorCaughtUp,
     TranslatorDown,
     TranslatorReply,
     TranslatorUp,
@@ -87,6 +89,7 @@ class SchedulerSettings:
         longest_queue: how many requests may wait for the translator.
         takeover_s: see `Sessions`.
         cache_bytes: how much is cached at most.
+        catch_up_s: how long (real) a restarted scheduler waits for the translator to send what it has missed.
     """
 
     rules: Rules = field(default_factory=Rules)
@@ -101,6 +104,7 @@ class SchedulerSettings:
     limits: Limits = field(default_factory=Limits)
     envelopes: Envelopes = field(default_factory=Envelopes)
     cache_bytes: int = 512 * 2**20
+    catch_up_s: float = 2.0
 
 
 class SchedulerCore:
@@ -128,6 +132,8 @@ class SchedulerCore:
         self._lease = Lease(None if settings.lease_s is None else round(settings.lease_s * 1e9))
         self._watchdog = Watchdog(settings.watchdog)
         self._started_s = 0.0
+        self._announce_at_s: float | None = None
+        self._recent: list[tuple[int, int]] = []
         self._probe: Job | None = None
         self._ids_known: bool | None = None
         self._told: set[object] = set()
@@ -142,6 +148,7 @@ class SchedulerCore:
             SubscriberJoined: self._on_subscriber,
             TranslatorUp: self._on_translator_up,
             TranslatorDown: self._on_translator_down,
+            TranslatorCaughtUp: self._on_translator_caught_up,
             ComponentDied: self._on_died,
             Tick: self._on_tick,
         }
@@ -149,13 +156,17 @@ class SchedulerCore:
     # --- life ---
 
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Begin: publishes the control state."""
+        """Begin: publishes the control state, after a restart as soon as the translator's packets are caught up."""
         self._effects = []
         self._started_s = now_s
         self._lease.held_by(self._control.holder, now_ns)
-        self._publish_control(now_ns)
+        self._cache.remember(self._recent)
         if self._control.ended:
             self._effects.append(Kill())
+        elif self._announce_at_s is None:
+            self._publish_control(now_ns)
+        else:  # first, in the order of time, what the translator published while we were dead
+            self._announce_at_s = now_s + self._settings.catch_up_s
         return self._effects
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
@@ -169,10 +180,11 @@ class SchedulerCore:
 
     def deadline_s(self) -> float | None:
         """When, in real monotonic time, a Tick is due at the latest; None: no deadline."""
-        forwarder_s, holder_s = self._forwarder.deadline_s(), self._holder_dead_at_s()
-        if forwarder_s is None or holder_s is None:
-            return holder_s if forwarder_s is None else forwarder_s
-        return min(forwarder_s, holder_s)
+        soonest_s = self._forwarder.deadline_s()
+        for deadline_s in (self._holder_dead_at_s(), self._announce_at_s):
+            if deadline_s is not None and (soonest_s is None or deadline_s < soonest_s):
+                soonest_s = deadline_s
+        return soonest_s
 
     def deadline_ns(self) -> int | None:
         """When, in experiment time, a Tick is due at the latest; None: no deadline (only a lease makes one)."""
@@ -183,6 +195,7 @@ class SchedulerCore:
         return {
             "control": self._control.to_dict(),
             "last_ns": self._cache.last_ns,
+            "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
         }
 
@@ -195,6 +208,8 @@ class SchedulerCore:
         self._control = Control.from_dict(state["control"])
         self._cache.not_before(int(state["last_ns"]))
         self._watchdog.restore(map(str, state["wanted"]))
+        self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
+        self._announce_at_s = math.inf
 
     def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
         """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
@@ -357,6 +372,7 @@ class SchedulerCore:
         return str(flight.request.subject) if flight is not None and flight.request.kind == _ACTION else None
 
     def _publish_control(self, now_ns: int) -> None:
+        self._announce_at_s = None
         payload = self._codec.encode_control_state(self._control.published())
         packet, cached = self._cache.stamp(CONTROL_STATE, payload, now_ns)
         self._effects.append(Publish(packet, None, cached))
@@ -453,6 +469,10 @@ class SchedulerCore:
         for settled in self._forwarder.lost():
             self._settle(settled, now_s, now_ns)
 
+    def _on_translator_caught_up(self, event: TranslatorCaughtUp, now_s: float, now_ns: int) -> None:
+        if self._announce_at_s is not None:
+            self._publish_control(now_ns)
+
     def _send_own(self, now_s: float) -> None:
         while (action := self._watchdog.next_action()) is not None:
             request = Request(_ACTION, action, self._codec.encode_action(action))
@@ -514,6 +534,8 @@ class SchedulerCore:
     def _on_tick(self, event: Tick, now_s: float, now_ns: int) -> None:
         for settled in self._forwarder.expire(now_s):
             self._settle(settled, now_s, now_ns)
+        if self._announce_at_s is not None and now_s >= self._announce_at_s:
+            self._publish_control(now_ns)
         dead_at_s, holder = self._holder_dead_at_s(), self._control.holder
         if holder is not None and dead_at_s is not None and now_s >= dead_at_s:
             self._arbitrate(Ask(Event.DEAD, holder), None, now_s, now_ns)

@@ -11,7 +11,7 @@ from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
 from afspm.model import ControlResponse, Packet, Response
-from afspm.transport.port import PacketReceived
+from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected
 from afspm.transport.translator_link import LinkReply, LinkUp
 from afspm.wire.frames import LONGEST_ID
@@ -115,6 +115,8 @@ class Shell:
 
     def _packets(self) -> None:
         for incoming in self._sockets.subscriber.receive():
+            if isinstance(incoming, CaughtUp):
+                self._take(events.TranslatorCaughtUp())
             if not isinstance(incoming, PacketReceived):
                 continue
             packet = incoming.packet
