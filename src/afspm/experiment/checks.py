@@ -120,10 +120,12 @@ def check_addresses(resolved: Resolved) -> None:
                 slot.place,
                 'make keys with `afspm keys` and set [security] keys = "keys"; or say [security] insecure = true',
             )
+    if not all(wiring.is_address(address) for address in bound):
+        return  # what is no address has been reported as such; whoever looks for it may be right
     for name, links in resolved.net.links.items():
         for target in (links.control, *links.subscribe):
             if target is None or target in resolved.net.slots or not wiring.is_address(target):
-                continue  # what is no address has been reported as such
+                continue
             if not any(wiring.reaches(target, b) for b in bound):
                 resolved.findings.error(
                     f"[{name}] connects to {target}, which nobody binds",

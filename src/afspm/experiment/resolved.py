@@ -75,7 +75,8 @@ class Resolved:
         """Whether the microscope is a simulated one, as its class (a command: its table) says: simulated = True."""
         translators = self.with_role(Role.TRANSLATOR)
         return bool(translators) and all(
-            (part.own.get(SIMULATED) if part.command else getattr(self.classes.get(part.name), SIMULATED, False)) is True
+            (part.own.get(SIMULATED) if part.command else getattr(self.classes.get(part.name), SIMULATED, False))
+            is True
             for part in translators
         )
 

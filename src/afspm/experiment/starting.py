@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from afspm.errors import ConfigError
@@ -25,8 +26,8 @@ def starts(
     """The processes chosen, translator and scheduler first; clock and folders are still to be added."""
     resolved = experiment.resolved
     chosen = _chosen(experiment.component_names, only, without)
-    links = {name: resolved.net.links[name] for name in chosen}
-    _require_addresses(resolved, links, chosen)
+    links = {name: _without_gone(resolved.net.links[name], resolved, set(without)) for name in chosen}
+    _require_addresses(resolved, links, chosen, piecemeal=bool(only))
     addresses = resolved.net.addresses(take_address)
     parts = sorted(
         (part for part in resolved.parts.components if part.name in chosen),
@@ -42,20 +43,30 @@ def _chosen(names: list[str], only: Collection[str], without: Collection[str]) -
     return {name for name in names if (not only or name in only) and name not in without}
 
 
-def _require_addresses(resolved: Resolved, links: Mapping[str, wiring.Links], chosen: set[str]) -> None:
-    """Between a process started here and one started elsewhere the address must be written down."""
+def _without_gone(links: wiring.Links, resolved: Resolved, without: set[str]) -> wiring.Links:
+    """A component left out, of no address that anybody could know, is not there: nobody listens to it."""
+    gone = {
+        key
+        for key, slot in resolved.net.slots.items()
+        if slot.owner in without and slot.address is None and resolved.roles[slot.owner] is Role.COMPONENT
+    }
+    return replace(links, subscribe=tuple(source for source in links.subscribe if source not in gone))
+
+
+def _require_addresses(
+    resolved: Resolved, links: Mapping[str, wiring.Links], chosen: set[str], *, piecemeal: bool
+) -> None:
+    """Between a process started here and one started elsewhere the address must be written down.
+
+    Args:
+        piecemeal: those that are not chosen run elsewhere; else they may just have been left out.
+    """
     missing = set()
-    for name, link in links.items():
-        for key in (link.publish, link.serve, link.control, *link.subscribe):
+    for name, link in resolved.net.links.items() if piecemeal else links.items():
+        for key in (link.control, *links.get(name, link).subscribe):
             slot = resolved.net.slots.get(key or "")
-            if slot is not None and slot.address is None and slot.owner not in chosen:
+            if slot is not None and slot.address is None and (slot.owner in chosen) != (name in chosen):
                 missing.add(f"where [{slot.owner}] is to be reached by [{name}] ({slot.use})")
-    for slot in resolved.net.slots.values():
-        users = {
-            n for n, link in resolved.net.links.items() if f"{slot.owner}/{slot.use}" in (link.control, *link.subscribe)
-        }
-        if slot.address is None and slot.owner in chosen and users - chosen:
-            missing.add(f"where [{slot.owner}] is to be reached by [{min(users - chosen)}] ({slot.use})")
     if missing:
         raise ConfigError(
             "a piecemeal start needs addresses in the file: " + "; ".join(sorted(missing)),

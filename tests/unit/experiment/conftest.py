@@ -75,17 +75,20 @@ class NoComponent:
     pass
 """
 
+PYTHON = json.dumps(sys.executable)
+"""The one program that is on every computer; texts say "python3" for it."""
+
 # commands, so that these tests are about the file and not about what is ready-made
 FRAME = f"""
 [scheduler]
 component = true
 role = "scheduler"
-command = [{json.dumps(sys.executable)}]
+command = [{PYTHON}]
 
 [microscope]
 component = true
 role = "translator"
-command = [{json.dumps(sys.executable)}]
+command = [{PYTHON}]
 simulated = true
 """
 
@@ -99,7 +102,7 @@ def write(tmp_path: Path) -> Write:
 
     def write(text: str, *overlays: str, frame: str = FRAME) -> Experiment:
         files = []
-        for i, content in enumerate([text + frame, *overlays]):
+        for i, content in enumerate([(text + frame).replace('"python3"', PYTHON), *overlays]):
             file = tmp_path / ("night.toml" if i == 0 else f"over{i}.toml")
             file.write_text(content, encoding="utf-8")
             files.append(file)

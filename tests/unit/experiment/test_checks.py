@@ -1,0 +1,188 @@
+"""What must hold between the parts of an experiment, each broken once; and files that break nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from afspm.experiment import Experiment, load
+
+from .conftest import FRAME, Write, errors, line_of, only_error
+
+CLASSIFIER = '[watch]\ncomponent = true\nclass = "parts.Classifier"\n'
+CORRECTOR = '[repair]\ncomponent = true\nclass = "parts.Corrector"\n'
+PEAKS = '[peaks]\ncomponent = true\nclass = "parts.Peaks"\n'
+CHOOSER = '[choose]\ncomponent = true\nclass = "parts.Chooser"\n'
+ANYTHING = '[any]\ncomponent = true\nclass = "parts.Anything"\n'
+REAL = FRAME.replace("simulated = true", "")
+WITHOUT_SCHEDULER = FRAME[FRAME.index("[microscope]") :]
+WITHOUT_TRANSLATOR = FRAME[: FRAME.index("[microscope]")]
+
+
+def test_an_experiment_that_fits_together_has_no_findings(write: Write) -> None:
+    assert write(CLASSIFIER + CORRECTOR + PEAKS + CHOOSER).check() == []
+
+
+BROKEN = {
+    "no scheduler": ("", WITHOUT_SCHEDULER, "there is no scheduler"),
+    "no translator": ("", WITHOUT_TRANSLATOR, "there is no translator"),
+    "two schedulers": ('[second]\ncomponent = true\nrole = "scheduler"\ncommand = ["python3"]\n', FRAME, "a second"),
+    "two translators": (
+        '[second]\ncomponent = true\nclass = "parts.Simulated"\n',
+        FRAME,
+        "a second translator",
+    ),
+    "two of one name": (CORRECTOR + CORRECTOR, FRAME, "[repair] is there twice"),
+    "two of nearly one name": (CORRECTOR + CORRECTOR.replace("repair", "Repair"), FRAME, "the same name"),
+    "not TOML": ("a = = 3\n", FRAME, "not valid TOML"),
+    "an unknown section": ("[limts]\nmost_pixels = 3\n", FRAME, "no section [limts]"),
+    "an unknown key of a section": ("[clock]\nsped = 2\n", FRAME, "[clock] sped is not a setting"),
+    "an unknown role": ('[a]\ncomponent = true\nrole = "shceduler"\ncommand = ["python3"]\n', FRAME, "no role"),
+    "class and command": ('[a]\ncomponent = true\nclass = "x.Y"\ncommand = ["python3"]\n', FRAME, "both `class` and"),
+    "nothing to run": ("[a]\ncomponent = true\n", FRAME, "neither `class` nor `command`"),
+    "not a boolean": ('[a]\ncomponent = "yes"\nclass = "parts.Corrector"\n', FRAME, "not true or false"),
+    "no such program": ('[a]\ncomponent = true\ncommand = ["no-such-program"]\n', FRAME, "there is no program"),
+    "nobody solves": (CLASSIFIER, FRAME, "which nobody solves"),
+    "no such problem": (
+        '[a]\ncomponent = true\ncommand = ["python3"]\nsolves = ["tip-shape-chnged"]\n',
+        FRAME,
+        "is no problem",
+    ),
+    "a problem's number is taken": ("[problems]\ntip-lost = 4\n", FRAME, "can't have the number 4"),
+    "a problem's number is no number": ('[problems]\ntip-lost = "six"\n', FRAME, "not a whole number"),
+    "nobody publishes": (ANYTHING + 'envelopes = ["Scn2d"]\n', FRAME, "'Scn2d', which nobody publishes"),
+    "nobody publishes what a class listens to": (CHOOSER, FRAME, "'PeakList', which nobody publishes"),
+    "two binds of one address": (
+        PEAKS + 'publisher = "tcp://127.0.0.1:9000"\n' + PEAKS.replace("peaks", "more")
+        + 'publisher = "tcp://127.0.0.1:9000"\n',
+        FRAME,
+        "both bind tcp://127.0.0.1:9000",
+    ),
+    "two binds, one by a wildcard": (
+        PEAKS + 'publisher = "tcp://127.0.0.1:9000"\n' + PEAKS.replace("peaks", "more")
+        + 'publisher = "tcp://*:9000"\n[security]\ninsecure = true\n',
+        FRAME,
+        "both bind",
+    ),
+    "open to the network": (PEAKS + 'publisher = "tcp://192.168.1.5:9000"\n', FRAME, "without keys"),
+    "nobody binds": (ANYTHING + 'subscriber = "tcp://127.0.0.1:9009"\n', FRAME, "which nobody binds"),
+    "not an address": (
+        ANYTHING + 'subscriber = "s"\n[s]\nclass = "Subscriber"\nsub_url = "localhost:3"\n', FRAME, "is not an address"
+    ),
+    "an unknown setting of an intermediary": (
+        ANYTHING + 'control_client = "c"\n[c]\nclass = "Client"\nretries = 3\n', FRAME, "no setting 'retries'"
+    ),
+    "a wire of the wrong kind": (
+        ANYTHING + 'subscriber = "c"\n[c]\nclass = "Client"\n', FRAME, "is a control client, not a subscriber"
+    ),
+    "a misspelt intermediary": (
+        ANYTHING + 'subscriber = "subb"\n', FRAME, "neither an address nor one of the tables"
+    ),
+    "to itself by its address": (
+        PEAKS + 'publisher = "tcp://127.0.0.1:9000"\nsubscriber = "tcp://127.0.0.1:9000"\n', FRAME, "to itself"
+    ),
+    "to itself by its name": (PEAKS + 'listens_to = ["peaks"]\n', FRAME, "subscribes to itself"),
+    "to somebody unknown": (ANYTHING + 'listens_to = ["peak"]\n' + PEAKS, FRAME, "no component 'peak'"),
+    "to somebody silent": (ANYTHING + 'listens_to = ["repair"]\n' + CORRECTOR, FRAME, "publishes nothing"),
+    "time made faster": ("[clock]\nspeed = 60\n", REAL, "not simulated"),
+    "time set": ("[clock]\nstart = 2026-01-01T00:00:00Z\n", REAL, "[clock] start"),
+    "an unknown person": ('[control.roles]\nset_mode = ["nobdy"]\n', FRAME, "there is no 'nobdy'"),
+    "no such folder of keys": ('[security]\nkeys = "keys"\n', FRAME, "there is no folder"),
+    "a lease of no time": ('[control]\nlease = "0 s"\n', FRAME, "[control] lease"),
+    "a rule of the cache that fits nothing": (
+        '[[cache.rules]]\nabove = "2 um"\nup_to = "1 um"\n', FRAME, "no width is above"
+    ),
+    "a mapping that is not there": ('[cache]\nmapping = "parts.no_such"\n', FRAME, "[cache] mapping"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BROKEN, ids=str)
+def test_what_does_not_fit_is_an_error(write: Write, case: str) -> None:
+    text, frame, said = BROKEN[case]
+    assert said in only_error(write(text, frame=frame)).what
+
+
+def test_an_error_names_the_line_and_the_nearest_name(write: Write) -> None:
+    experiment = write(ANYTHING + 'envelopes = [\n  "Scan2d",\n  "ScopeStatMsg",\n]\n')
+    error = only_error(experiment)
+    assert error.place.line == line_of(experiment, '  "ScopeStat')
+    assert "'ScopeStateMsg'" in error.hint
+
+
+def test_a_scan_s_envelope_may_be_given_whole(write: Write) -> None:
+    assert not errors(write(ANYTHING + 'envelopes = ["Scan2d_2000.0_Height", "Spec1d_IV", "Control"]\n'))
+
+
+def test_an_envelope_that_a_rule_of_the_cache_makes_is_published(write: Write) -> None:
+    rule = '[[cache.rules]]\nmessage = "Scan2d"\nabove = "1 um"\nenvelope = "wide_{channel}"\n'
+    assert not errors(write(ANYTHING + 'envelopes = ["wide_Height"]\n' + rule))
+    assert errors(write(ANYTHING + 'envelopes = ["wdie_Height"]\n' + rule))
+
+
+def test_a_problem_that_a_person_solves_may_be_flagged(write: Write) -> None:
+    assert not errors(write(CLASSIFIER + '[control]\nsolved_by_hand = ["EP_TIP_SHAPE_CHANGED"]\n'))
+
+
+def test_a_problem_named_in_the_file_is_one(write: Write) -> None:
+    text = '[a]\ncomponent = true\ncommand = ["python3"]\nsolves = ["tip lost"]\n[problems]\ntip-lost = 10\n'
+    experiment = write(text)
+    assert not errors(experiment)
+    assert experiment.resolved.named_problems == {"tip-lost": 10}
+
+
+def test_all_insecure_must_be_said_aloud(write: Write) -> None:
+    assert not errors(write(PEAKS + 'publisher = "tcp://*:9000"\n[security]\ninsecure = true\n'))
+
+
+def test_roles_without_keys_are_a_warning(write: Write) -> None:
+    experiment = write(CORRECTOR + '[control.roles]\nend_experiment = ["repair"]\n')
+    assert not errors(experiment)
+    assert any("without keys" in f.what for f in experiment.check())
+
+
+def test_a_text_that_is_nearly_a_variable_is_a_warning(write: Write) -> None:
+    experiment = write('channel_id = "Height"\n' + ANYTHING + 'channel = "chanel_id"\n')
+    assert not errors(experiment)
+    (warning,) = [f for f in experiment.check() if "nearly" in f.what]
+    assert "'channel_id'" in warning.hint
+    assert warning.place.line == line_of(experiment, "channel =")
+
+
+def test_an_intermediary_that_nobody_uses_is_a_warning(write: Write) -> None:
+    experiment = write('[sub]\nclass = "Subscriber"\n')
+    assert not errors(experiment)
+    assert any("nothing refers to [sub]" in f.what for f in experiment.check())
+
+
+def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+    error = only_error(load(tmp_path / "none.toml"))
+    assert "can't be read" in error.what
+
+
+def test_a_file_that_is_no_text_is_an_error(tmp_path: Path) -> None:
+    file = tmp_path / "night.toml"
+    file.write_bytes(b"\xff\xfe\x00")
+    assert "not UTF-8" in only_error(load(file)).what
+
+
+def test_a_byte_order_mark_does_not_matter(tmp_path: Path, write: Write) -> None:
+    experiment = write(CORRECTOR)
+    file = experiment.folder / "night.toml"
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert not errors(load(file))
+
+
+def test_what_is_expanded_checks_like_the_file_itself(write: Write) -> None:
+    experiment = write('where = ["1 um", "1 um"]\n[scan]\ncomponent = true\nclass = "parts.Scanner"\nsize = "where"\n'
+        + PEAKS + 'listens_to = []\n[limits]\nmost_pixels = 1000\n')  # fmt: skip
+    again = _reload(experiment)
+    assert not errors(again)
+    assert again.resolved.settings == experiment.resolved.settings
+    assert again.resolved.limits.most_pixels == 1000
+
+
+def _reload(experiment: Experiment) -> Experiment:
+    file = experiment.folder / "expanded.toml"
+    file.write_text(experiment.expanded(), encoding="utf-8")
+    return load(file)

@@ -1,0 +1,70 @@
+"""The commands that read an experiment file."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from afspm.cli.app import app
+
+from .conftest import Write
+
+CORRECTOR = '[repair]\ncomponent = true\nclass = "parts.Corrector"\n'
+
+
+@pytest.fixture
+def runner(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> CliRunner:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    return CliRunner()
+
+
+def test_check_of_a_good_file_ends_with_0(write: Write, runner: CliRunner) -> None:
+    write(CORRECTOR)
+    result = runner.invoke(app, ["check", "night.toml"])
+    assert result.exit_code == 0
+    assert "night: 3 processes, nothing wrong" in result.output
+
+
+def test_check_tells_every_error_with_file_and_line_and_ends_with_1(write: Write, runner: CliRunner) -> None:
+    write("[clock]\nsped = 2\n" + CORRECTOR + 'volage = "3 V"\nvoltage = "2 nm"\n')
+    result = runner.invoke(app, ["check", "night.toml"])
+    assert result.exit_code == 1
+    assert "night.toml:2: error: [clock] sped is not a setting\n    did you mean 'speed'?" in result.output
+    assert "night.toml:6: error: [repair] has no setting 'volage'" in result.output
+    assert "night.toml:7: error: [repair] voltage = '2 nm'" in result.output
+    assert "3 errors" in result.output
+
+
+def test_check_lays_files_over_each_other(write: Write, runner: CliRunner) -> None:
+    write(CORRECTOR, '[repair]\nvoltage = "2 nm"\n')
+    result = runner.invoke(app, ["check", "night.toml", "over1.toml"])
+    assert "over1.toml:2: error" in result.output
+
+
+def test_check_prints_what_the_file_expands_to(write: Write, runner: CliRunner) -> None:
+    write('volts = "2 V"\n' + CORRECTOR + 'voltage = "volts"\n')
+    result = runner.invoke(app, ["check", "night.toml", "--expanded"])
+    assert tomllib.loads(result.stdout)["repair"]["voltage"] == "2 V"
+
+
+def test_graph_writes_an_svg(write: Write, runner: CliRunner, tmp_path: Path) -> None:
+    write(CORRECTOR)
+    assert runner.invoke(app, ["graph", "night.toml", "-o", "out.svg"]).exit_code == 0
+    assert (tmp_path / "out.svg").read_text(encoding="utf-8").startswith("<svg")
+
+
+def test_keys_makes_a_pair_for_each_process_and_person_and_leaves_old_ones(
+    write: Write, runner: CliRunner, tmp_path: Path
+) -> None:
+    write(CORRECTOR)
+    assert runner.invoke(app, ["keys", "night.toml", "--also", "ana"]).exit_code == 0
+    public = {file.stem for file in (tmp_path / "keys" / "public").iterdir()}
+    assert public == {"repair", "scheduler", "microscope", "ana"}
+    before = (tmp_path / "keys" / "public" / "ana.key").read_text()
+    result = runner.invoke(app, ["keys", "night.toml", "--also", "ana"])
+    assert "there already" in result.output
+    assert (tmp_path / "keys" / "public" / "ana.key").read_text() == before
