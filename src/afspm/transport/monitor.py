@@ -13,16 +13,12 @@ from afspm.transport.frames import readable
 CONNECTED = int(zmq.EVENT_HANDSHAKE_SUCCEEDED)
 DISCONNECTED = int(zmq.EVENT_DISCONNECTED)
 ACCEPTED = int(zmq.EVENT_ACCEPTED)
-REFUSED = int(
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH
-)
-
 _HEADER = struct.Struct("=hi")
 _numbers = itertools.count()
 
 
 class ConnectionEvent(NamedTuple):
-    """`kind` is one of the constants above; `value` the descriptor of the connection, or an error number."""
+    """`kind` is one of the constants above; `value` the connection's descriptor if it was ACCEPTED or DISCONNECTED."""
 
     kind: int
     value: int

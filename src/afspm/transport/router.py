@@ -9,7 +9,7 @@ import zmq
 
 from afspm.transport.complaints import Complaints
 from afspm.transport.frames import readable, receive, user_of
-from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
+from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
 
 _BATCH = 256
@@ -66,7 +66,7 @@ class Router:
         self._identities: dict[int, bytes] = {}
         self.socket = network.socket(zmq.ROUTER)
         self.socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
-        self.monitor = Monitor(self.socket, CONNECTED | DISCONNECTED)
+        self.monitor = Monitor(self.socket, ACCEPTED | DISCONNECTED)
         self.address = network.bind(self.socket, address)
 
     def receive(self) -> list[RouterEvent]:
@@ -114,7 +114,7 @@ class Router:
             gone = self._by_descriptor.pop(descriptor, None)
             if gone is not None:
                 changes.append((descriptor, gone, False))
-            if kind == CONNECTED:
+            if kind == ACCEPTED:
                 self._connections += 1
                 peer = self._by_descriptor[descriptor] = _Peer(self._connections)
                 changes.append((descriptor, peer, True))
