@@ -122,6 +122,7 @@ class Microscope(ABC):
     Attributes:
         clock, log: of the experiment; given before `connect`.
         run_dir: the folder of this run.
+        wake: call it, from any thread, to have the controller looked at now rather than at the next poll.
         memory: a dict of JSON values, kept on disk: saved with every request and result, there after a restart.
     """
 
@@ -135,6 +136,7 @@ class Microscope(ABC):
     clock: Clock
     log: logging.Logger
     run_dir: Path
+    wake: Callable[[], None]
     memory: dict[str, Any]
 
     def __init__(

@@ -9,13 +9,13 @@ from __future__ import annotations
 import difflib
 import math
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
 from afspm import units
-from afspm.errors import ConfigError, Refused, UnitError
+from afspm.errors import AfspmError, ConfigError, Refused, UnitError
 from afspm.model import ControlResponse, names
 
 Value = bool | int | float | str
@@ -226,6 +226,10 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             table[name] = _row(known, given, where)
         return ParameterTable(table)
 
+    def without(self, names_: Collection[str]) -> ParameterTable:
+        """This table less some rows."""
+        return ParameterTable({name: row for name, row in self._rows.items() if name not in names_})
+
     def find(self, name: str) -> ParameterSpec:
         """A parameter by the name that a peer gave.
 
@@ -238,6 +242,26 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             reason = f"this microscope has no parameter {name[:100]!r}{hint}"
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, reason)
         return self._rows[name]
+
+    def written(self, given: Mapping[str, Any], *, where: str) -> dict[str, Value]:
+        """Values as the experiment file has them, in SI: "2 um/s", or plain numbers in the row's unit.
+
+        Raises:
+            ConfigError: a name or a value can't be.
+        """
+        values: dict[str, Value] = {}
+        try:
+            for name, value in given.items():
+                spec = self.find(name)
+                if isinstance(value, str) and spec.type in ("float", "int"):
+                    number, unit = units.parse_quantity(value)
+                    value = spec.from_unit(number, unit or spec.unit)
+                elif not isinstance(value, bool | str):
+                    value = spec.from_unit(value, spec.unit)
+                values[name] = spec.checked(value)
+        except (AfspmError, TypeError) as error:
+            raise ConfigError(str(error), where=where) from error
+        return values
 
     def __getitem__(self, name: str) -> ParameterSpec:
         return self._rows[name]

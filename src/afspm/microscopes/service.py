@@ -9,14 +9,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from afspm.errors import AfspmError, ConfigError, Refused
+from afspm.errors import ConfigError, Refused
 from afspm.microscopes.changes import asked_for, wanted_values
 from afspm.microscopes.in_force import FRAME, MOVES, check_together, of_message
 from afspm.microscopes.microscope import LOST, Action, Microscope
 from afspm.microscopes.parameters import Value, refuse_value
 from afspm.microscopes.sequence import Sequence, Step
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState
-from afspm.units import parse_quantity
 from afspm.wire import encode
 
 _ANNOUNCED = {
@@ -171,28 +170,13 @@ class Service:
             if isinstance(what, Mapping) and set(what) == {"command"}:
                 added[name] = Action(name, _bound(self._microscope.command, str(what["command"])))
             elif isinstance(what, Mapping) and set(what) == {"set"} and isinstance(what["set"], Mapping):
-                values = self._values_from_file(what["set"], where)
+                values = self._table.written(what["set"], where=where)
                 moves = ScopeState.MOVING if MOVES & values.keys() else None
                 added[name] = Action(name, _bound(self._apply, values, _already_said), moves)
             else:
                 hint = '{ set = { "<parameter>" = <value> } } or { command = "<text>" }'
                 raise ConfigError(f"{what!r} is not an action", where=where, hint=hint)
         return added
-
-    def _values_from_file(self, given: Mapping[str, Any], where: str) -> dict[str, Value]:
-        values: dict[str, Value] = {}
-        try:
-            for name, value in given.items():
-                spec = self._table.find(name)
-                if isinstance(value, str) and spec.type in ("float", "int"):
-                    number, unit = parse_quantity(value)
-                    value = spec.from_unit(number, unit or spec.unit)
-                elif not isinstance(value, bool | str):
-                    value = spec.from_unit(value, spec.unit)
-                values[name] = spec.checked(value)
-        except AfspmError as error:
-            raise ConfigError(str(error), where=where) from error
-        return values
 
 
 def _bound(function: Callable[..., None], *arguments: Any) -> Callable[[], None]:

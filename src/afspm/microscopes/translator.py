@@ -52,6 +52,7 @@ class Translator:
         self._log = log
         self._clock: Clock = port.clock
         microscope.clock, microscope.log, microscope.run_dir = port.clock, log, run_dir
+        microscope.wake = port.wake_up
         microscope.memory = memory.setdefault("microscope", {})
         self._kept: dict[str, Any] = memory.setdefault("translator", {"said": 0, "ledger": {}, "outbox": {}})
         said = ScopeStatus(ScopeState(self._kept["said"]))

@@ -1,0 +1,282 @@
+"""A simulated microscope: the physics of `afspm.simulation` behind a controller with all the base actions.
+
+It runs on the experiment clock, so that a night passes in a minute, and keeps its state over a kill: it is the same
+instrument afterwards, with the same tip, and what it was measuring has gone on meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from afspm.errors import ConfigError, Refused
+from afspm.microscopes.microscope import Action, Microscope, action
+from afspm.microscopes.parameters import FEEDBACK_ON, Value
+from afspm.microscopes.simulator import files
+from afspm.microscopes.simulator.faults import Fault, Faults
+from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
+from afspm.microscopes.simulator.truth import Truth
+from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.simulation import World
+from afspm.units import Duration
+
+if TYPE_CHECKING:
+    from afspm.runtime.process import Context
+
+_FAULT = "x-fault"
+_FAULT_PARAMETERS = ("x-fault-kind", "x-fault-count", "x-fault-duration")
+_AT_FIRST: dict[str, Any] = {
+    names.SCAN_TOP_LEFT_X: "-0.5 um",
+    names.SCAN_TOP_LEFT_Y: "-0.5 um",
+    names.SCAN_SIZE_X: "1 um",
+    names.SCAN_SIZE_Y: "1 um",
+    names.SCAN_ANGLE: 0.0,
+    names.SCAN_RESOLUTION_X: 128,
+    names.SCAN_RESOLUTION_Y: 128,
+    names.SCAN_SPEED: "2 um/s",
+    names.MOVE_SPEED: "5 um/s",
+    names.PROBE_POS_X: 0.0,
+    names.PROBE_POS_Y: 0.0,
+    names.SAMPLE_SLOPE_X: 0.0,
+    names.SAMPLE_SLOPE_Y: 0.0,
+    names.TIP_BIAS_VOLTAGE: "100 mV",
+    names.SPEC_KIND: "IV",
+    names.PULSE_VOLTAGE: "4 V",
+    names.PULSE_DURATION: "100 ms",
+    names.CRASH_SPEED: "50 nm/s",
+    names.CRASH_DEPTH: "5 nm",
+    "x-engaged": True,
+    "x-fault-kind": "slow",
+    "x-fault-count": 1,
+    "x-fault-duration": 1.0,
+}
+
+
+class Simulator(Microscope):
+    """The simulated microscope.
+
+    Args:
+        seed: everything that is left to chance follows from it.
+        surface, tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force: of the simulated world, see
+            `afspm.simulation.World`.
+        initial: values of parameters at the start, by their generic names.
+        approach_s: how long engaging and retracting take.
+        faults: what goes wrong when, each a table of `kind`, `at_s`, `count`, `duration_s` (see `Fault`).
+        fault_action: whether the action "x-fault" makes faults on demand.
+        panel: what a person does at the controller itself, each a table of `at_s` with `set` or `action`.
+        parameters, actions, poll_period_s, result_timeout_s: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    max_pixels: ClassVar[int] = 2048 * 2048
+    memory_is_all: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        *,
+        seed: int = 1,
+        surface: str | dict[str, Any] = "steps",
+        tip: dict[str, Any] | None = None,
+        tip_changes: dict[str, Any] | None = None,
+        drift: dict[str, Any] | None = None,
+        feedback: dict[str, Any] | None = None,
+        scanner: dict[str, Any] | None = None,
+        noise: dict[str, Any] | None = None,
+        signals: dict[str, Any] | None = None,
+        iv: dict[str, Any] | None = None,
+        force: dict[str, Any] | None = None,
+        initial: dict[str, Any] | None = None,
+        approach_s: Duration = 1.0,
+        faults: list[dict[str, Any]] | None = None,
+        fault_action: bool = False,
+        panel: list[dict[str, Any]] | None = None,
+        parameters: dict[str, dict[str, Any]] | None = None,
+        actions: dict[str, dict[str, Any]] | None = None,
+        poll_period_s: Duration = 0.25,
+        result_timeout_s: Duration = 10.0,
+    ) -> None:
+        world: dict[str, Any] = {
+            "surface": surface,
+            "tip": tip,
+            "tip_changes": tip_changes,
+            "drift": drift,
+            "feedback": feedback,
+            "scanner": scanner,
+            "noise": noise,
+            "signals": signals,
+            "iv": iv,
+            "force": force,
+        }
+        self._world_settings = {name: settings for name, settings in world.items() if settings is not None}
+        self._seed = seed
+        loop = World.from_settings(self._world_settings, seed, 0.0).settings.feedback
+        super().__init__(
+            parameters=_merged(_rows_for(loop.mode), parameters or {}),
+            actions=actions,
+            poll_period_s=poll_period_s,
+            result_timeout_s=result_timeout_s,
+        )
+        if not fault_action:
+            self.table = self.table.without(_FAULT_PARAMETERS)
+        self._fault_action = fault_action
+        in_force = {
+            FEEDBACK_ON: loop.on,
+            names.ZCTRL_PGAIN: loop.proportional_gain,
+            names.ZCTRL_IGAIN: loop.integral_gain,
+            names.ZCTRL_SETPOINT: loop.setpoint,
+        }
+        at_first = {name: value for name, value in {**_AT_FIRST, **in_force}.items() if name in self.table}
+        self._initial = self.table.written({**at_first, **(initial or {})}, where="initial")
+        self._faults_settings = [_made(Fault, fault, "faults") for fault in faults or []]
+        self._panel = [_made(PanelEvent, event, "panel") for event in panel or []]
+        for event in self._panel:
+            self.table.written(event.set or {}, where="panel")
+            if event.action and event.action not in self.own_actions():
+                raise ConfigError(f"there is no action {event.action!r}", where="panel")
+        self._approach_s = approach_s
+
+    def connect(self) -> None:
+        """Switch the instrument on, or find it as it was."""
+        kept = self.memory
+        if "start_s" not in kept:
+            values = {name: self.table[name].to_vendor(value) for name, value in self._initial.items()}
+            kept.update(start_s=self.clock.now_s(), values=values, doing=None, results=[], scans=0, spectra=0, panel=0)
+            kept["faults"] = {}
+        world = World.from_settings(self._world_settings, self._seed, kept["start_s"])
+        self.faults = Faults(self._faults_settings, kept["faults"], kept["start_s"])
+        truth = Truth(self.run_dir / "truth.jsonl", kept)
+        self._instrument = Instrument(
+            world,
+            self.table,
+            kept,
+            (self.run_dir / "scans").resolve(),
+            faults=self.faults,
+            truth=truth,
+            log=self.log,
+            panel=self._panel,
+            approach_s=self._approach_s,
+            wake=self.wake,
+        )
+        if "world" not in kept:
+            kept["world"] = world.state()
+            truth.note(kept["start_s"], "start", {"settings": self._world_settings, "seed": self._seed})
+
+    def status(self) -> ScopeStatus:
+        """What the instrument is doing now."""
+        return ScopeStatus(self._instrument.state(self.clock.now_s()))
+
+    def next_change_s(self) -> float | None:
+        """When the instrument will do something by itself."""
+        return self._instrument.next_change_s()
+
+    def get(self, vendor: str) -> Value:
+        """The value in force; every parameter has its generic name here."""
+        if vendor not in self.memory["values"]:
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"the simulated controller has no {vendor!r}")
+        value: Value = self.memory["values"][vendor]
+        return value
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        """Set values; the frame and the probe are moved at the move speed."""
+        for vendor in values:
+            self.get(vendor)
+        if not set(values) <= set(_FAULT_PARAMETERS):
+            self.faults.maybe_refuse()
+        self._instrument.set(dict(values), self.clock.now_s())
+
+    def results(self) -> Sequence[str]:
+        """The last saved files."""
+        return self._instrument.results()
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        """Read a saved file."""
+        return files.load(Path(result))
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame."""
+        self.faults.maybe_refuse()
+        self._instrument.start_scan(self.clock.now_s())
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        """Break the scan off."""
+        self.faults.maybe_refuse()
+        self._instrument.stop(self.clock.now_s())
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a spectrum of the kind `x-spec-kind` where the probe is."""
+        self.faults.maybe_refuse()
+        self._instrument.start_spectrum(self.clock.now_s())
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        """Break the spectrum off."""
+        self.faults.maybe_refuse()
+        self._instrument.stop(self.clock.now_s())
+
+    @action(names.PULSE, state=ScopeState.BUSY_PARAM)
+    def pulse(self) -> None:
+        """A bias pulse of `x-pulse-voltage` for `x-pulse-duration`."""
+        self.faults.maybe_refuse()
+        self._instrument.pulse(self.clock.now_s())
+
+    @action(names.CRASH, state=ScopeState.MOVING)
+    def crash(self) -> None:
+        """Drive the tip `x-crash-depth` into the sample at `x-crash-speed`, where the probe is."""
+        self.faults.maybe_refuse()
+        self._instrument.crash(self.clock.now_s())
+
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        """Take the tip away."""
+        self._instrument.retract(self.clock.now_s())
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """Bring the tip to the sample."""
+        self.faults.maybe_refuse()
+        self._instrument.engage(self.clock.now_s())
+
+    @action(_FAULT, while_busy=True)
+    def fault(self) -> None:
+        """Make the fault that the parameters "x-fault-…" describe."""
+        kind, count, duration_s = (self.memory["values"][name] for name in _FAULT_PARAMETERS)
+        self.faults.demand(Fault(str(kind), 0.0, int(count), float(duration_s)))
+
+    def own_actions(self) -> dict[str, Action]:
+        """Without "x-fault" unless it is wanted."""
+        found = super().own_actions()
+        return found if self._fault_action else {name: a for name, a in found.items() if name != _FAULT}
+
+    def run_process(self, context: Context) -> int:
+        """Be the translator, with the faults that are not the controller's."""
+        from afspm.microscopes.simulator.faulty import FaultyTranslator
+        from afspm.microscopes.translator import run_translator
+
+        return run_translator(self, context, FaultyTranslator)
+
+
+def _rows_for(mode: str) -> dict[str, dict[str, Any]]:
+    """What depends on the operating mode: tapping has an amplitude as its setpoint, tunnelling a current."""
+    setpoint = (
+        {"unit": "A", "range": ["1 pA", "100 nA"]} if mode == "current" else {"unit": "V", "range": ["1 mV", "10 V"]}
+    )
+    return {names.ZCTRL_SETPOINT: setpoint, names.SPEC_KIND: {"choices": ["IV", "force"]}}
+
+
+def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    merged: dict[str, dict[str, Any]] = {}
+    for table in tables:
+        for name, row in table.items():
+            merged[name] = {**merged.get(name, {}), **row}
+    return merged
+
+
+def _made(kind: Any, table: Mapping[str, Any], where: str) -> Any:
+    try:
+        return kind(**table)
+    except TypeError as error:
+        raise ConfigError(f"{dict(table)} can't be: {error}", where=where) from error

@@ -1,0 +1,365 @@
+"""The simulated controller with its hardware: what it is doing, from when to when, and what comes of it.
+
+Everything is a function of experiment time. What is going on is written down as "this, with these values, from then
+to then": whoever reads it later, a restarted process too, finds it still running or finished, as with a controller
+that has a life of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+from typing import Any, Final
+
+from afspm.errors import AfspmError, FileError, Refused
+from afspm.microscopes.in_force import feedback, frame
+from afspm.microscopes.parameters import ParameterTable, Value
+from afspm.microscopes.simulator.faults import Faults
+from afspm.microscopes.simulator.files import Measured, encode_scan, encode_spectrum
+from afspm.microscopes.simulator.truth import Truth
+from afspm.model import ControlResponse, ScopeState, Spectrum, names
+from afspm.runtime.memory import write_whole
+from afspm.simulation import SimulatedScan, World
+
+LISTED_RESULTS = 16
+
+_STATES: Final = {
+    "scan": ScopeState.SCANNING,
+    "spectrum": ScopeState.SPEC,
+    "move": ScopeState.MOVING,
+    "crash": ScopeState.MOVING,
+    "pulse": ScopeState.BUSY_PARAM,
+    "approach": ScopeState.COARSE_MOTOR,
+}
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class PanelEvent:
+    """What a person does at the controller's own panel, which nobody asked the translator for.
+
+    Attributes:
+        at_s: experiment seconds after the start.
+        set: values as in the experiment file.
+        action: one of the instrument's own actions.
+    """
+
+    at_s: float
+    set: dict[str, Any] | None = None
+    action: str = ""
+
+
+class Instrument:
+    """The simulated hardware.
+
+    Args:
+        kept: everything that lasts, JSON-able. It is brought up to date by every call.
+        folder: for the files that it saves.
+        panel: what a person does at it, in any order.
+        approach_s: how long engaging and retracting take.
+        wake: called, from any thread, when `state` has something new to say earlier than `next_change_s`.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        table: ParameterTable,
+        kept: dict[str, Any],
+        folder: Path,
+        *,
+        faults: Faults,
+        truth: Truth,
+        log: logging.Logger,
+        panel: list[PanelEvent],
+        approach_s: float,
+        wake: Callable[[], None],
+    ) -> None:
+        self._world = world
+        self._table = table
+        self._kept = kept
+        self._folder = folder
+        self._faults = faults
+        self._truth = truth
+        self._log = log
+        self._panel = sorted(panel, key=lambda event: event.at_s)
+        self._approach_s = approach_s
+        self._wake = wake
+        self._scan: Future[SimulatedScan] | None = None
+        if "world" in kept:
+            world.restore(kept["world"])
+        if kept["doing"] is not None and kept["doing"]["what"] == "scan":
+            self._scan = self._drawn_meanwhile(kept["doing"])
+        self._actions: dict[str, Callable[[float], None]] = {
+            names.START_SCAN: self.start_scan,
+            names.STOP_SCAN: self.stop,
+            names.START_SPEC: self.start_spectrum,
+            names.STOP_SPEC: self.stop,
+            names.PULSE: self.pulse,
+            names.CRASH: self.crash,
+            names.RETRACT: self.retract,
+            names.ENGAGE: self.engage,
+        }
+
+    # --- what is going on ---
+
+    def state(self, now_s: float) -> ScopeState:
+        """What the instrument is doing, after everything has happened that was to happen until now."""
+        self._advance(now_s)
+        doing = self._kept["doing"]
+        return ScopeState.FREE if doing is None else _STATES[doing["what"]]
+
+    def next_change_s(self) -> float | None:
+        """When the next thing happens by itself; None if nothing will, or `wake` will tell."""
+        times = [self._panel_s(), self._whole_s()]
+        if self._kept["doing"] is not None and not self._drawing():
+            times.append(self._kept["doing"]["end_s"])
+        return min((at_s for at_s in times if at_s is not None), default=None)
+
+    def results(self) -> list[str]:
+        """The files of the last scans and spectra, oldest first."""
+        return list(self._kept["results"])
+
+    def _advance(self, now_s: float) -> None:
+        while (at_s := self.next_change_s()) is not None and at_s <= now_s:
+            if at_s == self._whole_s():
+                self._complete_file()
+            elif at_s == self._panel_s():
+                self._someone_at_the_panel(at_s)
+            else:
+                self._end(at_s)
+
+    def _begin(self, what: str, now_s: float, lasts_s: float) -> None:
+        values = dict(self._kept["values"])
+        self._kept["doing"] = {"what": what, "start_s": now_s, "end_s": now_s + lasts_s, "values": values}
+
+    def _end(self, end_s: float) -> None:
+        doing, self._kept["doing"] = self._kept["doing"], None
+        try:
+            if doing["what"] == "scan" and self._scan is not None:
+                self._save_scan(self._scan.result(), doing)
+            elif doing["what"] == "spectrum":
+                self._save_spectrum(doing)
+        except AfspmError as error:
+            # as with a controller that fails: it is free again, and there is no file
+            self._log.error("the simulated %s failed: %s", doing["what"], error)
+        if doing["what"] in ("scan", "spectrum"):
+            self._settle()
+
+    def _drawing(self) -> bool:
+        """Whether a scan is still being worked out: then it lasts until that is done, however fast time passes."""
+        return self._scan is not None and not self._scan.done()
+
+    def _settle(self) -> None:
+        """Nothing works on the world any more, and its state is kept."""
+        if self._scan is not None:
+            wait([self._scan])
+        self._scan = None
+        self._kept["world"] = self._world.state()
+
+    # --- what it can be told to do ---
+
+    def set(self, values: dict[str, Value], now_s: float) -> None:
+        """Change values, by their generic names, in the table's units; a new frame or position is moved to."""
+        before = self._si(self._kept["values"])
+        self._kept["values"].update(values)
+        after = self._si(self._kept["values"])
+        speed_m_s = float(after[names.MOVE_SPEED])
+        distance_m = max(
+            _distance(before, after, names.PROBE_POS_X, names.PROBE_POS_Y),
+            _distance(before, after, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y),
+        )
+        if distance_m > 0.0:
+            self.stop(now_s)  # as far as that is allowed, it ends what is being measured
+            self._begin("move", now_s, distance_m / speed_m_s)
+
+    def start_scan(self, now_s: float) -> None:
+        """Scan the frame: every line there and back at the scan speed."""
+        self._prepare()
+        values = self._si(self._kept["values"])
+        region, (rows, _) = frame(values)
+        self._kept["scans"] += 1
+        self._begin("scan", now_s, rows * _line_s(values, region.size_m[0]))
+        self._note(now_s, "scan starts", {"number": self._kept["scans"]})
+        self._scan = self._drawn_meanwhile(self._kept["doing"])
+
+    def start_spectrum(self, now_s: float) -> None:
+        """Take a curve of the kind that is set, where the probe is."""
+        self._prepare()
+        self._kept["spectra"] += 1
+        kind = str(self._kept["values"][names.SPEC_KIND])
+        self._begin("spectrum", now_s, self._world.spectrum_s(kind))
+        self._note(now_s, "spectrum starts", {"number": self._kept["spectra"], "kind": kind})
+
+    def stop(self, now_s: float) -> None:
+        """Break off what is being measured. What would have come of it is lost."""
+        doing = self._kept["doing"]
+        if doing is not None and doing["what"] in ("scan", "spectrum"):
+            self._kept["doing"] = None
+            if not self._drawing():
+                self._settle()
+            self._note(now_s, f"{doing['what']} stopped", {})
+
+    def pulse(self, now_s: float) -> None:
+        """A bias pulse where the tip is."""
+        self._prepare()
+        values = self._si(self._kept["values"])
+        voltage_v, duration_s = float(values[names.PULSE_VOLTAGE]), float(values[names.PULSE_DURATION])
+        outcome = self._world.pulse(voltage_v, duration_s, now_s)
+        self._treated("pulse", now_s, duration_s, {"voltage_v": voltage_v, "outcome": outcome})
+
+    def crash(self, now_s: float) -> None:
+        """Drive the tip into the sample where the probe is, and out again."""
+        self._prepare()
+        values = self._si(self._kept["values"])
+        position_m = (float(values[names.PROBE_POS_X]), float(values[names.PROBE_POS_Y]))
+        speed_m_s, depth_m = float(values[names.CRASH_SPEED]), float(values[names.CRASH_DEPTH])
+        outcome = self._world.crash(position_m, speed_m_s, now_s)
+        self._treated("crash", now_s, 2.0 * depth_m / speed_m_s, {"position_m": position_m, "outcome": outcome})
+
+    def retract(self, now_s: float) -> None:
+        """Take the tip away from the sample, whatever is going on."""
+        self.stop(now_s)
+        self._kept["values"]["x-engaged"] = False
+        self._begin("approach", now_s, self._approach_s)
+
+    def engage(self, now_s: float) -> None:
+        """Bring the tip to the sample."""
+        self.stop(now_s)
+        self._kept["values"]["x-engaged"] = True
+        self._begin("approach", now_s, self._approach_s)
+
+    def _treated(self, what: str, now_s: float, lasts_s: float, facts: dict[str, Any]) -> None:
+        self._settle()
+        self._begin(what, now_s, lasts_s)
+        self._note(now_s, what, facts)
+
+    def _prepare(self) -> None:
+        """Raises Refused if the tip can't be used now; waits for what is left of a scan that was stopped."""
+        if self._kept["doing"] is not None:
+            raise Refused(ControlResponse.NOT_FREE, f"the instrument is busy: {self._kept['doing']['what']}")
+        if not self._kept["values"]["x-engaged"]:
+            raise Refused(ControlResponse.ACTION_ERROR, f"the tip is retracted: {names.ENGAGE} it first")
+        self._settle()
+
+    # --- what comes of it ---
+
+    def _drawn_meanwhile(self, doing: dict[str, Any]) -> Future[SimulatedScan]:
+        """The picture is worked out while the scan lasts and beside everything else, so that nobody waits for it."""
+        future: Future[SimulatedScan] = Future()
+
+        def work() -> None:
+            try:
+                future.set_result(self._draw(doing))
+            except BaseException as error:
+                future.set_exception(error)
+            self._wake()
+
+        # not an executor's thread: those are waited for when the process ends
+        Thread(target=work, daemon=True, name="simulated scan").start()
+        return future
+
+    def _draw(self, doing: dict[str, Any]) -> SimulatedScan:
+        values = self._si(doing["values"])
+        region, shape = frame(values)
+        return self._world.scan(
+            region,
+            shape,
+            _line_s(values, region.size_m[0]),
+            doing["start_s"],
+            feedback(values),
+            float(values[names.TIP_BIAS_VOLTAGE]),
+            slope=(float(values[names.SAMPLE_SLOPE_X]), float(values[names.SAMPLE_SLOPE_Y])),
+        )
+
+    def _save_scan(self, scan: SimulatedScan, doing: dict[str, Any]) -> None:
+        content = encode_scan(scan.course.region, scan.channels(), self._measured(doing))
+        name = f"scan-{self._kept['scans']:04d}.nc"
+        self._save(name, content, doing["end_s"])
+        self._note(doing["end_s"], "scan", {"file": name, "scan": dict(scan.truth)})
+
+    def _save_spectrum(self, doing: dict[str, Any]) -> None:
+        values = self._si(doing["values"])
+        position_m = (float(values[names.PROBE_POS_X]), float(values[names.PROBE_POS_Y]))
+        kind = str(values[names.SPEC_KIND])
+        bias_v = float(values[names.TIP_BIAS_VOLTAGE])
+        variables, units, curve = self._world.spectrum(kind, position_m, doing["start_s"], feedback(values), bias_v)
+        spectrum = Spectrum(position_m, kind, tuple(variables), tuple(units), curve)
+        name = f"spectrum-{self._kept['spectra']:04d}-{kind}.nc"
+        self._save(name, encode_spectrum(spectrum, self._measured(doing)), doing["end_s"])
+        self._note(doing["end_s"], "spectrum", {"file": name, "position_m": position_m, "kind": kind})
+
+    def _measured(self, doing: dict[str, Any]) -> Measured:
+        values = self._si(doing["values"])
+        attributes = {
+            f"{name} [{self._table[name].si_unit}]" if self._table[name].si_unit else name: (
+                value if isinstance(value, str) else float(value)
+            )
+            for name, value in values.items()
+        }
+        return Measured(int(doing["end_s"] * NS_PER_S), attributes)
+
+    def _save(self, name: str, content: bytes, end_s: float) -> None:
+        path = self._folder / name
+        whole_after_s = self._faults.strikes("half-file")
+        if whole_after_s is None:
+            write_whole(path, [content])
+        else:
+            write_whole(_hidden(path), [content])
+            path.write_bytes(content[: len(content) // 2])
+            self._kept["half"] = [str(path), end_s + whole_after_s]
+        self._kept["results"] = [*self._kept["results"], str(path)][-LISTED_RESULTS:]
+
+    def _whole_s(self) -> float | None:
+        half = self._kept.get("half")
+        return None if half is None else float(half[1])
+
+    def _complete_file(self) -> None:
+        path = Path(self._kept.pop("half")[0])
+        try:
+            _hidden(path).replace(path)
+        except OSError as error:
+            raise FileError(f"can't be completed: {error}", where=str(path)) from error
+
+    # --- the panel, and the truth ---
+
+    def _panel_s(self) -> float | None:
+        left = self._panel[self._kept["panel"] :]
+        return self._kept["start_s"] + left[0].at_s if left else None
+
+    def _someone_at_the_panel(self, at_s: float) -> None:
+        event = self._panel[self._kept["panel"]]
+        self._kept["panel"] += 1
+        if event.set:
+            values = self._table.written(event.set, where="panel")
+            self.set({name: self._table[name].to_vendor(value) for name, value in values.items()}, at_s)
+        if event.action:
+            try:
+                self._actions[event.action](at_s)
+            except Refused as refused:
+                self._log.warning("at the panel: %s", refused)
+
+    def _note(self, time_s: float, event: str, facts: dict[str, Any]) -> None:
+        if not self._drawing():
+            facts = {**facts, "truth": self._world.truth(time_s)}
+        self._truth.note(time_s, event, facts)
+
+    def _si(self, values: dict[str, Value]) -> dict[str, Value]:
+        return {name: self._table[name].from_vendor(value) for name, value in values.items() if name in self._table}
+
+
+def _line_s(values: dict[str, Value], width_m: float) -> float:
+    """There and back."""
+    return 2.0 * width_m / float(values[names.SCAN_SPEED])
+
+
+def _distance(before: dict[str, Value], after: dict[str, Value], *axes: str) -> float:
+    return math.hypot(*(float(after[axis]) - float(before[axis]) for axis in axes))
+
+
+def _hidden(path: Path) -> Path:
+    return path.with_name(f".{path.name}.whole")

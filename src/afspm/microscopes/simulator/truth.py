@@ -1,0 +1,37 @@
+"""What really was, for judging afterwards: `truth.jsonl` in the folder of the run, never on the wire."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class Truth:
+    """Appends one JSON object a line: `n`, `time_s` (experiment), `event` and what belongs to it.
+
+    Args:
+        kept: where the number of the last line is kept. After a kill the last event may be written again, under
+            the same `n`.
+    """
+
+    def __init__(self, path: Path, kept: dict[str, Any]) -> None:
+        self._path = path
+        self._kept = kept
+
+    def note(self, time_s: float, event: str, facts: Mapping[str, Any]) -> None:
+        """Write down what happened."""
+        self._kept["truth_lines"] = number = int(self._kept.get("truth_lines", 0)) + 1
+        line = json.dumps({"n": number, "time_s": time_s, "event": event, **facts}, default=_plain)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not of JSON")
