@@ -90,7 +90,7 @@ def full_path(name: str) -> str:
         module = _import(package)
         if module is None:
             continue
-        offered = getattr(module, "__all__", ())
+        offered = getattr(module, "__all__", None) or _own_classes(module)
         if name in offered:
             found = getattr(module, name)
             return f"{found.__module__}.{found.__qualname__}"
@@ -171,6 +171,10 @@ def _where(error: BaseException) -> str:
 
 def _public_classes(module: Any) -> list[str]:
     return [n for n, v in vars(module).items() if inspect.isclass(v) and not n.startswith("_")]
+
+
+def _own_classes(module: Any) -> list[str]:
+    return [name for name in _public_classes(module) if getattr(module, name).__module__ == module.__name__]
 
 
 def _names(value: Any) -> tuple[str, ...] | None:

@@ -9,7 +9,7 @@ from typing import Any
 from afspm.logic.limits import Guard, Limits
 from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
 
-PURE = "afspm.components"
+PURE = ("afspm.components", "afspm.microscopes.simulator")
 """Classes from here, and those derived from them, do nothing in `__init__` but to keep and to check their settings."""
 
 
@@ -28,7 +28,7 @@ def plan_of(component: type, settings: Mapping[str, Any]) -> Planned | None:
     Raises:
         AfspmError: the component refuses its settings.
     """
-    if not any(base.__module__.startswith(PURE + ".") for base in component.__mro__):
+    if not any(f"{base.__module__}.".startswith(f"{package}.") for base in component.__mro__ for package in PURE):
         return None
     made = component(**settings)
     plan = getattr(made, "plan", None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,12 +132,25 @@ def _resolve_part(part: Part, resolved: Resolved) -> None:
         )
         return
     resolved.classes[name], resolved.class_paths[name], resolved.roles[name] = component, path, role
-    resolved.declared[name] = Declared.of_class(component)
+    resolved.declared[name] = _declared(component, part)
     errors = findings.errors
     given = FROM_SECTIONS if role is Role.SCHEDULER else ()
     resolved.settings[name] = settings.check(component, part.settings, (name,), document, findings, given)
     if findings.errors > errors:
         resolved.refused.add(name)
+
+
+def _declared(component: type, part: Part) -> Declared:
+    """What the class says; a setting `problem` takes the place of its default there."""
+    said = Declared.of_class(component)
+    default, given = settings.default_of(component, "problem"), part.settings.get("problem")
+    if not isinstance(given, str) or not isinstance(default, str):
+        return said
+
+    def put(problems: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(given if problem == default else problem for problem in problems)
+
+    return replace(said, solves=put(said.solves), flags=put(said.flags))
 
 
 def _resolve_sections(resolved: Resolved) -> None:
@@ -155,7 +168,7 @@ def _resolve_sections(resolved: Resolved) -> None:
         certain=has is not None,
     )
     resolved.limits = reader.read(parts.sections.get("limits", {}))
-    for part in resolved.with_role(Role.COMPONENT):
+    for part in parts.components:
         if part.name in resolved.classes and part.name not in resolved.refused:
             _resolve_plan(part.name, resolved)
 
@@ -166,8 +179,9 @@ def _resolve_plan(name: str, resolved: Resolved) -> None:
     try:
         plan = planned.plan_of(resolved.classes[name], resolved.settings[name])
     except AfspmError as error:
-        where = resolved.document.place(name, error.where) if error.where else place
-        resolved.findings.error(f"[{name}] {error.what}", where, error.hint)
+        inside = error.where.removeprefix("simulation.").split(".") if error.where else []
+        said = f"{error.where}: {error.what}" if inside else error.what
+        resolved.findings.error(f"[{name}] {said}", resolved.document.place(name, *inside), error.hint)
         return
     except Exception as error:
         resolved.findings.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", place)

@@ -38,6 +38,8 @@ class Roles(Section):
     end_experiment: tuple[str, ...] | None = None
     set_mode: tuple[str, ...] | None = None
     clear_problems: tuple[str, ...] | None = None
+    operate: tuple[str, ...] = ()
+    """Who may command the microscope in MANUAL mode: nobody, if not named."""
 
 
 class Control(Section):
@@ -49,7 +51,7 @@ class Control(Section):
     stop_scan_on_manual: bool = True
     request_timeout: PositiveDuration = 5.0
     request_retries: Annotated[int, Field(ge=0)] = 3
-    solved_by_hand: tuple[str, ...] = ()
+    solved_by_hand: tuple[str, ...] = ("device-malfunction",)
     """Problems that a person puts right: they may be flagged though no component solves them."""
     retract: bool = True
     """Whether the tip is retracted when a holder dies in a dangerous state, where the microscope can."""

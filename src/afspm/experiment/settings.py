@@ -55,6 +55,12 @@ def check(
     return checked
 
 
+def default_of(component: type, name: str) -> Any:
+    """The default of a setting; None where it has none."""
+    parameter = _parameters(component).get(name)
+    return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
+
+
 def jsonable(value: Any, folder: Path) -> Any:
     """`value` in JSON's own types; a relative path is one beside the experiment file."""
     if isinstance(value, Enum):
@@ -69,6 +75,8 @@ def jsonable(value: Any, folder: Path) -> Any:
         return [jsonable(item, folder) for item in value]
     if isinstance(value, datetime | date):
         return value.isoformat()
+    if isinstance(value, str) and value.startswith(("./", "../")):
+        return str((folder / value).resolve())  # within tables of any content only this says that it is a file
     return value
 
 

@@ -70,6 +70,7 @@ class Simulator(Microscope):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     max_pixels: ClassVar[int] = 2048 * 2048
+    simulated: ClassVar[bool] = True
     memory_is_all: ClassVar[bool] = True
 
     def __init__(
