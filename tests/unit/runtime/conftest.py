@@ -7,10 +7,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from runtime_lab import SOURCE, Lab, LabPort  # noqa: E402
+from runtime_lab import SOURCE, Lab, LabPort
 
-from afspm.runtime.link import Link  # noqa: E402
-from afspm.runtime.scope import Scope  # noqa: E402
+from afspm.runtime.link import Link
+from afspm.runtime.scope import Scope
 
 
 @pytest.fixture

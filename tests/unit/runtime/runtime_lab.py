@@ -90,8 +90,9 @@ class Lab:
         self.requests: list[Request] = []
         self.published: list[tuple[str, bytes]] = []
         self.answers: dict[str, Response] = {}
-        self.intercept: Callable[[Request], Response | None | str] = lambda request: "go on"
+        self.intercept: Callable[[Request], Response | str | None] = lambda request: "go on"
         self.begun_scans = 0
+        self.finished: list[Region] = []
         self.cached: dict[str, Packet] = {}
         self._happenings: list[tuple[float, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
@@ -259,7 +260,7 @@ class Lab:
                 self._start(ScopeState.SCANNING, self._finish_scan)
             case ControlRequest.ACTION, "start-spec":
                 self._start(ScopeState.SPEC, self._finish_spectrum)
-            case (ControlRequest.ACTION | ControlRequest.ACTION_SUPPORT), "x-crash":
+            case ((ControlRequest.ACTION | ControlRequest.ACTION_SUPPORT), "x-crash"):
                 return Response(ControlResponse.ACTION_NOT_SUPPORTED, reason="no such action")
             case ControlRequest.PARAM, Parameter(name, value, unit):
                 if value is not None:
@@ -292,6 +293,7 @@ class Lab:
 
     def _finish_scan(self) -> None:
         assert isinstance(self.parameters.region, Region)
+        self.finished.append(self.parameters.region)
         self.publish_scan(self.parameters.region, self.parameters.shape or (8, 8))
 
     def _finish_spectrum(self) -> None:

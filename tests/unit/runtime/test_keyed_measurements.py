@@ -1,0 +1,184 @@
+"""With a key, a scan is there exactly once, whenever the component is killed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from runtime_lab import REGION, SCAN_S, SOURCE, Lab, LabPort
+
+from afspm.errors import InvalidValue
+from afspm.logic.arbitration import Event
+from afspm.model import ControlRequest, Problem, ScanSet
+from afspm.runtime.link import Link
+from afspm.runtime.scope import Scope
+
+TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
+
+
+class Kill9(BaseException):
+    """The component is gone, in the middle of whatever it did."""
+
+
+def scope_of(lab: Lab, folder: Path, life: int) -> Scope:
+    return Scope(Link(LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
+
+
+def survey(scope: Scope) -> list[ScanSet]:
+    return [scope.scan(region, shape=(8, 8), key=f"tile-{i}") for i, region in enumerate(TILES)]
+
+
+def survive(lab: Lab, folder: Path, kills_s: list[float], *, is_noticed: bool) -> list[ScanSet]:
+    """Run the survey, kill it after each of `kills_s` (from the start of each life), and start it again."""
+    for life, kill_s in enumerate([*kills_s, None]):
+        if kill_s is not None:
+
+            def die() -> None:
+                raise Kill9
+
+            lab.at(kill_s, die)
+        try:
+            return survey(scope_of(lab, folder, life))
+        except Kill9:
+            if is_noticed:  # the scheduler takes control from the dead, and stops the scan
+                lab.does(Event.DEAD, lab.name)
+            lab.restart_component()
+    raise AssertionError
+
+
+def test_a_script_that_starts_from_the_beginning_gets_the_scans_of_its_earlier_life(tmp_path: Path) -> None:
+    lab = Lab()
+    before = survey(scope_of(lab, tmp_path, 0))
+    lab.restart_component()
+    after = survey(scope_of(lab, tmp_path, 1))
+    assert lab.begun_scans == 3
+    assert [s.region for s in before] == [s.region for s in after] == TILES
+    assert [s.first.time_ns for s in before] == [s.first.time_ns for s in after]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    kills_s=st.lists(st.floats(0.0, 2.5 * SCAN_S), min_size=1, max_size=3),
+    is_noticed=st.booleans(),
+)
+def test_every_tile_is_scanned_exactly_once_whenever_it_is_killed(kills_s: list[float], *, is_noticed: bool) -> None:
+    lab = Lab()
+    with TemporaryDirectory() as folder:
+        scans = survive(lab, Path(folder), kills_s, is_noticed=is_noticed)
+    assert [s.region for s in scans] == TILES
+    assert lab.finished == TILES
+    assert lab.control.holder is None
+
+
+class DeadlyPort(LabPort):
+    """Kills the component at a certain call to the network, before or after that has done its work."""
+
+    def __init__(self, lab: Lab, deadly_call: int, *, is_late: bool) -> None:
+        super().__init__(lab)
+        self.calls = 0
+        self.send = lambda frames: self.strike(lambda: lab.send(frames))
+        self.poll = lambda timeout_s: self.strike(lambda: lab.poll(timeout_s))
+        self.deadly_call, self.is_late = deadly_call, is_late
+
+    def strike(self, work: Callable[[], Any]) -> Any:
+        self.calls += 1
+        if self.calls == self.deadly_call and not self.is_late:
+            raise Kill9
+        done = work()
+        if self.calls == self.deadly_call:
+            raise Kill9
+        return done
+
+
+@pytest.mark.parametrize("is_noticed", [True, False])
+@pytest.mark.parametrize("is_late", [True, False])
+def test_every_tile_is_scanned_exactly_once_at_whichever_step_it_is_killed(*, is_late: bool, is_noticed: bool) -> None:
+    for deadly_call in range(1, 1000):
+        lab = Lab()
+        with TemporaryDirectory() as folder:
+            port = DeadlyPort(lab, deadly_call, is_late=is_late)
+            try:
+                survey(Scope(Link(port, lab.name, source=SOURCE, session="0"), state_dir=Path(folder)))
+                break  # survived: all steps were tried
+            except Kill9:
+                pass
+            if is_noticed:
+                lab.does(Event.DEAD, lab.name)
+            lab.restart_component()
+            survey(scope_of(lab, Path(folder), 1))
+        assert lab.finished == TILES, f"killed at call {deadly_call}"
+    assert deadly_call > 20
+
+
+def test_a_scan_that_went_on_during_the_death_is_taken_up_and_not_asked_for_again(tmp_path: Path) -> None:
+    lab = Lab()
+    survive(lab, tmp_path, [50.0], is_noticed=False)
+    assert lab.begun_scans == 3
+
+
+def test_a_scan_that_was_finished_during_the_death_is_found_in_the_cache(tmp_path: Path) -> None:
+    lab = Lab()
+
+    def die() -> None:
+        raise Kill9
+
+    lab.at(50.0, die)
+    with pytest.raises(Kill9):
+        survey(scope_of(lab, tmp_path, 0))
+    while lab._happenings:  # nobody takes what arrives
+        lab.poll(1000.0)
+    lab.restart_component()
+    scope_of(lab, tmp_path, 1).scan(TILES[0], shape=(8, 8), key="tile-0")
+    assert lab.begun_scans == 1
+    assert lab.control.holder is None, "control of the earlier life is given back"
+
+
+def test_interruptions_of_an_earlier_life_are_said_too(tmp_path: Path) -> None:
+    lab = Lab()
+    lab.at(20.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    scans = survive(lab, tmp_path, [100.0], is_noticed=False)
+    assert "tip-shape-changed" in scans[0].interruptions[0]
+
+
+def test_a_key_is_for_one_measurement(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    scope.scan(TILES[0], key="same")
+    with pytest.raises(InvalidValue, match="another measurement"):
+        scope.scan(TILES[1], key="same")
+
+
+@pytest.mark.parametrize("key", ["", "a/b", "x" * 101, "line\nbreak"])
+def test_a_key_must_fit_into_an_id(tmp_path: Path, key: str) -> None:
+    with pytest.raises(InvalidValue, match="key"):
+        scope_of(Lab(), tmp_path, 0).scan(TILES[0], key=key)
+
+
+def test_keys_that_look_alike_on_disk_are_told_apart(tmp_path: Path) -> None:
+    scope = scope_of(Lab(), tmp_path, 0)
+    a, b = scope.scan(TILES[0], key="Tile 1"), scope.scan(TILES[1], key="tile 1")
+    assert (a.region, b.region) == (TILES[0], TILES[1])
+
+
+def test_without_a_key_every_call_is_a_new_scan(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    scope.scan(TILES[0])
+    scope.scan(TILES[0])
+    assert lab.begun_scans == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_spectrum_with_a_key_is_taken_once(tmp_path: Path) -> None:
+    lab = Lab()
+    for life in range(2):
+        scope_of(lab, tmp_path, life).spectrum((1e-7, 0.0), key="iv-1")
+        lab.restart_component()
+    assert lab.begun_scans == 1
+    assert lab.count(ControlRequest.SET_PROBE_POS) == 1

@@ -1,0 +1,83 @@
+"""What is kept on disk, and what waits in memory."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afspm.errors import FileError, InvalidValue
+from afspm.model import Packet
+from afspm.runtime.backlog import Backlog
+from afspm.runtime.memory import Memory
+
+
+def test_what_is_saved_is_there_after_a_restart(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "state" / "x.json")
+    memory["step"] = 17
+    memory["places"] = [[1.5e-9, 2.0]]
+    memory.save()
+    memory["step"] = 18  # not saved
+    assert dict(Memory(tmp_path / "state" / "x.json")) == {"step": 17, "places": [[1.5e-9, 2.0]]}
+
+
+def test_nothing_is_left_of_a_value_that_can_not_be_kept(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "x.json")
+    memory["a"] = 1
+    memory.save()
+    memory["b"] = object()
+    with pytest.raises(InvalidValue, match="can't be kept"):
+        memory.save()
+    assert dict(Memory(tmp_path / "x.json")) == {"a": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["x.json"]
+
+
+def test_a_key_that_would_come_back_as_another_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidValue, match="text"):
+        Memory(None)[5] = "x"  # type: ignore[index]
+
+
+@pytest.mark.parametrize("content", ["{", "[1]", "\0"])
+def test_a_file_that_is_something_else_is_told(tmp_path: Path, content: str) -> None:
+    (tmp_path / "x.json").write_text(content)
+    with pytest.raises(FileError, match="remove it"):
+        Memory(tmp_path / "x.json")
+
+
+def test_a_folder_that_can_not_be_written_to_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    memory = Memory(None)
+    memory._path = tmp_path / "file" / "x.json"
+    with pytest.raises(FileError):
+        memory.save()
+
+
+OPERATIONS = st.lists(st.one_of(st.none(), st.tuples(st.binary(max_size=40), st.none() | st.integers(0, 2**62))))
+
+
+@given(OPERATIONS)
+def test_a_backlog_is_a_queue_however_much_of_it_is_on_disk(operations: list[tuple[bytes, int | None] | None]) -> None:
+    backlog, model = Backlog(limit_bytes=60), deque[Packet]()
+    for number, operation in enumerate(operations):
+        if operation is None:
+            assert backlog.take() == (model.popleft() if model else None)
+        else:
+            packet = Packet(f"Enveloppe_é_{number}", *operation)
+            backlog.put(packet)
+            model.append(packet)
+        assert len(backlog) == len(model)
+        assert backlog._memory_bytes <= 60
+    while model:
+        assert backlog.take() == model.popleft()
+    assert backlog._file is None, "an empty backlog keeps no file"
+    backlog.close()
+
+
+def test_a_packet_larger_than_the_limit_is_kept_all_the_same() -> None:
+    backlog = Backlog(limit_bytes=10)
+    backlog.put(Packet("Scan2d", b"x" * 100, 1))
+    backlog.put(Packet("Scan2d", memoryview(b"y" * 100), 2))
+    assert [bytes(p.payload[:1]) for p in iter(backlog.take, None)] == [b"x", b"y"]
