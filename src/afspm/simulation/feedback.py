@@ -121,7 +121,6 @@ class Loop:
         too_high, too_low = self.error_limits_m
         rate = self.integral_gain + self.proportional_gain / self.settings.lag_s
         down, up = np.float64(rate * too_high), np.float64(rate * too_low)
-        bound = self._oscillation_bound_m(max(down, up))
         z, v = height_m[0].copy(), start_v.copy()
         result = np.empty_like(height_m)
         result[0] = z
@@ -131,10 +130,11 @@ class Loop:
                 h = height_m[n - 1] + k * part
                 y = z - h
                 z_new = z + move[0, 0] * y + move[0, 1] * v + move[0, 2] * part
-                v = np.clip(move[1, 0] * y + move[1, 1] * v + move[1, 2] * part, -down, up)
-                z = np.clip(z_new, z - down * dt, z + up * dt)
-                if bound is not None:
-                    z = np.clip(z, h - bound, h + bound)
+                v = move[1, 0] * y + move[1, 1] * v + move[1, 2] * part
+                if self.oscillates:
+                    z, v = self._limited(z_new, v, h + part)
+                else:
+                    z, v = np.clip(z_new, z - down * dt, z + up * dt), np.clip(v, -down, up)
             result[n] = z
         return result
 
@@ -161,11 +161,17 @@ class Loop:
         ringing = self._damping**2 < 2.0 * max(self._inertia, 0.1 * self.settings.lag_s) * self.integral_gain
         return min(4, max(1, math.ceil(step_s / self.settings.lag_s / 3.0))) if ringing else 1
 
-    def _oscillation_bound_m(self, fastest_m_per_s: float) -> float | None:
-        if not self.oscillates:
-            return None
-        inertia = max(self._inertia, 0.1 * self.settings.lag_s)
-        return float(fastest_m_per_s * math.sqrt(inertia / max(self.integral_gain, 1.0)))
+    def _limited(self, z: Array, v: Array, h: Array) -> tuple[Array, Array]:
+        """An oscillation grows until the saturated detector gives no more gain than the loop can bear.
+
+        For a sine that saturates, the gain falls about as 4 / pi * limit / amplitude (its describing function).
+        """
+        excess = self.integral_gain * self.settings.delay_s / (1.0 + self.proportional_gain)
+        most_m = min(self.error_limits_m) * 4.0 / math.pi * max(excess, 1.0)
+        omega = math.sqrt(max(self.integral_gain, 1.0) / max(self._inertia, 0.1 * self.settings.lag_s))
+        y = z - h
+        share = np.minimum(1.0, most_m / np.maximum(np.hypot(y, v / omega), 1e-15))
+        return h + share * y, share * v
 
     def _propagator(self, dt: float) -> NDArray[np.float64]:
         """Exact over dt: rows give the change of z and the new v from (z - h, v, change of h during dt)."""

@@ -197,7 +197,7 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
     lead = min(nx, 6 + nx // 16)
     path: Array = np.concatenate([lines[:, lead:0:-1] if nx > 1 else lines[:, :1], lines], axis=1).T
     # An oscillation grows out of whatever there is; a quiet loop starts at rest.
-    start_v: Array = (1e-6 if loop.oscillates else 0.0) * random.standard_normal(path.shape[1])
+    start_v: Array = (1e-6 if loop.oscillates else 0.0) * random.standard_normal((path.shape[1],))
     z: Array = loop.follow(np.ascontiguousarray(path), course.line_s / (2 * nx), start_v)
     return z[-2 * nx :].T
 

@@ -25,7 +25,8 @@ class IVSettings:
 
     Attributes:
         range_v: from -range to +range.
-        set_current_a: at the bias in force, before the feedback is opened; in current mode the setpoint is used.
+        set_bias_v, set_current_a: at that bias that current flows before the feedback is opened (when tunnelling:
+            the setpoint at the bias in force).
         gap_ev: band gap of material 0; material 1 is a metal.
         band_offset_ev: of the gap's middle against the Fermi level (doping).
         noise_a: white; relative_noise: a share of the current besides.
@@ -34,6 +35,7 @@ class IVSettings:
 
     points: int = 256
     range_v: float = 1.5
+    set_bias_v: float = 1.0
     set_current_a: float = 100e-12
     gap_ev: float = 1.1
     band_offset_ev: float = 0.15
@@ -82,7 +84,7 @@ def current_voltage(
     """I(V), forth and back, and dI/dV as a lock-in shows it.
 
     The current is the integral of the sample's density of states times the tip's times the barrier's transmission,
-    scaled so that at the bias in force it is the current that the feedback had held.
+    scaled to the current that the feedback had held.
     """
     bias = np.linspace(-settings.range_v, settings.range_v, settings.points)
     energy = np.linspace(-settings.range_v - 0.5, settings.range_v + 0.5, 1201)
@@ -95,8 +97,9 @@ def current_voltage(
     from_zero = np.cumsum(density) * step
     from_zero -= np.interp(0.0, energy, from_zero)
     current = np.interp(bias, energy, from_zero)
-    held = loop.setpoint if loop.settings.mode == "current" else settings.set_current_a
-    at_bias = abs(float(np.interp(bias_v, energy, from_zero)))
+    tunnels = loop.settings.mode == "current"
+    held = loop.setpoint if tunnels else settings.set_current_a
+    at_bias = abs(float(np.interp(bias_v if tunnels else settings.set_bias_v, energy, from_zero)))
     scale = held / max(at_bias, 1e-3 * float(np.abs(current).max()), 1e-30)
     clean = current * scale
     sweeps = [_through_preamplifier(settings, clean, tip, random) for _ in range(2)]
