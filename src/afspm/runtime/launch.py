@@ -96,6 +96,7 @@ class Launch:
 _STRINGS = {"name", "class_", "run_dir", "state_dir", "log_level"}
 _NUMBERS = {"beat_period_s", "request_timeout_s", "request_retries"}
 _TABLES = {"settings", "clock", "problems"}
+_LISTS = {"subscribe", "envelopes", "messages"}
 
 
 def _fields(cls: type[Any], plain: Any, where: str) -> dict[str, Any]:
@@ -116,11 +117,13 @@ def _fields(cls: type[Any], plain: Any, where: str) -> dict[str, Any]:
 
 def _checked(cls: type[Any], key: str, value: Any, where: str) -> Any:
     """`value`, lists made tuples; refused if its type can't be right for the field `key`."""
-    if isinstance(value, list):
+    if key in _LISTS and isinstance(value, list):
         if not all(isinstance(item, str) for item in value):
             raise ConfigError(f"{key!r} must be a list of strings", where=where)
         return tuple(value)
-    if cls is Sockets:
+    if key in _LISTS:
+        fits = value is None and key == "envelopes"
+    elif cls is Sockets:
         fits = isinstance(value, str) or value is None
     elif key in _STRINGS:
         fits = isinstance(value, str)

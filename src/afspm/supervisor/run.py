@@ -13,6 +13,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
 from afspm.logic.supervision import Policy
+from afspm.runtime.connect import guest_facts
 from afspm.supervisor import run_folder, summary
 from afspm.supervisor.log import SUPERVISOR, RunLog
 from afspm.supervisor.ports import FreePorts
@@ -81,11 +82,13 @@ def dry_run(experiment: Experiment, options: Options = Options()) -> list[Start]
 def run_facts(name: str, starts: Sequence[Start], clock: ExperimentClock) -> dict[str, object]:
     """What a script needs to know to take part in this run, for run.json.
 
-    The launch lines are there as they are, so that whoever joins is connected just as those are.
+    The launch line of a component is there as it is, so that whoever joins is connected just as that is.
     """
     by_role = {start.role: start.launch for start in starts}
     scheduler = by_role.get(Role.SCHEDULER)
-    some = next((start.launch for start in starts if start.role is Role.COMPONENT), scheduler)
+    components = [start.launch for start in starts if start.role is Role.COMPONENT]
+    component = next((launch for launch in components if launch.sockets.control), None)
+    some = component or scheduler
     return {
         "name": name,
         "scheduler": None
@@ -93,6 +96,7 @@ def run_facts(name: str, starts: Sequence[Start], clock: ExperimentClock) -> dic
         else {"publish": scheduler.sockets.publish, "control": scheduler.sockets.serve},
         "clock": clock.as_dict(),
         "problems": dict(some.problems) if some else {},
+        "guest": guest_facts(component) if component else None,
         "processes": {
             start.launch.name: {
                 "role": start.role.value,

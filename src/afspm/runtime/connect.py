@@ -1,0 +1,133 @@
+"""`afspm.connect`: a script or notebook joins an experiment that is running."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import weakref
+from pathlib import Path
+from typing import Any
+
+from afspm.clock import ExperimentClock
+from afspm.errors import ConfigError, FileError
+from afspm.model import ProblemNames
+from afspm.runtime.launch import Launch, Sockets
+from afspm.runtime.link import Link
+from afspm.runtime.messages import register_all
+from afspm.runtime.scope import Scope
+from afspm.transport.launching import open_port
+
+RUN_FILE = "run.json"
+LATEST_FILE = "latest"
+GUEST = "guest"
+
+
+def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
+    """Join a running experiment; what is returned can be used like `self.scope` in a component.
+
+        scope = afspm.connect("runs/my_experiment-20261120-040000")
+        scope.scan(Region((0, 0), (2e-6, 2e-6)))
+
+    Args:
+        where: the folder of the run, the folder of all runs (its newest is meant), or the experiment file (its newest
+            run is meant, in the folder `runs` here or beside it).
+        name: what others see as the holder of control. Two that join need different names.
+
+    Raises:
+        FileError: there is no such run.
+        ConfigError: it has nobody to connect to.
+    """
+    folder = find_run(Path(where))
+    launch = guest_of(folder, name)
+    register_all(launch.messages)
+    clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
+    port = open_port(launch, clock)
+    link = Link(
+        port,
+        name,
+        source=launch.sockets.subscribe[0],
+        session=os.urandom(4).hex(),
+        request_timeout_s=launch.request_timeout_s,
+        request_retries=launch.request_retries,
+        log=logging.getLogger(f"afspm.{name}"),
+    )
+    scope = Scope(link, ProblemNames(launch.problems), folder / "state")
+    weakref.finalize(scope, port.close)
+    return scope
+
+
+def guest_facts(launch: Launch) -> dict[str, Any]:
+    """What run.json says under "guest": the launch line of a component, without what is that component's own."""
+    sockets = Sockets(subscribe=launch.sockets.subscribe[:1], control=launch.sockets.control)
+    guest = dataclasses.replace(launch, name=GUEST, class_="", settings={}, sockets=sockets, envelopes=None)
+    facts: dict[str, Any] = json.loads(guest.to_json())
+    return facts
+
+
+def guest_of(folder: Path, name: str) -> Launch:
+    """The launch line of someone who joins the run in `folder`.
+
+    Raises:
+        FileError: run.json can't be read.
+        ConfigError: there is no scheduler to connect to.
+    """
+    facts = _facts(folder)
+    if facts is None:
+        raise FileError("there is no run in this folder", where=str(folder), hint="name a folder with a run.json")
+    guest = facts.get(GUEST)
+    if not isinstance(guest, dict):
+        raise ConfigError(
+            "this part of the experiment has no component that could be joined",
+            where=str(folder / RUN_FILE),
+            hint="connect on the computer where components run",
+        )
+    launch = Launch.from_json(json.dumps({**guest, "name": name}))
+    if not launch.sockets.subscribe or launch.sockets.control is None:
+        raise ConfigError("this experiment has no scheduler to connect to", where=str(folder / RUN_FILE))
+    return launch
+
+
+def find_run(where: Path) -> Path:
+    """The folder of the run that is meant. Raises FileError if there is none."""
+    if where.suffix == ".toml":
+        name = where.resolve().parent.name if where.stem == "experiment" else where.stem
+        runs = (Path("runs"), where.resolve().parent / "runs")
+        found = [run for folder in runs if (run := _newest(folder, name, where)) is not None]
+        if not found:
+            raise FileError("no run of this experiment is found", where=str(where), hint="start it with `afspm run`")
+        return found[0]
+    if (where / RUN_FILE).is_file():
+        return where
+    latest = where / LATEST_FILE
+    if latest.is_file():
+        return where / latest.read_text(encoding="utf-8").strip()
+    raise FileError("there is no run here", where=str(where), hint="name the folder of a run, e.g. runs/…")
+
+
+def _newest(runs: Path, name: str, file: Path) -> Path | None:
+    """The newest run of the experiment `name` in the folder `runs`."""
+    name = _name_in(file) or name
+    found = [run for run in runs.glob(f"*/{RUN_FILE}") if (_facts(run.parent) or {}).get("name") == name]
+    return max(found, key=lambda run: run.stat().st_mtime_ns).parent if found else None
+
+
+def _name_in(file: Path) -> str | None:
+    import tomllib
+
+    try:
+        name = tomllib.loads(file.read_text(encoding="utf-8")).get("name")
+    except (OSError, ValueError) as error:
+        raise FileError(f"can't be read: {error}", where=str(file)) from error
+    return name if isinstance(name, str) and name else None
+
+
+def _facts(folder: Path) -> dict[str, Any] | None:
+    try:
+        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise FileError(f"can't be read: {error}", where=str(folder / RUN_FILE)) from error
+    return facts if isinstance(facts, dict) else None
