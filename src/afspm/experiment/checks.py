@@ -78,7 +78,7 @@ def check_commands(resolved: Resolved) -> None:
 
 
 def _program(name: str, folder: Path) -> bool:
-    return shutil.which(name) is not None or (folder / name).is_file()
+    return name == "python" or shutil.which(name) is not None or (folder / name).is_file()
 
 
 def check_intermediaries(resolved: Resolved) -> None:

@@ -92,7 +92,7 @@ def full_path(name: str) -> str:
             continue
         offered = getattr(module, "__all__", None) or _own_classes(module)
         if name in offered:
-            found = getattr(module, name)
+            found = _attribute(module, name)
             return f"{found.__module__}.{found.__qualname__}"
         known += [n for n in offered if n[:1].isupper()]
     raise Unloadable(f"there is no ready-made class {name!r}", nearest(name, known) or 'write it as "module.Name"')
@@ -113,9 +113,7 @@ def load(path: str) -> Any:
         raise _no_module(module_name, error) from error
     except Exception as error:
         raise Unloadable(f"importing {module_name} fails: {_where(error)}") from error
-    if not hasattr(module, name):
-        raise Unloadable(f"{module_name} has no {name!r}", nearest(name, _public_classes(module)))
-    return getattr(module, name)
+    return _attribute(module, name)
 
 
 def role_of(component: type) -> Role | None:
@@ -125,6 +123,19 @@ def role_of(component: type) -> Role | None:
             if base.__module__ == package or base.__module__.startswith(package + "."):
                 return role
     return Role.COMPONENT if hasattr(component, "run_process") else None
+
+
+def _attribute(module: Any, name: str) -> Any:
+    """A name of a module, which a package may only import when it is asked for."""
+    try:
+        return getattr(module, name)
+    except AttributeError:
+        hint = nearest(name, _public_classes(module))
+        raise Unloadable(f"{module.__name__} has no {name!r}", hint) from None
+    except ModuleNotFoundError as error:
+        raise _no_module(f"{module.__name__}.{name}", error) from error
+    except Exception as error:
+        raise Unloadable(f"importing {name} fails: {_where(error)}") from error
 
 
 def _import(package: str) -> Any:
@@ -137,9 +148,9 @@ def _import(package: str) -> Any:
 def _no_module(module: str, error: ModuleNotFoundError) -> Unloadable:
     missing = error.name or module
     if module != missing and not module.startswith(missing + "."):
-        return Unloadable(
-            f"importing {module} fails: it needs {missing!r}, which is not installed", f"pip install {missing}"
-        )
+        ours = missing.partition(".")[0] == module.partition(".")[0]
+        hint = "" if ours else f"pip install {missing}"
+        return Unloadable(f"importing {module} fails: it needs {missing!r}, which is not installed", hint)
     parent, _, last = missing.rpartition(".")
     siblings: list[str] = []
     for folder in _search_paths(parent):

@@ -30,6 +30,7 @@ class Start:
             where it has not given them to `Experiment.launches`.
         command: program and arguments; empty: the Python host runs `launch.class_`.
         folder: to start commands in: that of the experiment file.
+        beats: whether it sends heartbeats; a command that does not (`heartbeats = false`) is only known by its exit.
         python_path: to be put before PYTHONPATH, so that modules beside the file are found.
     """
 
@@ -38,6 +39,7 @@ class Start:
     command: tuple[str, ...]
     folder: Path
     python_path: tuple[str, ...]
+    beats: bool = True
 
 
 class Experiment:

@@ -15,7 +15,9 @@ from afspm.experiment.references import References
 SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "messages", "restart")
 
 # Keys of a component's table that are for us; everything else is a setting of its class or command.
-OWN_KEYS: Final = frozenset({"component", "class", "command", "envelopes", "listens_to", "role", *WIRE_KEYS})
+OWN_KEYS: Final = frozenset(
+    {"component", "class", "command", "envelopes", "listens_to", "role", "heartbeats", *WIRE_KEYS}
+)
 SIMULATED = "simulated"
 """For a translator that is a command: whether its microscope is simulated, as a class says by an attribute."""
 DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -105,7 +106,12 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
         simulated=resolved.simulated,
     )
     folders = tuple(str(folder) for folder in resolved.document.folders)
-    return Start(launch, role, part.command, experiment.folder, folders)
+    return Start(launch, role, _command(part), experiment.folder, folders, part.own.get("heartbeats") is not False)
+
+
+def _command(part: Part) -> tuple[str, ...]:
+    """The command; "python" is the one that runs us, wherever that is."""
+    return (sys.executable, *part.command[1:]) if part.command[:1] == ("python",) else part.command
 
 
 def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str]) -> dict[str, str] | None:

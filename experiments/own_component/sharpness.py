@@ -1,0 +1,22 @@
+"""A component of ten lines."""
+
+import numpy as np
+
+from afspm.runtime.component import Component
+
+
+class Sharpness(Component):
+    """Warns of scans that are less sharp than the first one was."""
+
+    listens = ("Scan2d",)
+
+    def __init__(self, threshold: float = 0.5, channel: str = "Height"):
+        self.threshold, self.channel = threshold, channel
+
+    def on_scan(self, scan):
+        if scan.channel == self.channel:
+            sharpness = float(np.abs(np.diff(scan.values, axis=1)).mean())
+            first = self.memory.setdefault("first", sharpness)
+            self.memory.save()
+            if sharpness < self.threshold * first:
+                self.log.warning("a scan is %.0f %% as sharp as the first", 100 * sharpness / first)

@@ -1,0 +1,66 @@
+"""Every sample checks without a finding, can be drawn and could be started."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from afspm.experiment import Experiment, load
+from afspm.experiment.graph import draw
+from afspm.transport.keys import generate
+
+EXPERIMENTS = Path(__file__).parents[3] / "experiments"
+SAMPLES = sorted(folder.name for folder in EXPERIMENTS.iterdir() if (folder / "experiment.toml").exists())
+
+
+def sample(name: str, *overlays: str) -> Experiment:
+    folder = EXPERIMENTS / name
+    return load(folder / "experiment.toml", *(folder / overlay for overlay in overlays))
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_a_sample_has_nothing_wrong(name: str) -> None:
+    experiment = sample(name)
+    assert experiment.check() == []
+    assert experiment.name == name
+    assert (EXPERIMENTS / name / "README.md").exists()
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_a_sample_can_be_drawn_and_started(name: str) -> None:
+    experiment = sample(name)
+    assert all(part in draw(experiment) for part in experiment.component_names)
+    ports = itertools.count(20000)
+    starts = experiment.launches(take_address=lambda: f"tcp://127.0.0.1:{next(ports)}")
+    assert {start.launch.name for start in starts} == set(experiment.component_names)
+
+
+def test_a_small_file_ports_an_experiment_to_another_microscope() -> None:
+    ported = sample("keep_scanning", "small_scanner.toml")
+    assert ported.check() == []
+    assert ported.resolved.settings["series"]["size"] == pytest.approx([500e-9, 500e-9])
+    assert ported.resolved.settings["series"]["every"] == 900.0
+    assert ported.resolved.limits.region is not None
+
+
+def test_the_laboratory_s_file_of_two_computers_needs_its_keys(tmp_path: Path) -> None:
+    without = sample("two_computers", "lab.toml")
+    assert ["there is no folder" in finding.what for finding in without.check()] == [True]
+    generate(tmp_path / "keys", without.component_names)
+    lab = tmp_path / "lab.toml"
+    lab.write_text((EXPERIMENTS / "two_computers" / "lab.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    experiment = load(EXPERIMENTS / "two_computers" / "experiment.toml", lab)
+    assert experiment.check() == []
+    (series,) = experiment.launches(take_address=lambda: "tcp://127.0.0.1:20000", only=["series"])
+    assert series.launch.sockets.control == "tcp://192.168.1.20:29002"
+
+
+def test_the_paper_s_form_says_the_same_as_the_short_one() -> None:
+    short, long = sample("tip_repair").resolved, sample("paper_form").resolved
+    for name in ("scheduler", "series", "tip_classifier", "tip_corrector"):
+        assert long.settings[name] == short.settings[name]
+        assert long.class_paths[name] == short.class_paths[name]
+    assert long.settings["translator"] == short.settings["microscope"]
+    assert long.limits.region == short.limits.region
