@@ -97,13 +97,17 @@ class Sampler:
         return np.asarray(lower * (1 - self._v) + upper * self._v)
 
 
+def across_m(tip: TipState, height_range_m: float) -> float:
+    """How far beside its apex the round part of a tip can touch a surface of that range of heights."""
+    corner = tip.imaging_radius_m / math.tan(math.radians(tip.half_angle_deg))  # beyond, it is the cone that touches
+    return min(math.sqrt(2.0 * tip.imaging_radius_m * height_range_m), corner)
+
+
 def reach_m(tip: TipState, height_range_m: float) -> float:
     """How far beside its apex a tip can touch a surface of that range of heights."""
-    slope = 1.0 / math.tan(math.radians(tip.half_angle_deg))
-    reach = math.sqrt(2.0 * tip.imaging_radius_m * height_range_m)
-    corner = tip.imaging_radius_m * slope  # beyond, it is the cone that touches
-    if reach > corner:
-        reach = corner + (height_range_m - corner * slope / 2) / slope
+    across = across_m(tip, height_range_m)
+    beyond = max(0.0, height_range_m - across**2 / (2.0 * tip.imaging_radius_m))
+    reach = across + beyond * math.tan(math.radians(tip.half_angle_deg))
     return reach + (math.hypot(*tip.second_apex_m[:2]) if tip.second_apex_m else 0.0)
 
 
@@ -131,7 +135,7 @@ def _dilated(surface: Single, grid: Grid, tip: TipState) -> Single:
     height_range = float(np.ptp(surface))
     slope = 1.0 / math.tan(math.radians(tip.half_angle_deg))
     radius = tip.imaging_radius_m
-    across = min(math.sqrt(2.0 * radius * height_range), radius * slope)
+    across = across_m(tip, height_range)
     for axis, step in enumerate((grid.dy_m, grid.dx_m)):
         surface = _under_parabola(surface, axis, step, radius, across)
     if height_range > slope * across / 2:

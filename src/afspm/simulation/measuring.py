@@ -10,7 +10,7 @@ import numpy as np
 
 from afspm.simulation.feedback import Loop
 from afspm.simulation.fields import Array
-from afspm.simulation.imaging import Grid, Sampler, felt, reach_m
+from afspm.simulation.imaging import Grid, Sampler, across_m, felt, reach_m
 from afspm.simulation.noise import NoiseSettings, disturbances, flattened, height_noise
 from afspm.simulation.scanning import Course, ScannerSettings
 from afspm.simulation.signals import SignalSettings, current_a, phase_deg
@@ -22,6 +22,8 @@ TipTimes = Sequence[tuple[float, TipState]]
 """(since when, tip), the first not later than the scan's start."""
 
 _POINTS = 1_400_000  # of the grid, if oversampling is left to us
+_MOST_POINTS = 4_000_000  # of the grid in any case
+_MOST_TAPS = 160  # grid steps that a tip may reach aside: one that reaches further sees no finer detail
 
 
 @dataclass(frozen=True)
@@ -159,9 +161,12 @@ def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> t
     area = (extent[0] + 2 * margin) * (extent[1] + 2 * margin)
     finest = math.sqrt(_POINTS * pixel[0] * pixel[1] / area)
     over = setup.scanner.oversampling or int(min(4, max(1, math.floor(finest))))
-    step = (pixel[0] / over, pixel[1] / over)
-    blur = setup.scanner.band_limit_px * over
-    return Grid.covering(x, y, step, margin), (blur, blur)
+    wide = max(across_m(tip, rise) for _, tip in tips) / _MOST_TAPS
+    step = (max(pixel[0] / over, wide), max(pixel[1] / over, wide))
+    coarser = max(1.0, math.sqrt(area / (step[0] * step[1]) / _MOST_POINTS))
+    step = (step[0] * coarser, step[1] * coarser)
+    blur = setup.scanner.band_limit_px
+    return Grid.covering(x, y, step, margin), (blur * pixel[1] / step[1], blur * pixel[0] / step[0])
 
 
 def _rows_of_grid(grid: Grid, y: Array, margin_m: float) -> tuple[Grid, int, int]:

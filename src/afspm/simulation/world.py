@@ -101,6 +101,8 @@ class World:
         """
         course = Course(region, shape, line_s, start_s, direction)
         loop = Loop.of(self.settings.feedback, feedback)
+        if not all(map(math.isfinite, (bias_v, *slope))):
+            raise InvalidValue(f"bias {bias_v} V and slope {slope} must be finite")
         call = self._begin(start_s, region.center_m)
         self._foresee(course, loop, call)
         tips = [(start_s, self._tips.at(start_s))]
@@ -135,6 +137,8 @@ class World:
         """
         if kind not in spectra.KINDS:
             raise InvalidValue(f"no spectrum of kind {kind!r}", hint=nearest(kind, spectra.KINDS))
+        if not all(map(math.isfinite, (bias_v, *position_m))):
+            raise InvalidValue(f"bias {bias_v} V and position {position_m} must be finite")
         loop = Loop.of(self.settings.feedback, feedback)
         call = self._begin(t_s, position_m)
         tip = self._tips.at(t_s)
@@ -341,8 +345,6 @@ class World:
         return relief
 
     def _setup(self, loop: Loop, bias_v: float, slope: tuple[float, float], start_s: float) -> Setup:
-        if not (math.isfinite(bias_v) and all(map(math.isfinite, slope))):
-            raise InvalidValue(f"bias {bias_v} V and slope {slope} must be finite")
         return Setup(
             sample=lambda x, y, resolution_m: self._relief(x, y, resolution_m, start_s),
             drift_m=self._drift.at,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from afspm.simulation import chance
-from afspm.simulation.fields import Array, smooth_field
+from afspm.simulation.fields import Array, is_separable, smooth_field
 from afspm.simulation.settings import check
 from afspm.simulation.surfaces.relief import Relief, Sites, around, grain
 
@@ -41,7 +41,13 @@ class Particles:
             return Relief(height_m, material)  # far too small to be seen one by one
         sites = self._present(seed + 10, x_m, y_m)
         radii = self.radius_m * np.exp(self.spread * chance.normal(seed + 11, sites.key))
-        for x0, y0, radius in zip(sites.x_m, sites.y_m, np.minimum(radii, _LARGEST * self.radius_m), strict=True):
+        radii = np.minimum(radii, _LARGEST * self.radius_m)
+        if is_separable(x_m, y_m):
+            small = radii < 0.75 * resolution_m
+            _strew(Relief(height_m, material), x_m, y_m, sites, np.where(small, radii, 0.0), resolution_m)
+        else:
+            small = np.zeros(len(radii), dtype=bool)
+        for x0, y0, radius in zip(sites.x_m[~small], sites.y_m[~small], radii[~small], strict=True):
             _rest(height_m, material, ground, x_m, y_m, (x0, y0, radius), resolution_m)
         return Relief(height_m, material)
 
@@ -66,3 +72,13 @@ def _rest(
         )
         height_m[index] = np.maximum(height_m[index], top)
         material[index] = np.maximum(material[index], inside > 0)
+
+
+def _strew(relief: Relief, x_m: Array, y_m: Array, sites: Sites, radii_m: Array, resolution_m: float) -> None:
+    """All particles smaller than a step of the grid at once: each adds its volume to the point next to it."""
+    column, row = np.searchsorted(x_m[0], sites.x_m), np.searchsorted(y_m[:, 0], sites.y_m)
+    inside = (radii_m > 0) & (column < x_m.size) & (row < y_m.size) & (column > 0) & (row > 0)
+    radii_m = radii_m[inside]
+    share = np.minimum(np.pi * (radii_m / (resolution_m or 1.0)) ** 2, 1.0)
+    np.add.at(relief.height_m, (row[inside], column[inside]), 5 / 3 * radii_m * share)
+    np.maximum.at(relief.material, (row[inside], column[inside]), share)

@@ -55,7 +55,7 @@ def grain(seed: int, x_m: Array, y_m: Array, rms_m: float, size_m: float, resolu
     """Fine roughness of the given rms whose largest grains are `size_m` wide."""
     if rms_m == 0.0:
         return 0.0
-    field = rough_field(seed, x_m, y_m, largest_m=size_m, smallest_m=size_m / 8, hurst=0.6, resolution_m=resolution_m)
+    field = rough_field(seed, x_m, y_m, largest_m=size_m, smallest_m=size_m / 4, hurst=0.6, resolution_m=resolution_m)
     return rms_m * field
 
 

@@ -34,7 +34,7 @@ class Steps:
     def relief(self, x_m: Array, y_m: Array, resolution_m: float, seed: int) -> Relief:
         wide = smooth_field(seed + 1, x_m, y_m, 2.3 * self.terrace_m)
         narrow = rough_field(
-            seed + 2, x_m, y_m, largest_m=0.45 * self.terrace_m, smallest_m=0.05 * self.terrace_m, hurst=0.8,
+            seed + 2, x_m, y_m, largest_m=0.45 * self.terrace_m, smallest_m=0.08 * self.terrace_m, hurst=0.8,
             resolution_m=resolution_m,
         )  # fmt: skip
         along, _ = turned(x_m, y_m, self.angle_deg)

@@ -1,0 +1,53 @@
+"""Drift as a function of time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from afspm.errors import InvalidValue
+from afspm.simulation.drift import Drift, DriftSettings, Relaxation, random_walk
+
+START = 1.75e9
+
+
+def test_drift_is_zero_at_the_start_and_adds_up() -> None:
+    settings = DriftSettings(
+        velocity_m_per_s=(1e-10, 0.0, 2e-11), relaxing=(Relaxation((1e-6, -2e-6, 0.0), 1000.0),) * 2
+    )
+    drift = Drift(settings, 3, START)
+    np.testing.assert_array_equal(drift.at(START), np.zeros(3))
+    left = 1 - np.exp(-0.5)
+    np.testing.assert_allclose(drift.at(START + 500), [5e-8 + 2e-6 * left, -4e-6 * left, 1e-8], rtol=1e-6)
+    assert drift.at(np.full((4, 5), START)).shape == (4, 5, 3)
+
+
+def test_a_walk_asked_for_in_any_order_is_the_same_walk() -> None:
+    drift = Drift(DriftSettings(walk_m_per_sqrt_hour=100e-9), 3, START)
+    times = START + np.random.default_rng(0).uniform(0, 2e6, 300)
+    together = drift.at(times)
+    one_by_one = np.array([drift.at(t) for t in times[::-1]])[::-1]
+    np.testing.assert_array_equal(together, one_by_one)
+    other = Drift(DriftSettings(walk_m_per_sqrt_hour=100e-9), 4, START).at(times)
+    assert not np.allclose(together[:, :2], other[:, :2])
+
+
+def test_a_walk_spreads_as_the_square_root_of_time() -> None:
+    ends = np.array([random_walk(seed, np.array([100.0, 3600.0, 3600.0 * 40])) for seed in range(600)])
+    np.testing.assert_allclose(ends.std(axis=0), np.sqrt([100.0, 3600.0, 3600.0 * 40]), rtol=0.12)
+    steps = np.diff(random_walk(5, np.arange(0.0, 20000.0, 10.0)))
+    assert np.std(steps) == pytest.approx(np.sqrt(10.0), rel=0.06)
+    assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 0.08
+
+
+def test_a_walk_is_continuous_across_its_longest_interval() -> None:
+    edge = 2.0**20
+    near = random_walk(1, np.array([edge - 1e-3, edge, edge + 1e-3]))
+    assert np.ptp(near) < 0.05
+
+
+def test_before_the_start_nothing_is_known() -> None:
+    with pytest.raises(InvalidValue):
+        Drift(DriftSettings(), 1, START).at(START - 5)
+    with pytest.raises(InvalidValue):
+        Drift(DriftSettings(), 1, START).at(float("nan"))

@@ -1,0 +1,127 @@
+"""The z feedback: gains and setpoint matter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from afspm.errors import InvalidValue
+from afspm.model import Feedback, Region
+from afspm.simulation import World
+from afspm.simulation.feedback import FeedbackSettings, Loop
+
+REGION = Region((0.0, 0.0), (1e-6, 1e-6))
+DT = 1e-4
+
+
+def loop(**said: Any) -> Loop:
+    return Loop.of(FeedbackSettings(), Feedback(**said))
+
+
+def step(height_m: float, steps: int = 400) -> np.ndarray:
+    path = np.full((steps, 1), height_m)
+    path[:10] = 0.0
+    return path
+
+
+def channels(**said: Any) -> dict[str, np.ndarray]:
+    world = World.from_settings({"surface": "particles"}, seed=3, start_s=0.0)
+    scan = world.scan(REGION, (64, 96), 1.0, 0.0, Feedback(**said))
+    return {name: values for name, (_, values) in scan.channels().items()}
+
+
+def asymmetry(said: dict[str, Any]) -> float:
+    seen = channels(**said)
+    return float(np.std(seen["Height"] - seen["Height Retrace"]) / np.std(seen["Height"]))
+
+
+def test_a_loop_settles_on_the_surface_without_error() -> None:
+    z = loop(integral_gain=1500.0).follow(step(5e-9), DT, np.zeros(1))
+    assert z[-1, 0] == pytest.approx(5e-9, rel=1e-3)
+    assert z.max() < 5.5e-9
+
+
+def test_one_long_step_is_as_good_as_many_short_ones() -> None:
+    ramp = np.linspace(0.0, 1e-9, 11)[:, None]
+    fine = np.interp(np.linspace(0, 10, 101), np.arange(11), ramp[:, 0])[:, None]
+    a = loop(integral_gain=800.0).follow(ramp, 1e-3, np.zeros(1))
+    b = loop(integral_gain=800.0).follow(fine, 1e-4, np.zeros(1))
+    np.testing.assert_allclose(a[:, 0], b[::10, 0], atol=1e-15)
+
+
+def test_lower_gains_are_slower_and_higher_ones_overshoot() -> None:
+    at = {
+        gain: loop(integral_gain=gain).follow(step(5e-9, 1500), DT, np.zeros(1))[:, 0]
+        for gain in (50.0, 1500.0, 8000.0)
+    }
+    settled = {gain: int(np.argmax(z > 4.5e-9)) for gain, z in at.items()}
+    assert settled[50.0] > 10 * (settled[1500.0] - 10) > 0
+    assert at[8000.0].max() > 6e-9
+    assert at[50.0].max() <= 5e-9
+
+
+def test_gains_beyond_the_limit_oscillate_for_ever() -> None:
+    unstable = loop(integral_gain=12000.0)
+    assert unstable.oscillates
+    assert not loop(integral_gain=1500.0).oscillates
+    z = unstable.follow(step(0.0, 3000), DT, np.array([1e-6]))[-1000:, 0]
+    assert z.max() > 5e-9
+    assert z.min() < -5e-9
+    assert np.abs(z).max() < 200e-9
+
+
+def test_the_tip_parachutes_down_a_cliff_more_the_softer_the_setpoint() -> None:
+    def time_down(setpoint: float) -> int:
+        z = loop(setpoint=setpoint, integral_gain=300.0).follow(step(-100e-9, 2000), DT, np.zeros(1))[:, 0]
+        return int(np.argmax(z < -90e-9))
+
+    def time_up(setpoint: float) -> int:
+        z = loop(setpoint=setpoint, integral_gain=300.0).follow(step(100e-9, 2000), DT, np.zeros(1))[:, 0]
+        return int(np.argmax(z > 90e-9))
+
+    assert time_down(0.95) > 2 * time_down(0.7) > 2 * time_up(0.7)
+
+
+def test_low_gains_smear_trace_and_retrace_apart() -> None:
+    good, slow = asymmetry({"integral_gain": 1500.0}), asymmetry({"integral_gain": 60.0, "proportional_gain": 0.0})
+    assert good < 0.1
+    assert slow > 3 * good
+
+
+def test_unstable_gains_are_seen_in_height_and_amplitude() -> None:
+    good, bad = channels(integral_gain=1500.0), channels(integral_gain=12000.0)
+    assert bad["Amplitude"].std() > 5 * good["Amplitude"].std()
+    assert np.median(np.abs(np.diff(bad["Height"], axis=1))) > 5 * np.median(np.abs(np.diff(good["Height"], axis=1)))
+
+
+def test_without_feedback_the_height_is_constant_and_the_amplitude_shows_the_sample() -> None:
+    world = World.from_settings({"surface": "particles", "noise": {"scar_probability": 0.0}}, seed=3, start_s=0.0)
+    on = world.scan(REGION, (64, 96), 1.0, 0.0).channels()["Height"][1]
+    off = world.scan(REGION, (64, 96), 1.0, 100.0, Feedback(on=False)).channels()
+    assert off["Height"][1].std() < 0.05 * on.std()
+    high = on > np.percentile(on, 97)
+    assert off["Amplitude"][1][high].mean() < off["Amplitude"][1][~high].mean() - 0.3
+
+
+def test_a_setpoint_above_the_free_amplitude_never_touches() -> None:
+    seen = channels(setpoint=1.2)
+    assert seen["Height"].std() < 1e-9
+    assert seen["Height"].mean() > 1e-6
+    assert np.allclose(seen["Amplitude"], 1.0, atol=0.02)
+    assert np.abs(seen["Current"]).max() < 10e-12
+
+
+def test_amplitude_phase_and_current_answer_to_the_setpoint() -> None:
+    soft, hard = channels(setpoint=0.8), channels(setpoint=0.4)
+    assert np.median(soft["Amplitude"]) == pytest.approx(0.8, abs=0.01)
+    assert np.median(hard["Amplitude"]) == pytest.approx(0.4, abs=0.01)
+    assert np.median(hard["Phase"]) < np.median(soft["Phase"]) < 90.0
+    assert np.median(hard["Current"]) > 2 * np.median(soft["Current"])
+
+
+@pytest.mark.parametrize("said", [{"integral_gain": -1.0}, {"proportional_gain": float("nan")}, {"setpoint": 0.0}])
+def test_feedback_without_sense_is_refused(said: dict[str, float]) -> None:
+    with pytest.raises(InvalidValue):
+        loop(**said)
