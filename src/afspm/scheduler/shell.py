@@ -11,8 +11,9 @@ from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
 from afspm.model import ControlResponse, Packet, Response
+from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
-from afspm.transport.router import PeerAsked, PeerConnected
+from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
 from afspm.transport.translator_link import LinkReply, LinkUp
 from afspm.wire.frames import LONGEST_ID
 
@@ -48,6 +49,7 @@ class Shell:
         self._complaints = complaints
         self._log = log
         self._replay: tuple[Packet, ...] = ()
+        self._next_s = -math.inf
         self.ended = False
         sockets.publisher.history = self._history
 
@@ -63,13 +65,19 @@ class Shell:
         sockets = self._sockets
         for source in ready:
             if source is sockets.router:
-                self._requests()
+                self._requests(sockets.router.receive())
             elif source is sockets.link:
-                self._translator()
+                if (reply := sockets.link.receive()) is not None:
+                    self._take(events.TranslatorReply(reply.number, _response(reply)))
             elif source is sockets.subscriber:
                 self._packets()
-            else:
+            elif source is sockets.publisher:
                 sockets.publisher.serve()
+            elif source is sockets.router.monitor:
+                self._requests(sockets.router.follow())
+            else:
+                for change in sockets.link.follow():
+                    self._take(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
         self._deadlines()
 
     def close(self) -> None:
@@ -83,8 +91,8 @@ class Shell:
     def _take(self, event: events.Input) -> None:
         self._carry_out(self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns()))
 
-    def _requests(self) -> None:
-        for event in self._sockets.router.receive():
+    def _requests(self, received: list[RouterEvent]) -> None:
+        for event in received:
             if isinstance(event, PeerAsked):
                 self._request(event)
             elif isinstance(event, PeerConnected):
@@ -105,13 +113,6 @@ class Shell:
             self._sockets.router.reply(asked.connection, wire.encode_response(response))
             return
         self._take(events.RequestIn(asked.connection, name, request, asked.user))
-
-    def _translator(self) -> None:
-        for event in self._sockets.link.receive():
-            if isinstance(event, LinkReply):
-                self._take(events.TranslatorReply(event.number, _response(event)))
-            else:
-                self._take(events.TranslatorUp() if isinstance(event, LinkUp) else events.TranslatorDown())
 
     def _packets(self) -> None:
         for incoming in self._sockets.subscriber.receive():
@@ -134,28 +135,28 @@ class Shell:
 
     def _deadlines(self) -> None:
         now_s = self._clock.monotonic_s()
+        if now_s < self._next_s:
+            return
         due_s = self._journal.due_s
         if due_s is not None and now_s >= due_s:
             self._journal.follow(self._core.cached())
-        if self._wait_s(now_s) <= 0.0:
+        if self._core_due_s() <= now_s:
             self._take(events.Tick())
 
-    def _wait_s(self, now_s: float) -> float:
-        """Real seconds until the next deadline of the core's."""
-        wait_s = math.inf
-        if (deadline_s := self._core.deadline_s()) is not None:
-            wait_s = deadline_s - now_s
+    def _core_due_s(self) -> float:
+        """When, in real monotonic time, the core is due."""
+        due_s = self._core.deadline_s()
         if (deadline_ns := self._core.deadline_ns()) is not None:
-            wait_s = min(wait_s, self._clock.real_s((deadline_ns - self._clock.now_ns()) * 1e-9))
-        return wait_s
+            wait_s = self._clock.real_s((deadline_ns - self._clock.now_ns()) * 1e-9)
+            due_s = min(math.inf if due_s is None else due_s, self._clock.monotonic_s() + wait_s)
+        return math.inf if due_s is None else due_s
 
     def _timeout_ms(self) -> int | None:
-        now_s = self._clock.monotonic_s()
-        wait_s = self._wait_s(now_s)
-        if (due_s := self._journal.due_s) is not None:
-            wait_s = min(wait_s, due_s - now_s)
-        # rounded up: woken up before the deadline we would only come back
-        return None if wait_s == math.inf else max(0, math.ceil(wait_s * 1000.0))
+        due_s = self._core_due_s()
+        if (journal_s := self._journal.due_s) is not None and journal_s < due_s:
+            due_s = journal_s
+        self._next_s = due_s
+        return None if due_s == math.inf else milliseconds(due_s - self._clock.monotonic_s())
 
     # --- what goes out ---
 

@@ -9,7 +9,7 @@ import zmq
 from afspm import wire
 from afspm.errors import WireError
 from afspm.transport.complaints import Complaints
-from afspm.transport.frames import readable
+from afspm.transport.frames import receive, send
 from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
@@ -36,19 +36,22 @@ class ControlClient:
     def send(self, frames: Sequence[bytes]) -> None:
         """Ask; dropped while there is no scheduler."""
         try:
-            self.socket.send_multipart([b"", *frames], zmq.NOBLOCK)
+            send(self.socket, [b"", *frames])
         except zmq.Again:
             return
 
     def receive(self) -> list[Incoming]:
-        """Answers, and the scheduler's coming and going."""
+        """The next answer."""
+        frames = [frame.bytes for frame in receive(self.socket)]
+        try:
+            return [self._interpret(frames)]
+        except WireError as error:
+            self._complaints.say(f"dropped a reply from {self._address}: {error}")
+            return []
+
+    def follow(self) -> list[Incoming]:
+        """The scheduler's coming and going."""
         found: list[Incoming] = []
-        while readable(self.socket):
-            frames = self.socket.recv_multipart(zmq.NOBLOCK)
-            try:
-                found.append(self._interpret(frames))
-            except WireError as error:
-                self._complaints.say(f"dropped a reply from {self._address}: {error}")
         for event in self.monitor.drain():
             if event.kind == CONNECTED:
                 self._greet()

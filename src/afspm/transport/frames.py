@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import zmq
+from zmq.backend import Socket as _Library
 
 if TYPE_CHECKING:
     Socket = zmq.Socket[bytes]
@@ -13,19 +15,34 @@ if TYPE_CHECKING:
 _LARGE = 32 * 1024
 
 
+# The library's own methods, without the checks and the enumerations of the classes above them: those take longer than
+# the sending and receiving itself.
+_send: Any = _Library.send
+_receive: Any = _Library.recv
+_get: Any = _Library.get
+_NOBLOCK, _SNDMORE, _EVENTS, _POLLIN = int(zmq.NOBLOCK), int(zmq.SNDMORE), int(zmq.EVENTS), int(zmq.POLLIN)
+
+
 def readable(socket: Socket) -> bool:
     """Whether a message can be received at once."""
-    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+    return bool(_get(socket, _EVENTS) & _POLLIN)
 
 
 def receive(socket: Socket) -> list[zmq.Frame]:
     """One whole message as it lies in the library's buffers. Raises zmq.Again if there is none."""
-    frame = socket.recv(zmq.NOBLOCK, copy=False)
+    frame: zmq.Frame = _receive(socket, _NOBLOCK, copy=False)
     frames = [frame]
     while frame.more:
-        frame = socket.recv(zmq.NOBLOCK, copy=False)
+        frame = _receive(socket, _NOBLOCK, copy=False)
         frames.append(frame)
     return frames
+
+
+def send(socket: Socket, frames: Sequence[bytes]) -> None:
+    """Send one whole, small message. Raises zmq.Again if nobody is there to take it."""
+    for frame in frames[:-1]:
+        _send(socket, frame, _NOBLOCK | _SNDMORE)
+    _send(socket, frames[-1], _NOBLOCK)
 
 
 def payload_of(frame: zmq.Frame) -> bytes | memoryview:
@@ -33,17 +50,22 @@ def payload_of(frame: zmq.Frame) -> bytes | memoryview:
     return frame.bytes if len(frame) < _LARGE else memoryview(frame.buffer).toreadonly()
 
 
-def send_payload(socket: Socket, payload: bytes | memoryview, flags: int) -> None:
-    """Send one frame; what was received goes out from the buffer that it came in."""
+def send_packet(socket: Socket, head: Sequence[bytes], payload: bytes | memoryview, tail: bytes | None) -> None:
+    """Send a message with a payload, which if it was received goes out from the buffer that it came in."""
+    for frame in head:
+        _send(socket, frame, _SNDMORE)
+    flags = 0 if tail is None else _SNDMORE
     if isinstance(payload, memoryview):
         origin = payload.obj
         if isinstance(origin, zmq.Frame) and len(origin) == payload.nbytes:
-            socket.send(origin, flags, copy=False)
+            _send(socket, origin, flags, copy=False)
         else:
             # somebody else's buffer may change after we return
-            socket.send(payload.tobytes(), flags)
+            _send(socket, payload.tobytes(), flags)
     else:
-        socket.send(payload, flags, copy=len(payload) < _LARGE)
+        _send(socket, payload, flags, copy=len(payload) < _LARGE)
+    if tail is not None:
+        _send(socket, tail, 0)
 
 
 def user_of(frame: zmq.Frame) -> str | None:

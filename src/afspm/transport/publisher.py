@@ -8,7 +8,7 @@ import zmq
 
 from afspm import wire
 from afspm.model import Packet
-from afspm.transport.frames import readable, send_payload
+from afspm.transport.frames import readable, send_packet
 from afspm.transport.network import Network
 from afspm.transport.replay import Marker, is_reserved, spelled_out
 
@@ -36,13 +36,8 @@ class Publisher:
 
     def publish(self, packet: Packet) -> None:
         """Send to all who subscribed to the packet's envelope. Never blocks."""
-        socket = self.socket
-        socket.send(packet.envelope.encode(), zmq.SNDMORE)
-        if packet.time_ns is None:
-            send_payload(socket, packet.payload, 0)
-        else:
-            send_payload(socket, packet.payload, zmq.SNDMORE)
-            socket.send(wire.encode_time(packet.time_ns))
+        tail = None if packet.time_ns is None else wire.encode_time(packet.time_ns)
+        send_packet(self.socket, [packet.envelope.encode()], packet.payload, tail)
 
     def kill(self) -> None:
         """The experiment has ended: tell everyone to close."""
@@ -87,9 +82,7 @@ class Publisher:
         for prefix in spelled_out(prefix.encode() for prefix in marker.prefixes):
             socket.setsockopt(zmq.SUBSCRIBE, prefix)
         for packet in self.history(topic, marker.prefixes, marker.since_ns):
-            socket.send(topic, zmq.SNDMORE)
-            socket.send(packet.envelope.encode(), zmq.SNDMORE)
-            send_payload(socket, packet.payload, zmq.SNDMORE)
-            socket.send(b"" if packet.time_ns is None else wire.encode_time(packet.time_ns))
+            tail = b"" if packet.time_ns is None else wire.encode_time(packet.time_ns)
+            send_packet(socket, [topic, packet.envelope.encode()], packet.payload, tail)
         socket.send(topic)
         socket.setsockopt(zmq.UNSUBSCRIBE, topic)

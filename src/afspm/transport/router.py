@@ -8,11 +8,11 @@ from typing import NamedTuple
 import zmq
 
 from afspm.transport.complaints import Complaints
-from afspm.transport.frames import readable, receive, user_of
+from afspm.transport.frames import readable, receive, send, user_of
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
-from afspm.transport.network import Network
+from afspm.transport.network import QUEUE_LENGTH, Network
 
-_BATCH = 256
+_DESCRIPTOR = int(zmq.SRCFD)
 
 
 class PeerConnected(NamedTuple):
@@ -43,10 +43,11 @@ RouterEvent = PeerConnected | PeerDisconnected | PeerAsked
 class _Peer:
     """One connection."""
 
-    __slots__ = ("connection", "identity", "name", "user")
+    __slots__ = ("connection", "descriptor", "identity", "name", "user")
 
-    def __init__(self, connection: int) -> None:
+    def __init__(self, connection: int, descriptor: int) -> None:
         self.connection = connection
+        self.descriptor = descriptor
         self.identity: bytes | None = None
         self.name = ""
         self.user: str | None = None
@@ -70,73 +71,76 @@ class Router:
         self.address = network.bind(self.socket, address)
 
     def receive(self) -> list[RouterEvent]:
-        """What has come, a batch at a time: connections in the order in which they came and went, and what came by
-        one that is gone before its going."""
-        messages: list[list[zmq.Frame]] = []
-        while len(messages) < _BATCH and readable(self.socket):
-            messages.append(receive(self.socket))
-        # after the messages: every connection that they came by is known then
-        changes = self._follow_connections()
-        dying = {peer: descriptor for descriptor, peer, came in changes if not came}
-        asked: list[tuple[_Peer, RouterEvent]] = []
-        for frames in messages:
-            peer = self._sender(frames[0], dying)
-            if peer is not None and (event := self._interpret(peer, frames)) is not None:
-                asked.append((peer, event))
-        if not changes:
-            return [event for _, event in asked]
+        """The next request, and what happened to connections if it may have to do with it."""
+        frames = receive(self.socket)
+        identity, descriptor = frames[0].bytes, int(frames[0].get(_DESCRIPTOR))
+        peer = self._by_descriptor.get(descriptor)
+        if peer is not None and peer.identity == identity and not readable(self.monitor.socket):
+            return self._interpret(peer, frames)
+        # the monitor tells everything in order: it knows of every connection that anything has come by
+        changes = self._changes()
+        current = self._by_descriptor.get(descriptor)
+        gone = next(
+            (p for p, came in changes if not came and (p.descriptor, p.identity) == (descriptor, identity)), None
+        )
+        if current is None or (current.identity not in (identity, None) and gone is not None):
+            said = [] if gone is None else self._interpret(gone, frames)
+            return said + [self._tell(peer, came=came) for peer, came in changes]
+        if current.identity not in (identity, None):
+            # what was left of an earlier connection had been taken for the first words of this one
+            changes += [(current, False), (current := self._new(descriptor), True)]
+        found = [self._tell(peer, came=came) for peer, came in changes]
+        self._introduce(current, frames[0], identity)
+        return found + self._interpret(current, frames)
+
+    def follow(self) -> list[RouterEvent]:
+        """Connections that came and went, in order, after what they said before."""
         found: list[RouterEvent] = []
-        for _, peer, came in changes:
-            if came:
-                found.append(PeerConnected(peer.connection))
-                continue
-            found += [event for asker, event in asked if asker is peer]
-            found.append(PeerDisconnected(peer.connection))
-            self._identities.pop(peer.connection, None)
-        return found + [event for asker, event in asked if asker not in dying]
+        for _ in range(QUEUE_LENGTH):
+            if not readable(self.socket):
+                break
+            found += self.receive()
+        return found + [self._tell(peer, came=came) for peer, came in self._changes()]
 
     def reply(self, connection: int, frames: Sequence[bytes]) -> None:
         """Answer by `connection`, if it is still there. Never blocks."""
         identity = self._identities.get(connection)
         if identity is not None:
-            self.socket.send_multipart([identity, b"", *frames], zmq.NOBLOCK)
+            send(self.socket, [identity, b"", *frames])
 
-    def _interpret(self, peer: _Peer, frames: list[zmq.Frame]) -> PeerAsked | None:
+    def _interpret(self, peer: _Peer, frames: list[zmq.Frame]) -> list[RouterEvent]:
         if len(frames) < 2 or len(frames[1]):
             self._complaints.say(f"dropped a request of {peer.name or 'somebody'}: no empty frame before it")
-            return None
-        return PeerAsked(peer.connection, peer.name, peer.user, [frame.bytes for frame in frames[2:]])
+            return []
+        return [PeerAsked(peer.connection, peer.name, peer.user, [frame.bytes for frame in frames[2:]])]
 
-    def _follow_connections(self) -> list[tuple[int, _Peer, bool]]:
-        """Take in the monitor's events: (descriptor, peer, whether it came or went), in order."""
+    def _changes(self) -> list[tuple[_Peer, bool]]:
+        """The monitor's events: who, and whether it came or went."""
         changes = []
         for kind, descriptor in self.monitor.drain():
             gone = self._by_descriptor.pop(descriptor, None)
             if gone is not None:
-                changes.append((descriptor, gone, False))
+                changes.append((gone, False))
             if kind == ACCEPTED:
-                self._connections += 1
-                peer = self._by_descriptor[descriptor] = _Peer(self._connections)
-                changes.append((descriptor, peer, True))
+                changes.append((self._new(descriptor), True))
         return changes
 
-    def _sender(self, first: zmq.Frame, dying: dict[_Peer, int]) -> _Peer | None:
-        """Whose message this is; None if its connection is long gone."""
-        identity = first.bytes
-        descriptor = int(first.get(zmq.SRCFD))
-        # a descriptor is given out again at once: what an earlier connection said may still have been waiting
-        for peer, old in dying.items():
-            if old == descriptor and peer.identity in (identity, None):
-                return self._named(peer, first, identity)
-        current = self._by_descriptor.get(descriptor)
-        return None if current is None else self._named(current, first, identity)
+    def _new(self, descriptor: int) -> _Peer:
+        self._connections += 1
+        peer = self._by_descriptor[descriptor] = _Peer(self._connections, descriptor)
+        return peer
 
-    def _named(self, peer: _Peer, first: zmq.Frame, identity: bytes) -> _Peer | None:
+    def _tell(self, peer: _Peer, *, came: bool) -> RouterEvent:
+        if came:
+            return PeerConnected(peer.connection)
+        self._identities.pop(peer.connection, None)
+        return PeerDisconnected(peer.connection)
+
+    def _introduce(self, peer: _Peer, first: zmq.Frame, identity: bytes) -> None:
         if peer.identity is None:
             peer.identity = self._identities[peer.connection] = identity
             peer.name = _name(identity)
             peer.user = user_of(first) if self._with_keys else None
-        return peer if peer.identity == identity else None
 
     def close(self) -> None:
         self.monitor.close()

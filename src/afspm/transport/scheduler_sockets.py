@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
-import zmq
-
 from afspm.errors import ConfigError
 from afspm.model import Packet
 from afspm.transport.complaints import Complaints
 from afspm.transport.launching import Launched
+from afspm.transport.monitor import Monitor
 from afspm.transport.network import Network
+from afspm.transport.polling import poller
 from afspm.transport.publisher import Publisher
 from afspm.transport.router import Router
 from afspm.transport.subscriber import Subscriber
 from afspm.transport.translator_link import TranslatorLink
 from afspm.transport.wakeup import WakeUp
 
-Source = Router | TranslatorLink | Subscriber | Publisher
+Source = Router | TranslatorLink | Subscriber | Publisher | Monitor
 
 
 class SchedulerSockets:
@@ -46,29 +46,21 @@ class SchedulerSockets:
         self.subscriber = Subscriber(
             self._network, launch.name, sockets.subscribe[0], None, complaints, since_ns=since_ns, filtered=False
         )
-        self._sources: dict[zmq.Socket[bytes], Source] = {
-            self.router.socket: self.router,
-            self.router.monitor.socket: self.router,
-            self.link.socket: self.link,
-            self.link.monitor.socket: self.link,
-            self.subscriber.socket: self.subscriber,
-            self.subscriber.monitor.socket: self.subscriber,
-            self.publisher.socket: self.publisher,
-        }
-        self._poller = zmq.Poller()
-        for socket in self._sources:
-            self._poller.register(socket, zmq.POLLIN)
-        self._poller.register(self._wake_up.fileno(), zmq.POLLIN)
+        self._poller = poller(self._wake_up)
+        self._poller.register(self.router.socket, self.router, sends=True)
+        self._poller.register(self.link.socket, self.link, sends=True)
+        self._poller.register(self.publisher.socket, self.publisher, sends=True)
+        self._poller.register(self.subscriber.socket, self.subscriber)
+        self._poller.register(self.subscriber.monitor.socket, self.subscriber)
+        self._poller.register(self.router.monitor.socket, self.router.monitor)
+        self._poller.register(self.link.monitor.socket, self.link.monitor)
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
         """Those that have something to receive; returns early, perhaps with none, after `wake_up`."""
-        found: list[Source] = []
-        for ready, _ in self._poller.poll(timeout_ms):
-            if isinstance(ready, int):
-                self._wake_up.take()
-            elif (source := self._sources[ready]) not in found:
-                found.append(source)
-        return found
+        sources, woken = self._poller.wait(timeout_ms)
+        if woken:
+            self._wake_up.take()
+        return sources
 
     def wake_up(self) -> None:
         """End a `wait` under way, or the next. From any thread."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import zmq
 
 from afspm.transport.complaints import Complaints
-from afspm.transport.frames import readable
+from afspm.transport.frames import receive, send
 from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
 
@@ -30,9 +30,6 @@ class LinkReply(NamedTuple):
     frames: Sequence[bytes]
 
 
-LinkEvent = LinkUp | LinkDown | LinkReply
-
-
 class TranslatorLink:
     """Asks the translator, ours or of version 1: a REP socket gives back the number that stands before the empty frame,
     so that a late answer is never taken for another's.
@@ -50,23 +47,22 @@ class TranslatorLink:
     def send(self, number: int, frames: Sequence[bytes]) -> bool:
         """Ask; False if there is no translator to ask."""
         try:
-            self.socket.send_multipart([b"%d" % number, b"", *frames], zmq.NOBLOCK)
+            send(self.socket, [b"%d" % number, b"", *frames])
         except zmq.Again:
             return False
         return True
 
-    def receive(self) -> list[LinkEvent]:
-        """Answers, and the translator's coming and going."""
-        found: list[LinkEvent] = []
-        while readable(self.socket):
-            frames = self.socket.recv_multipart(zmq.NOBLOCK)
-            if len(frames) < 3 or frames[1] or not frames[0].isdigit() or len(frames[0]) > _LONGEST_NUMBER:
-                self._complaints.say(f"dropped a malformed answer from {self._address}")
-                continue
-            found.append(LinkReply(int(frames[0]), frames[2:]))
-        for event in self.monitor.drain():
-            found.append(LinkUp() if event.kind == CONNECTED else LinkDown())
-        return found
+    def receive(self) -> LinkReply | None:
+        """The next answer; None: it was none."""
+        frames = [frame.bytes for frame in receive(self.socket)]
+        if len(frames) < 3 or frames[1] or not frames[0].isdigit() or len(frames[0]) > _LONGEST_NUMBER:
+            self._complaints.say(f"dropped a malformed answer from {self._address}")
+            return None
+        return LinkReply(int(frames[0]), frames[2:])
+
+    def follow(self) -> list[LinkUp | LinkDown]:
+        """The translator's coming and going."""
+        return [LinkUp() if event.kind == CONNECTED else LinkDown() for event in self.monitor.drain()]
 
     def close(self) -> None:
         self.monitor.close()

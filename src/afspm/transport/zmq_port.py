@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable, Sequence
-
-import zmq
+from collections.abc import Sequence
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
@@ -14,12 +11,11 @@ from afspm.transport.complaints import Complaints
 from afspm.transport.control_client import ControlClient
 from afspm.transport.history import Published
 from afspm.transport.network import Network
+from afspm.transport.polling import milliseconds, poller
 from afspm.transport.port import Incoming
 from afspm.transport.publisher import Publisher
 from afspm.transport.subscriber import Subscriber
 from afspm.transport.wakeup import WakeUp
-
-Drain = Callable[[], list[Incoming]]
 
 
 class ZmqPort:
@@ -57,23 +53,18 @@ class ZmqPort:
         self._publisher = None
         self._published = Published(clock)
         self._control = None
-        self._drains: dict[zmq.Socket[bytes], Drain] = {}
+        self._poller = poller(self._wake_up)
         if publish is not None:
             self._publisher = Publisher(network, publish, self._published)
-            self._drains[self._publisher.socket] = self._serve
+            self._poller.register(self._publisher.socket, self._serve, sends=True)
         if control is not None:
             self._control = ControlClient(network, name, control, complaints)
-            self._listen(self._control)
+            self._poller.register(self._control.socket, self._control.receive, sends=True)
+            self._poller.register(self._control.monitor.socket, self._control.follow)
         for address in subscribe:
-            self._listen(Subscriber(network, name, address, envelopes, complaints))
-        self._poller = zmq.Poller()
-        for socket in self._drains:
-            self._poller.register(socket, zmq.POLLIN)
-        self._poller.register(self._wake_up.fileno(), zmq.POLLIN)
-
-    def _listen(self, source: ControlClient | Subscriber) -> None:
-        self._drains[source.socket] = source.receive
-        self._drains[source.monitor.socket] = source.receive
+            subscriber = Subscriber(network, name, address, envelopes, complaints)
+            self._poller.register(subscriber.socket, subscriber.receive)
+            self._poller.register(subscriber.monitor.socket, subscriber.receive)
 
     @property
     def clock(self) -> Clock:
@@ -92,12 +83,10 @@ class ZmqPort:
         self._control.send(frames)
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
-        # rounded up: woken up before the deadline, the caller would only come back
-        timeout_ms = None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
-        found: list[Incoming] = []
-        for ready, _ in self._poller.poll(timeout_ms):
-            # a descriptor is the wake-up's; everything else is a socket
-            found += self._wake_up.take() if isinstance(ready, int) else self._drains[ready]()
+        drains, woken = self._poller.wait(milliseconds(timeout_s))
+        found: list[Incoming] = self._wake_up.take() if woken else []
+        for drain in drains:
+            found += drain()
         return found
 
     def publish(self, envelope: str, payload: bytes) -> None:

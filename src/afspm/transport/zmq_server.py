@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import zmq
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
-from afspm.transport.frames import readable, receive, user_of
+from afspm.transport.frames import readable, receive, send, user_of
 from afspm.transport.history import Published
 from afspm.transport.network import Network
+from afspm.transport.polling import milliseconds, poller
 from afspm.transport.port import RequestReceived, Served, SubscriberJoined
 from afspm.transport.publisher import Publisher
 from afspm.transport.wakeup import WakeUp
@@ -45,11 +45,10 @@ class ZmqServerPort:
         self._publisher = None if publish is None else Publisher(network, publish, self._published)
         self._socket = network.socket(zmq.ROUTER)
         self.serve_address = network.bind(self._socket, serve)
-        self._poller = zmq.Poller()
-        self._poller.register(self._socket, zmq.POLLIN)
-        self._poller.register(self._wake_up.fileno(), zmq.POLLIN)
+        self._poller = poller(self._wake_up)
+        self._poller.register(self._socket, self._request, sends=True)
         if self._publisher is not None:
-            self._poller.register(self._publisher.socket, zmq.POLLIN)
+            self._poller.register(self._publisher.socket, self._serve, sends=True)
 
     @property
     def clock(self) -> Clock:
@@ -61,17 +60,14 @@ class ZmqServerPort:
         return self._publisher.address if self._publisher else None
 
     def poll(self, timeout_s: float | None) -> list[Served]:
-        timeout_ms = None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
-        found: list[Served] = []
-        self._poller.modify(self._socket, zmq.POLLIN if self._asker is None else 0)
-        for ready, _ in self._poller.poll(timeout_ms):
-            if ready is self._socket:
-                found += self._request()
-            elif isinstance(ready, int):
-                found += self._wake_up.take()
-            elif self._publisher is not None and self._publisher.serve():
-                found.append(SubscriberJoined())
+        drains, woken = self._poller.wait(milliseconds(timeout_s))
+        found: list[Served] = self._wake_up.take() if woken else []
+        for drain in drains:
+            found += drain()
         return found
+
+    def _serve(self) -> list[Served]:
+        return [SubscriberJoined()] if self._publisher is not None and self._publisher.serve() else []
 
     def _request(self) -> list[Served]:
         """The next request, if the last one was answered."""
@@ -93,7 +89,7 @@ class ZmqServerPort:
     def reply(self, frames: Sequence[bytes] | None) -> None:
         asker, self._asker = self._asker, None
         if asker is not None and frames is not None:
-            self._socket.send_multipart([*asker, *frames], zmq.NOBLOCK)
+            send(self._socket, [*asker, *frames])
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
         if self._publisher is None:

@@ -1,0 +1,63 @@
+"""The processes that are measured against each other, each in one role."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from afspm.clock import ExperimentClock
+from afspm.runtime.launch import Launch, Sockets
+from afspm.supervisor.ports import FreePorts
+
+CLOCK = ExperimentClock.real()
+PORTS = FreePorts()
+
+
+class Roles(ExitStack):
+    """Starts processes, and ends them when the block is left."""
+
+    def start(self, role: str, **arguments: Any) -> str:
+        """A process of `benchmarks.roles`; returns the line that it prints when it is ready."""
+        process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.roles", role, json.dumps(arguments)], stdout=subprocess.PIPE, text=True
+        )
+        self.callback(_end, process)
+        assert process.stdout is not None
+        return process.stdout.readline().strip()
+
+    def scheduler(self, translator_publish: str, translator_serve: str) -> tuple[str, str]:
+        """The real scheduler, which keeps its state on disk; returns the addresses (publish, serve)."""
+        folder = self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
+        publish, serve = PORTS.address(), PORTS.address()
+        launch = Launch(
+            "scheduler",
+            "afspm.scheduler.Scheduler",
+            sockets=Sockets(publish, (translator_publish,), serve, translator_serve),
+            state_dir=folder,
+            log_level="ERROR",
+        )
+        process = subprocess.Popen([sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE)
+        self.callback(_end, process)
+        assert process.stdin is not None
+        process.stdin.write(launch.to_json().encode() + b"\n")
+        process.stdin.flush()
+        return publish, serve
+
+
+@contextmanager
+def roles() -> Iterator[Roles]:
+    with Roles() as started:
+        yield started
+
+
+def _end(process: subprocess.Popen[Any]) -> None:
+    for stream in (process.stdin, process.stdout):
+        if stream is not None:
+            stream.close()
+    process.kill()
+    process.wait()

@@ -1,0 +1,113 @@
+"""One process of a measurement: `python -m benchmarks.roles <role> <arguments as JSON>`. Prints its addresses."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import zmq
+
+from afspm import wire
+from afspm.clock import ExperimentClock
+from afspm.model import Response
+from afspm.transport.network import Network
+from afspm.transport.port import PacketReceived, RequestReceived
+from afspm.transport.zmq_port import ZmqPort
+from afspm.transport.zmq_server import ZmqServerPort
+
+ANY = "tcp://127.0.0.1:0"
+LAST = b"last"
+PROBE = 100
+"""Payloads up to this size are no scans: they ask whether anybody is there, or say that it was the last."""
+
+
+def bound(socket: Any) -> str:
+    return f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
+
+
+def ready(*addresses: str) -> None:
+    print(*addresses, flush=True)
+
+
+def bare_request_proxy() -> None:
+    context: zmq.Context[Any] = zmq.Context()
+    front, back = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
+    ready(bound(front), bound(back))
+    zmq.proxy(front, back)
+
+
+def bare_rep(back: str) -> None:
+    socket = zmq.Context().socket(zmq.REP)
+    socket.connect(back)
+    ready()
+    while True:
+        socket.recv_multipart()
+        socket.send(b"\0")
+
+
+def translator() -> None:
+    """Answers every request with a success, having read it."""
+    port = ZmqServerPort(Network(), ExperimentClock.real(), serve=ANY, publish=ANY)
+    ready(str(port.publish_address), port.serve_address)
+    while True:
+        for received in port.poll(None):
+            if isinstance(received, RequestReceived):
+                request = wire.decode_request(received.frames)
+                port.reply(wire.encode_response(Response(0, id=request.id)))
+
+
+def bare_packet_proxy(publisher: str, queue: int) -> None:
+    context: zmq.Context[Any] = zmq.Context()
+    front, back = context.socket(zmq.XSUB), context.socket(zmq.XPUB)
+    for socket in (front, back):
+        socket.set_hwm(queue)
+    front.connect(publisher)
+    ready(bound(back))
+    zmq.proxy(front, back)
+
+
+class Tally:
+    """Tells the measuring process when something arrives for the first time, and when the last of a batch does."""
+
+    def __init__(self, address: str) -> None:
+        self._socket: Any = zmq.Context.instance().socket(zmq.PUSH)
+        self._socket.connect(address)
+        self._there = False
+        self._count = 0
+
+    def add(self, size: int) -> None:
+        if size > PROBE:
+            self._count += 1
+        elif not self._there:
+            self._there = True
+            self._socket.send(b"there")
+        elif size == len(LAST):
+            self._socket.send(b"%d" % self._count)
+            self._count = 0
+
+
+def bare_subscriber(source: str, tally: str, queue: int) -> None:
+    socket: Any = zmq.Context.instance().socket(zmq.SUB)
+    socket.set_hwm(queue)
+    socket.setsockopt(zmq.SUBSCRIBE, b"Scan2d")
+    socket.setsockopt(zmq.SUBSCRIBE, b"Mark")
+    socket.connect(source)
+    told = Tally(tally)
+    ready()
+    while True:
+        told.add(len(socket.recv_multipart(copy=False)[1]))
+
+
+def our_subscriber(source: str, tally: str, name: str) -> None:
+    port = ZmqPort(Network(), name, ExperimentClock.real(), subscribe=[source], envelopes=["Scan2d", "Mark"])
+    told = Tally(tally)
+    ready()
+    while True:
+        for incoming in port.poll(None):
+            if isinstance(incoming, PacketReceived):
+                told.add(len(incoming.packet.payload))
+
+
+if __name__ == "__main__":
+    globals()[sys.argv[1]](**json.loads(sys.argv[2]))

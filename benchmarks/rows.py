@@ -1,0 +1,69 @@
+"""The rows of the benchmark table: what is measured, and what is asked of it.
+
+A measurement is a function that yields rows, registered with `@measurement`; put it into a module of this package and
+name the module in `__main__.MODULES`.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line.
+
+    Attributes:
+        name: what was measured.
+        unit: of `ours` and `bare`.
+        ours, bare: medians; `bare` is None where there is nothing to compare with.
+        ratio: ours over bare; ours itself where there is nothing to compare with.
+        target: what `ratio` is to be.
+        better: whether a low or a high ratio is wanted.
+    """
+
+    name: str
+    unit: str
+    ours: float
+    bare: float | None
+    target: float
+    better: Literal["low", "high"] = "low"
+
+    @property
+    def ratio(self) -> float:
+        return self.ours if self.bare is None else self.ours / self.bare
+
+    @property
+    def met(self) -> bool:
+        return self.ratio <= self.target if self.better == "low" else self.ratio >= self.target
+
+    def to_json(self) -> dict[str, object]:
+        sign = "<=" if self.better == "low" else ">="
+        return {
+            "name": self.name,
+            "unit": self.unit,
+            "ours": self.ours,
+            "bare": self.bare,
+            "ratio": self.ratio,
+            "target": f"{sign} {self.target:g}",
+            "met": self.met,
+        }
+
+
+Measurement = Callable[[], Iterator[Row]]
+MEASUREMENTS: dict[str, Measurement] = {}
+
+
+def measurement(function: Measurement) -> Measurement:
+    """Register a function that yields rows, under its name."""
+    MEASUREMENTS[function.__name__] = function
+    return function
+
+
+def alternate(ours: Callable[[], float], bare: Callable[[], float], times: int) -> tuple[float, float]:
+    """Medians of both, measured in turn, so that whatever else the machine does is shared by both."""
+    pairs = [(ours(), bare()) if n % 2 else (bare(), ours())[::-1] for n in range(times)]
+    return statistics.median(p[0] for p in pairs), statistics.median(p[1] for p in pairs)
