@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TextIO
@@ -12,8 +12,9 @@ from typing import TextIO
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
-from afspm.logic.supervision import Policy
-from afspm.runtime.connect import guest_facts
+from afspm.experiment.wiring import connectable
+from afspm.runtime.connect import GUEST, guest_facts
+from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor import run_folder, summary
 from afspm.supervisor.log import SUPERVISOR, RunLog
 from afspm.supervisor.ports import FreePorts
@@ -64,7 +65,7 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
         run_folder.write_experiment(folder, experiment.expanded())
         run_folder.write_run(folder, run_facts(experiment.name, starts, clock))
         log.write(SUPERVISOR, logging.INFO, f"{experiment.name}: {len(starts)} processes, into {folder}")
-        supervisor = Supervisor([from_start(start) for start in starts], log, clock, Policy())
+        supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy())
         outcome = supervisor.run()
         for line in summary.lines(outcome, folder):
             log.write(SUPERVISOR, logging.INFO, line)
@@ -80,23 +81,10 @@ def dry_run(experiment: Experiment, options: Options = Options()) -> list[Start]
 
 
 def run_facts(name: str, starts: Sequence[Start], clock: ExperimentClock) -> dict[str, object]:
-    """What a script needs to know to take part in this run, for run.json.
-
-    The launch line of a component is there as it is, so that whoever joins is connected just as that is.
-    """
-    by_role = {start.role: start.launch for start in starts}
-    scheduler = by_role.get(Role.SCHEDULER)
-    components = [start.launch for start in starts if start.role is Role.COMPONENT]
-    component = next((launch for launch in components if launch.sockets.control), None)
-    some = component or scheduler
-    return {
+    """What run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
+    facts: dict[str, object] = {
         "name": name,
-        "scheduler": None
-        if scheduler is None
-        else {"publish": scheduler.sockets.publish, "control": scheduler.sockets.serve},
         "clock": clock.as_dict(),
-        "problems": dict(some.problems) if some else {},
-        "guest": guest_facts(component) if component else None,
         "processes": {
             start.launch.name: {
                 "role": start.role.value,
@@ -106,6 +94,20 @@ def run_facts(name: str, starts: Sequence[Start], clock: ExperimentClock) -> dic
             for start in starts
         },
     }
+    host = _example_of_a_guest(starts)
+    return facts if host is None else {**facts, GUEST: guest_facts(host)}
+
+
+def _example_of_a_guest(starts: Sequence[Start]) -> Launch | None:
+    """The launch line of somebody who is connected as a guest would be; None where that can't be known."""
+    by_role = {start.role: start.launch for start in reversed(starts)}
+    scheduler = by_role.get(Role.SCHEDULER)
+    if scheduler is None or scheduler.sockets.publish is None or scheduler.sockets.serve is None:
+        component = by_role.get(Role.COMPONENT)
+        return component if component and component.sockets.subscribe and component.sockets.control else None
+    sockets = Sockets(subscribe=(connectable(scheduler.sockets.publish),), control=connectable(scheduler.sockets.serve))
+    keys = by_role[Role.COMPONENT].keys if Role.COMPONENT in by_role else scheduler.keys
+    return replace(scheduler, sockets=sockets, keys=keys)
 
 
 def _starts(
@@ -126,11 +128,12 @@ def _starts(
 
 
 def _clock(experiment: Experiment, speed: float | None) -> ExperimentClock:
-    section = experiment.resolved.clock
-    if speed is not None and not experiment.resolved.simulated:
+    clock = experiment.clock()
+    if speed is None:
+        return clock
+    if not experiment.resolved.simulated:
         raise ConfigError("a real microscope has real time", where="--speed", hint="leave --speed away")
-    start_s = section.start.timestamp() if section.start else None
-    return ExperimentClock.starting_now(start_s, section.speed if speed is None else speed)
+    return replace(clock, speed=speed)
 
 
 def _now() -> datetime:

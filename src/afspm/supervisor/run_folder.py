@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import FileError
+from afspm.runtime.connect import LATEST_FILE, RUN_FILE
 
 EXPERIMENT_FILE = "experiment.toml"
-RUN_FILE = "run.json"
 LOG_FILE = "log.txt"
 STATE_DIR = "state"
-LATEST_FILE = "latest"
 MOST_RUNS_A_SECOND = 1000
 
 

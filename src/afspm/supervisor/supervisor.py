@@ -6,6 +6,7 @@ What to do about a child is decided by `logic.supervision.ChildWatch`, how a run
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -55,6 +56,7 @@ class _Child:
     process: ChildProcess | None = None
     lines: LineReader = field(default_factory=LineReader)
     starts: int = 0
+    up: bool = False
     given_up: bool = False
     last_exit: str = ""
 
@@ -101,6 +103,10 @@ class Supervisor:
         )
         return Outcome(self._ending.why, self._ending.text, reports, self._clock.monotonic_s() - began_s)
 
+    def stop(self) -> None:
+        """End the run as Ctrl-C does. From any thread; a second call kills at once."""
+        self._wakeup.post(signals.Signalled(signal.SIGINT))
+
     # --- what comes in ---
 
     def _wait(self) -> None:
@@ -109,6 +115,9 @@ class Supervisor:
         now_s = self._clock.monotonic_s()
         for beat in beats:
             child = self._children[beat.name]
+            if not child.up:
+                child.up = True
+                self._log.write(child.name, logging.DEBUG, "is up")
             self._carry_out(child, child.watch.beat(beat, now_s))
         for event in self._wakeup.take():
             match event:
@@ -166,8 +175,10 @@ class Supervisor:
         for child in self._children.values():
             self._carry_out(child, child.watch.tick(now_s))
         if self._ending is None and all(child.over for child in self._children.values()):
-            lost = all(child.given_up for child in self._children.values())
-            self._end(Why.LOST if lost else Why.ALL_DONE, "nothing is left to run")
+            if all(child.given_up for child in self._children.values()):
+                self._end(Why.LOST, "everything is given up")
+            else:
+                self._end(Why.ALL_DONE, "all is done")
 
     def _carry_out(self, child: _Child, effects: Sequence[supervision.Effect]) -> None:
         for effect in effects:
@@ -187,12 +198,13 @@ class Supervisor:
         if self._ending is not None:
             return
         launch = replace(task.launch, sockets=replace(task.launch.sockets, heartbeat=child.heartbeat))
-        child.lines = LineReader()
+        child.lines, child.up = LineReader(), False
         child.starts += 1
         try:
             child.process = ChildProcess(
                 task.name, task.command, launch.to_json(), self._wakeup.post, task.environment, task.folder
             )
+            self._log.write(child.name, logging.DEBUG, f"started, process {child.process.pid}")
         except AfspmError as error:
             child.last_exit = f"could not be started: {error}"
             self._carry_out(child, child.watch.start_failed(str(error), self._clock.monotonic_s()))

@@ -25,6 +25,7 @@ class Task:
         role: what it is in the experiment; without scheduler or translator nothing can go on.
         folder: where to start it; None: where we are.
         environment: what it gets besides our own environment.
+        beats: whether it sends heartbeats; what doesn't is only known by its exit.
     """
 
     launch: Launch
@@ -32,6 +33,7 @@ class Task:
     role: Role = Role.COMPONENT
     folder: Path | None = None
     environment: Mapping[str, str] = field(default_factory=dict)
+    beats: bool = True
 
     @property
     def name(self) -> str:
@@ -45,7 +47,7 @@ class Task:
 
 def from_start(start: Start) -> Task:
     """A task of what the experiment file says: Python classes by our host, other languages by our guard."""
-    ours = (sys.executable, "-m", HOST) if not start.command else (sys.executable, "-m", GUARD, *start.command)
+    ours = (sys.executable, "-m", HOST) if not start.command else (sys.executable, "-m", GUARD, "--", *start.command)
     before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
     return Task(
         launch=start.launch,
@@ -53,4 +55,5 @@ def from_start(start: Start) -> Task:
         role=start.role,
         folder=start.folder if start.command else None,
         environment={"PYTHONPATH": os.pathsep.join(before)} if before else {},
+        beats=start.beats,
     )

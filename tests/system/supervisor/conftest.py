@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from supervisor_lab import DEADLINE_S, QUICK, Running, RunTasks, Terminal
+
+from afspm.clock import ExperimentClock
+from afspm.logic.supervision import Policy
+from afspm.supervisor.log import RunLog
+from afspm.supervisor.supervisor import Outcome, Supervisor
+from afspm.supervisor.task import Task
+
+
+@pytest.fixture
+def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
+    """Starts a supervisor of these tasks; it is stopped after the test."""
+    running: list[Running] = []
+    logs: list[RunLog] = []
+
+    def start(*tasks: Task, policy: Policy = QUICK) -> Running:
+        terminal = Terminal()
+        clock = ExperimentClock.real()
+        log = RunLog(tmp_path / "log.txt", clock, terminal=terminal, level=0)  # type: ignore[arg-type]
+        logs.append(log)
+        supervisor = Supervisor(tasks, log, clock, policy)
+        outcomes: list[Outcome] = []
+
+        def run() -> None:
+            try:
+                outcomes.append(supervisor.run())
+            finally:
+                terminal.close_for_waiters()
+
+        thread = threading.Thread(target=run, daemon=True)
+        one = Running(supervisor, terminal, thread, outcomes)
+        running.append(one)
+        thread.start()
+        return one
+
+    yield start
+    for one in running:
+        one.supervisor.stop()
+        one.supervisor.stop()
+        one.thread.join(DEADLINE_S)
+    for log in logs:
+        log.close()
+
+
+@pytest.fixture
+def calls() -> Iterator[socket.socket]:
+    """A server that a peer with `call` connects to: the connection is open as long as the peer lives."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(DEADLINE_S)
+        yield server

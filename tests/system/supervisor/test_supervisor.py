@@ -1,0 +1,163 @@
+"""What the supervisor does about real processes that end, crash, freeze, are busy, or don't want to end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from supervisor_lab import DEADLINE_S, RunTasks, peer
+
+from afspm.clock import ExperimentClock
+from afspm.experiment import Role
+from afspm.supervisor.ending import Why
+from afspm.supervisor.task import Task
+
+posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+
+
+def test_when_all_are_done_the_run_ends_well(run_tasks: RunTasks) -> None:
+    outcome = run_tasks(peer("a", first="exit", code=0), peer("b", first="exit", code=0)).outcome()
+    assert outcome.why is Why.ALL_DONE
+    assert outcome.exit_code == 0
+    assert [report.starts for report in outcome.reports] == [1, 1]
+
+
+def test_a_crashed_process_is_started_again(run_tasks: RunTasks, tmp_path: Path) -> None:
+    running = run_tasks(peer("a", first="crash", lives=str(tmp_path / "lives")))
+    running.terminal.wait_for(" a ", "ERROR it breaks")
+    running.terminal.wait_for(" a ", "life 2")
+    assert running.stop().reports[0].starts == 2
+
+
+@posix_only
+def test_a_killed_process_is_started_again(run_tasks: RunTasks, tmp_path: Path) -> None:
+    running = run_tasks(peer("a", lives=str(tmp_path / "lives")))
+    running.terminal.wait_for(" a ", "life 1")
+    os.kill(running.pid("a"), signal.SIGKILL)
+    running.terminal.wait_for(" a ", "killed by SIGKILL")
+    running.terminal.wait_for(" a ", "life 2")
+
+
+@posix_only
+def test_a_frozen_process_is_killed_and_started_again(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("a"))
+    running.terminal.wait_for(" a ", "is up")
+    os.kill(running.pid("a"), signal.SIGSTOP)
+    running.terminal.wait_for(" a ", "no heartbeat")
+    running.terminal.wait_for(" a ", "is up", count=2)
+
+
+def test_one_that_is_busy_within_what_it_declared_is_left_alone(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("a", first="busy", busy_s=2.0, longest_step_s=60.0))
+    running.terminal.wait_for(" a ", "no longer busy")
+    assert running.stop().reports[0].starts == 1
+
+
+def test_one_that_is_busy_longer_than_it_declared_is_killed(run_tasks: RunTasks, tmp_path: Path) -> None:
+    lives = str(tmp_path / "lives")
+    running = run_tasks(peer("a", first="busy", busy_s=600.0, longest_step_s=0.3, lives=lives))
+    running.terminal.wait_for(" a ", "frozen")
+    running.terminal.wait_for(" a ", "life 2")
+
+
+def test_what_always_crashes_is_given_up_and_the_rest_goes_on(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("bad", first="crash"), peer("good"))
+    running.terminal.wait_for("CRITICAL", "bad is given up", "the rest goes on")
+    assert running.thread.is_alive()
+    outcome = running.stop()
+    bad, good = outcome.reports
+    assert (bad.given_up, bad.starts) == (True, 3)  # once, and a budget of two restarts
+    assert (good.given_up, good.starts) == (False, 1)
+
+
+@pytest.mark.parametrize("role", [Role.SCHEDULER, Role.TRANSLATOR])
+def test_without_scheduler_or_translator_the_run_ends_and_says_so(run_tasks: RunTasks, role: Role) -> None:
+    outcome = run_tasks(peer("vital", role, first="crash"), peer("other")).outcome()
+    assert outcome.why is Why.LOST
+    assert outcome.exit_code == 1
+    assert "vital" in outcome.text
+
+
+def test_when_nothing_could_be_kept_running_the_run_is_lost(run_tasks: RunTasks) -> None:
+    assert run_tasks(peer("only", first="crash")).outcome().exit_code == 1
+
+
+def test_wrong_settings_are_not_tried_again(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("a", first="exit", code=78), peer("b"))
+    running.terminal.wait_for("CRITICAL", "a is given up")
+    report = running.stop().reports[0]
+    assert (report.starts, report.given_up) == (1, True)
+
+
+def test_a_program_that_is_not_there_does_not_end_the_rest(run_tasks: RunTasks) -> None:
+    missing = replace(peer("missing"), command=("no-such-program",))
+    running = run_tasks(missing, peer("good"))
+    running.terminal.wait_for("CRITICAL", "missing is given up")
+    running.terminal.wait_for(" good ", "life 1")
+    assert not running.stop().reports[1].given_up
+
+
+def test_the_end_of_the_experiment_ends_all_even_the_deaf(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("ends", first="exit", code=80), peer("waits"), peer("deaf", first="deaf"))
+    outcome = running.outcome()
+    assert outcome.why is Why.EXPERIMENT_ENDED
+    assert outcome.exit_code == 0
+    assert [report.starts for report in outcome.reports] == [1, 1, 1]
+    running.terminal.wait_for(" deaf ", "does not end: killed")
+
+
+def test_a_scheduler_that_is_done_ends_the_experiment(run_tasks: RunTasks) -> None:
+    outcome = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=0), peer("waits")).outcome()
+    assert outcome.why is Why.EXPERIMENT_ENDED
+
+
+def test_a_component_that_is_done_does_not(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("done", first="exit", code=0), peer("waits"))
+    running.terminal.wait_for(" done ", "ended (done)")
+    assert running.stop().why is Why.STOPPED
+
+
+def test_stopping_takes_about_two_seconds_at_most(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("waits"), peer("deaf", first="deaf"))
+    running.terminal.wait_for(" waits ", "life 1")
+    running.terminal.wait_for(" deaf ", "life 1")
+    clock = ExperimentClock.real()
+    began_s = clock.monotonic_s()
+    outcome = running.stop()
+    assert clock.monotonic_s() - began_s < 2.5  # two seconds, and some for a busy computer
+    assert outcome.why is Why.STOPPED
+    waits, deaf = outcome.reports
+    assert waits.last_exit == "ended (orphan)"  # by itself, since its stdin was closed
+    assert deaf.last_exit != "ended (orphan)"
+
+
+def test_a_second_wish_to_stop_is_not_made_to_wait(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("deaf", first="deaf"))
+    running.terminal.wait_for(" deaf ", "life 1")
+    clock = ExperimentClock.real()
+    began_s = clock.monotonic_s()
+    running.supervisor.stop()
+    running.stop()
+    assert clock.monotonic_s() - began_s < 1.0
+
+
+def test_nothing_is_restarted_while_the_run_ends(run_tasks: RunTasks, tmp_path: Path) -> None:
+    deaf = peer("deaf", first="deaf", then="deaf", lives=str(tmp_path / "lives"))
+    running = run_tasks(deaf)
+    running.terminal.wait_for(" deaf ", "life 1")
+    running.stop()
+    assert (tmp_path / "lives").read_text() == "1"
+
+
+def test_what_a_program_of_another_kind_writes_is_in_the_log(run_tasks: RunTasks) -> None:
+    code = "import sys; print('to stdout'); print('to stderr', file=sys.stderr)"
+    task = Task(peer("script").launch, (sys.executable, "-c", code))
+    running = run_tasks(task)
+    assert running.outcome().exit_code == 0
+    running.terminal.wait_for(" script ", "to stdout")
+    running.terminal.wait_for(" script ", "WARNING to stderr")
+    assert running.outcome().duration_s < DEADLINE_S
