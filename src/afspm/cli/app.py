@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from afspm.cli import check, graph, keys
+from afspm.cli import check, graph, keys, run
 
 app = typer.Typer(
     name="afspm",
@@ -14,6 +14,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+app.command("run")(run.run)
 app.command("check")(check.check)
 app.command("graph")(graph.graph)
 app.command("keys")(keys.keys)
