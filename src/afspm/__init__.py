@@ -1,19 +1,44 @@
-"""Automation of scanning probe microscopes, whoever made them."""
+"""afspm automates scanning probe microscopes, whoever made them.
+
+What one writes components and scripts with is here; it is loaded when it is first used, so that every process starts fast.
+"""
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
+    from afspm.runtime.component import Component
     from afspm.runtime.connect import connect
+    from afspm.runtime.scope import Scope
 
-__all__ = ["connect"]
+__all__ = [
+    "Component",
+    "ControlMode",
+    "Problem",
+    "Region",
+    "Scan",
+    "ScanSet",
+    "Scope",
+    "ScopeState",
+    "Spectrum",
+    "connect",
+]
+
+_HOMES = {
+    "Component": "afspm.runtime.component",
+    "Scope": "afspm.runtime.scope",
+    "connect": "afspm.runtime.connect",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """`afspm.connect`, imported when it is used: every process of an experiment imports this package."""
-    if name == "connect":
-        from afspm.runtime.connect import connect
+    if name not in __all__:
+        raise AttributeError(f"module 'afspm' has no attribute {name!r}")
+    return getattr(import_module(_HOMES.get(name, "afspm.model")), name)
 
-        return connect
-    raise AttributeError(f"module 'afspm' has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])
