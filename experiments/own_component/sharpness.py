@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from afspm.runtime.component import Component
+from afspm import Component
 
 
 class Sharpness(Component):
