@@ -116,6 +116,15 @@ def load(path: str) -> Any:
     return _attribute(module, name)
 
 
+def find_module(name: str, folders: Sequence[Path]) -> Any:
+    """The spec of a module that can be imported, also from beside the file; None: there is none."""
+    with importing_from(folders):
+        try:
+            return importlib.util.find_spec(name)
+        except (ImportError, ValueError):
+            return None
+
+
 def role_of(component: type) -> Role | None:
     """Scheduler, translator or component, by what the class is derived from; None: it is none of them."""
     for base in component.__mro__:

@@ -12,7 +12,7 @@ from afspm.experiment.findings import Findings, Place, closest, nearest
 from afspm.experiment.known import COMPONENT_ALIASES, WIRE_CLASSES, WIRE_KEYS, Wire
 from afspm.experiment.references import References
 
-SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "messages", "restart")
+SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart")
 
 # Keys of a component's table that are for us; everything else is a setting of its class or command.
 OWN_KEYS: Final = frozenset(

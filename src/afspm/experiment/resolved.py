@@ -33,7 +33,7 @@ class Resolved:
     clock: sections.Clock
     control: sections.Control
     security: sections.Security
-    messages: sections.Messages
+    messages: tuple[str, ...]
     restart: sections.Restart
     problems: ProblemNames
     named_problems: dict[str, int]
@@ -95,7 +95,7 @@ def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:
         clock=section(sections.Clock, "clock"),
         control=section(sections.Control, "control"),
         security=section(sections.Security, "security"),
-        messages=section(sections.Messages, "messages"),
+        messages=_messages(parts.variables.get("messages", []), document, findings),
         restart=section(sections.Restart, "restart"),
         problems=ProblemNames(named),
         named_problems=named,
@@ -204,6 +204,26 @@ def _written_role(part: Part, resolved: Resolved) -> Role:
     if "control_server" in part.own:
         return Role.TRANSLATOR
     return Role.SCHEDULER if {"router", "pubsubcache"} & part.own.keys() else Role.COMPONENT
+
+
+def _messages(given: Any, document: Document, findings: Findings) -> tuple[str, ...]:
+    """`messages`: .proto files, absolute, and modules with messages of the user."""
+    if not isinstance(given, list) or not all(isinstance(one, str) for one in given):
+        findings.error("`messages` is not a list of texts", document.place("messages"), 'messages = ["my.proto"]')
+        return ()
+    found = []
+    for i, one in enumerate(given):
+        place = document.place("messages", i)
+        if not one.endswith(".proto"):
+            found.append(one)
+            if classes.find_module(one, document.folders) is None:
+                findings.error(f"messages: there is no module {one!r}", place, "or give a .proto file")
+            continue
+        file = document.folder_of("messages") / one
+        found.append(str(file))
+        if not file.is_file():
+            findings.error(f"messages: there is no file {one!r}", place, "it is looked for beside the experiment file")
+    return tuple(found)
 
 
 def _problems(table: Mapping[str, Any], document: Document, findings: Findings) -> dict[str, int]:

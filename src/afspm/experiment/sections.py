@@ -82,12 +82,6 @@ class Restart(Section):
     healthy: PositiveDuration = 30.0
 
 
-class Messages(Section):
-    """[messages]: Python modules or .proto files with message types of the user."""
-
-    modules: tuple[str, ...] = ()
-
-
 S = TypeVar("S", bound=Section)
 
 

@@ -101,7 +101,7 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
         request_timeout_s=wires.request_timeout_s or resolved.control.request_timeout,
         request_retries=_first(wires.request_retries, resolved.control.request_retries),
         keys=_keys(resolved, links, addresses),
-        messages=resolved.messages.modules,
+        messages=resolved.messages,
         beat_period_s=resolved.restart.beat_period,
         simulated=resolved.simulated,
     )

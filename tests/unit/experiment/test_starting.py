@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
 
@@ -281,3 +282,21 @@ def test_the_experiment_is_named_by_its_folder_or_file_or_itself(tmp_path: Path)
     ):
         (folder / file).write_text(text)
         assert load(folder / file).name == name
+
+
+def test_messages_of_one_s_own_reach_every_process_as_files_beside_the_experiment(write: Write) -> None:
+    text = 'messages = ["crystal.proto", "parts"]\n' + CORRECTOR
+    assert "no file 'crystal.proto'" in only_error(write(text)).what
+    experiment = write(text)
+    (experiment.folder / "crystal.proto").write_text('syntax = "proto3";')
+    launch = starts(load(experiment.folder / "night.toml"))["repair"].launch
+    assert launch.messages == (str(experiment.folder / "crystal.proto"), "parts")
+
+
+def test_a_command_says_if_it_sends_no_heartbeats(write: Write) -> None:
+    text = '[other]\ncomponent = true\ncommand = ["python", "x.py"]\n'
+    assert starts(write(text))["other"].beats
+    start = starts(write(text + "heartbeats = false\n"))["other"]
+    assert not start.beats
+    assert start.launch.settings == {}
+    assert start.command == (sys.executable, "x.py")
