@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,15 +42,23 @@ class Translator:
         port: to the network.
         memory: kept over a restart.
         run_dir: the folder of the run.
+        step: entered around everything that takes time, so that busy can be told from frozen.
     """
 
     def __init__(
-        self, microscope: Microscope, port: ServerPort, memory: Memory, run_dir: Path, log: logging.Logger
+        self,
+        microscope: Microscope,
+        port: ServerPort,
+        memory: Memory,
+        run_dir: Path,
+        log: logging.Logger,
+        step: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self.microscope = microscope
         self._port = port
         self._memory = memory
         self._log = log
+        self._step = step
         self._clock: Clock = port.clock
         microscope.clock, microscope.log, microscope.run_dir = port.clock, log, run_dir
         microscope.wake = port.wake_up
@@ -71,11 +80,13 @@ class Translator:
         """Until the parent has gone or wants us to stop."""
         try:
             while True:
-                self.look()
+                with self._step():
+                    self.look()
                 for arrived in self._port.poll(self.wait_s()):
                     if isinstance(arrived, ParentGone):
                         return ExitCode.ORPHAN
-                    self.handle(arrived)
+                    with self._step():
+                        self.handle(arrived)
         finally:
             self.microscope.close()
             self._port.close()
@@ -140,7 +151,10 @@ class Translator:
                 self._publish(thing)
         # the state first: a result that comes in between then waits for the next look, and is not lost
         status = self.microscope.status()
-        self._play(self._sequence.observe(status, self._outbox.look(), self._clock.now_s()))
+        steps = self._sequence.observe(status, self._outbox.look(), self._clock.now_s())
+        if steps:
+            self._save()  # before anything is out: who comes back from a kill must not tell an older story
+            self._play(steps)
 
     def _read(self) -> dict[str, Value]:
         """What is in force; differences below the controller's precision are none."""
@@ -155,20 +169,18 @@ class Translator:
     def _play(self, steps: Sequence[Step]) -> None:
         for step in steps:
             if isinstance(step, Say):
-                self._kept["said"] = int(step.status.state)
                 self._publish(step.status)
             elif isinstance(step, Deliver):
                 self._deliver()
             elif isinstance(step, Discard):
                 self._outbox.discard()
+                self._save()
             elif isinstance(step, Complain):
                 self._log.error("%s", step.text)
-        if steps:
-            self._save()
 
     def _deliver(self) -> None:
         packets = self._outbox.take()
-        self._save()  # before anything is out: a restart then publishes the same again, not anew
+        self._save()  # a restart then publishes the same again, at the same times, and not anew
         for packet in packets:
             self._port.publish(*packet)
 
@@ -226,6 +238,7 @@ class Translator:
         self._port.reply(wire.encode_response(response))
 
     def _save(self) -> None:
+        self._kept["said"] = int(self._sequence.said.state)
         try:
             self._memory.save()
         except FileError as error:  # a full disk must not stop the tip from being looked after
@@ -266,4 +279,5 @@ def run_translator(microscope: Microscope, context: Context, make: Callable[...,
     memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None)
     port = open_server_port(launch, context.clock)
     context.when_stopping(lambda: port.wake_up(ParentGone()))
-    return make(microscope, port, memory, Path(launch.run_dir or "."), context.log).run()
+    run_dir = Path(launch.run_dir or ".")
+    return make(microscope, port, memory, run_dir, context.log, context.activity.step).run()

@@ -161,7 +161,8 @@ class Simulator(Microscope):
         )
         if "world" not in kept:
             kept["world"] = world.state()
-            truth.note(kept["start_s"], "start", {"settings": self._world_settings, "seed": self._seed})
+            facts = {"settings": self._world_settings, "seed": self._seed, "truth": world.truth(kept["start_s"])}
+            truth.note(kept["start_s"], "start", facts)
 
     def status(self) -> ScopeStatus:
         """What the instrument is doing now."""
