@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from afspm.clock import Clock
+from afspm.errors import ConfigError, InvalidValue
 from afspm.model import ProblemNames
 from afspm.runtime.launch import Launch
 from afspm.transport.port import Port
@@ -68,6 +69,10 @@ class Context:
         when_stopping: registers what is called, from another thread, when the parent has gone or wants us to stop
             (a port made by `open_port` is told by itself).
         session: differs between two lives of a process, for ids that must not meet.
+        problems: the problems of the experiment by name.
+
+    Raises:
+        ConfigError: two problems have the same number, say.
     """
 
     launch: Launch
@@ -80,7 +85,10 @@ class Context:
     problems: ProblemNames = field(init=False)
 
     def __post_init__(self) -> None:
-        self.problems = ProblemNames(self.launch.problems)
+        try:
+            self.problems = ProblemNames(self.launch.problems)
+        except InvalidValue as error:
+            raise ConfigError(error.what, where=error.where, hint=error.hint) from error
 
     @property
     def name(self) -> str:

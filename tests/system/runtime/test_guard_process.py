@@ -1,0 +1,103 @@
+"""The guard of components in other languages."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from afspm.clock import ExperimentClock
+from afspm.runtime.exit_codes import ExitCode
+
+GUARD = [sys.executable, "-m", "afspm.runtime.guard"]
+CLOCK = ExperimentClock.real()
+
+# other languages have no Python: these use nothing of ours
+ECHO = "import sys; print(sys.stdin.readline().strip(), flush=True); print('eof', repr(sys.stdin.read()), flush=True)"
+DEAF = (
+    "import signal, threading; print('deaf', flush=True); "
+    "signal.signal(signal.SIGTERM, signal.SIG_IGN); threading.Event().wait()"
+)
+PARENT = (
+    "import subprocess, sys; "
+    "p = subprocess.Popen([sys.executable, '-c', 'import threading; threading.Event().wait()']); "
+    "print(p.pid, flush=True); sys.stdin.read()"
+)
+
+
+def python(code: str) -> list[str]:
+    return [sys.executable, "-c", code]
+
+
+@pytest.mark.parametrize("separator", [[], ["--"]])
+def test_the_line_is_passed_on_and_the_end_too(start: Any, separator: list[str]) -> None:
+    child = start([*GUARD, *separator, *python(ECHO)], '{"name": "x"}')
+    child.expect('{"name": "x"}')
+    child.let_go()
+    child.expect("eof ''")
+    assert child.exit_code() == 0
+
+
+def test_the_exit_code_is_passed_on(start: Any) -> None:
+    assert start([*GUARD, *python("raise SystemExit(80)")], "{}").exit_code() == ExitCode.ENDED
+
+
+def test_one_that_does_not_listen_is_ended(start: Any) -> None:
+    child = start([*GUARD, *python(DEAF)], "{}")
+    child.expect("deaf")
+    began_s = CLOCK.monotonic_s()
+    child.let_go()
+    assert child.exit_code() == ExitCode.ORPHAN
+    assert CLOCK.monotonic_s() - began_s < 1.9
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
+def test_a_guard_that_is_terminated_takes_its_command_along(start: Any) -> None:
+    child = start([*GUARD, *python(DEAF)], "{}")
+    child.expect("deaf")
+    child.popen.terminate()
+    assert child.exit_code() == ExitCode.ORPHAN
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="process groups of Unix")
+def test_what_the_command_has_started_does_not_outlive_it(start: Any) -> None:
+    child = start([*GUARD, *python(PARENT)], "{}")
+    grandchild = int(child.lines.get(timeout=20.0))
+    child.let_go()
+    child.exit_code()
+    assert gone(lambda: _is_running(grandchild))
+
+
+def test_a_crash_is_a_crash(start: Any) -> None:
+    child = start([*GUARD, *python("import os; os.abort()")], "{}")
+    assert child.exit_code() not in (ExitCode.DONE, ExitCode.ENDED, ExitCode.ORPHAN, ExitCode.CONFIG)
+
+
+@pytest.mark.parametrize("command", [[], ["/no/such/program"]])
+def test_what_can_not_be_started_is_told(start: Any, command: list[str]) -> None:
+    child = start([*GUARD, *command], "{}")
+    assert child.exit_code() == ExitCode.CONFIG
+    assert child.error_text.startswith("ERROR ")
+
+
+def gone(is_there: Callable[[], bool]) -> bool:
+    end_s = CLOCK.monotonic_s() + 10.0
+    while CLOCK.monotonic_s() < end_s:
+        if not is_there():
+            return True
+    return False
+
+
+def _is_running(pid: int) -> bool:
+    """Whether a process is there and no zombie that nobody has buried yet."""
+    import os
+    from pathlib import Path
+
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{pid}/stat")
+    return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")
