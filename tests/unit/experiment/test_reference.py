@@ -1,0 +1,34 @@
+"""The reference page has every key that the file may have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from afspm.experiment import caching, limits, sections
+from afspm.experiment.known import WIRE_KEYS, WIRE_SETTINGS, Wire
+from afspm.experiment.parts import DECLARED_KEYS, OWN_KEYS, SECTIONS
+
+PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "experiment-file.md").read_text(encoding="utf-8")
+MODELS = [sections.Clock, sections.Control, sections.Roles, sections.Security, sections.Restart, caching.Cache,
+          caching.Rule, limits.ParameterLimit, limits.ActionLimit, limits.Whole, limits.Box]  # fmt: skip
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
+def test_every_key_of_a_section_is_on_the_page(model: type[BaseModel]) -> None:
+    assert [
+        key for key in model.model_fields if not any(form in PAGE for form in (f"`{key}", f"{key} =", f".{key}]"))
+    ] == []
+
+
+def test_every_section_and_key_of_a_component_is_on_the_page() -> None:
+    assert [name for name in SECTIONS if f"[{name}" not in PAGE] == []
+    assert [key for key in (*OWN_KEYS, *DECLARED_KEYS, *WIRE_KEYS) if f"`{key}" not in PAGE] == []
+
+
+def test_every_setting_of_the_wiring_that_means_something_is_on_the_page() -> None:
+    kinds = (Wire.PUBLISHER, Wire.SERVER, Wire.ROUTER, Wire.CLIENT)
+    keys = {key for kind in kinds for key in WIRE_SETTINGS[kind]} - {"get_envelope_for_proto"}
+    assert [key for key in keys if f"`{key}`" not in PAGE] == []
