@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from afspm.components import verdicts
-from afspm.components.tip_judge import Counter, Opinion, Reference, TipJudge, Tolerance, Verdict
+from afspm.components.tip_judge import Counter, Opinion, TipJudge, Tolerance, Verdict
 from afspm.components.tip_scans import HeightPair, Pairing
 from afspm.errors import UnitError
 from afspm.model import ControlState, Scan
@@ -17,8 +17,9 @@ _SCORES = {Opinion.GOOD: verdicts.GOOD, Opinion.BAD: verdicts.BAD, Opinion.UNCLE
 class TipClassifier(Component):
     """Flags `tip-shape-changed` when scans say that the tip is blunt, double or carries debris, and clears it again.
 
-    It learns what a good tip shows from the first scans, so the tip has to be good then; scans of another pixel size
-    are not judged. What it thinks of each it publishes as a `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
+    It learns what a good tip shows from the first scans, so the tip has to be good then; scans of another size are not
+    judged. It judges best a place that it has seen before; elsewhere it sees only large changes. What it thinks of each
+    scan it publishes as a `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
 
     Args:
         channel: of the heights.
@@ -26,9 +27,10 @@ class TipClassifier(Component):
         reference_scans: how many scans it learns from.
         flag_after: bad scans in a row until the problem is flagged.
         clear_after: good scans in a row until it is cleared.
-        detail: share of the fine detail below which the tip is blunt.
-        ghost: correlation of a ghost image above which the tip is double.
+        detail: share of the fine detail at a known place below which the tip is blunt.
+        ghost: correlation of a ghost image at a known place above which the tip is double.
         unrest: factor on the disagreement of trace and retrace above which it carries debris.
+        worn: share of the first scans' fine detail below which it is worn, wherever that is seen.
         sigmas: standard deviations of the reference beyond which a scan must lie to be bad.
         problem: what it flags.
     """
@@ -47,19 +49,20 @@ class TipClassifier(Component):
         detail: float = Tolerance.detail,
         ghost: float = Tolerance.ghost,
         unrest: float = Tolerance.unrest,
+        worn: float = Tolerance.worn,
         sigmas: float = Tolerance.sigmas,
         problem: str = "tip-shape-changed",
     ) -> None:
         self.pairing = Pairing(channel, retrace_channel)
-        self.judge = TipJudge(reference_scans, Tolerance(detail, ghost, unrest, sigmas))
+        self.judge = TipJudge(reference_scans, Tolerance(detail, ghost, unrest, worn, sigmas))
         self.counter = Counter(flag_after, clear_after)
         self.problem = problem
         self._problems: tuple[int, ...] = ()
 
     def on_start(self) -> None:
-        if "reference" in self.memory:
-            self.judge.reference = Reference.from_dict(self.memory["reference"])
-        self.counter.bad, self.counter.good = self.memory.get("counter", (0, 0))
+        if "judge" in self.memory:
+            self.judge.restore(self.memory["judge"])
+            self.counter.restore(self.memory["counter"])
 
     def on_control(self, control_state: ControlState) -> None:
         was, self._problems = self._is_flagged, control_state.problems
@@ -88,7 +91,7 @@ class TipClassifier(Component):
             return
         self.counter.count(verdict.opinion)
         self._tell(pair.trace, verdict)
-        self._remember(pair.trace, verdict)
+        self._remember(pair.trace)
 
     def _tell(self, scan: Scan, verdict: Verdict) -> None:
         """Flag or clear; then the verdict, so that who waits for it finds the flag as it should be."""
@@ -102,12 +105,11 @@ class TipClassifier(Component):
         if verdict.opinion in _SCORES:
             self.publish(verdicts.verdict_message(scan, _SCORES[verdict.opinion]), f"{verdicts.MESSAGE}_{self.name}")
 
-    def _remember(self, scan: Scan, verdict: Verdict) -> None:
+    def _remember(self, scan: Scan) -> None:
         if scan.time_ns is not None:
             self.memory["newest_ns"] = scan.time_ns
         self.memory["counter"] = self.counter.state
-        if verdict.opinion is Opinion.LEARNING and self.judge.reference is not None:
-            self.memory["reference"] = self.judge.reference.to_dict()
+        self.memory["judge"] = self.judge.state()
         self.memory.save()
 
 

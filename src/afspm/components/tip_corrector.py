@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from afspm import wire
 from afspm.components import verdicts
 from afspm.components.planned_scans import pair
-from afspm.components.tip_judge import Opinion, Reference, TipJudge, Tolerance
+from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.components.tip_scans import Pairing
 from afspm.components.treatments import Pulse, Treatment, clearance_m, fresh_place, treatments
 from afspm.components.verdicts import read_verdict
@@ -26,7 +26,7 @@ _REGION_PARAMETERS = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y, names.SCAN_TOP_LEFT_
 class TipCorrector(Component):
     """Solves `tip-shape-changed`: pulses of the bias, one after the other, then controlled crashes, deeper and deeper.
 
-    After each it takes a test scan elsewhere, of the size of the experiment's scans. Whoever judges scans (the
+    After each it takes a test scan, of the size of the experiment's scans. Whoever judges scans (the
     `TipClassifier`) clears the flag when the tip is good, which takes control from the corrector: the experiment goes
     on. The lists below are all that one repair may do, over restarts too; what a limit of the experiment file or the
     microscope refuses is told and left out. When nothing is left it flags `device-malfunction` and waits for a person:
@@ -37,7 +37,8 @@ class TipCorrector(Component):
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
-        test_center: (x, y) of the middle of the test scans.
+        test_center: (x, y) of the middle of the test scans; by default that of the experiment's own scans: nowhere else
+            is it known as well what a good tip shows.
         pulse_voltages: those of one repair, in order.
         pulse_duration: of each pulse.
         crash_depths: those of one repair, in order, after the pulses.
@@ -58,7 +59,7 @@ class TipCorrector(Component):
     def __init__(
         self,
         workshop_center: tuple[Length, Length],
-        test_center: tuple[Length, Length],
+        test_center: tuple[Length, Length] | None = None,
         pulse_voltages: tuple[Voltage, ...] = (3.0, -4.0, 5.0),
         pulse_duration: Duration = 50e-3,
         crash_depths: tuple[Length, ...] = (5e-9, 10e-9, 20e-9),
@@ -71,18 +72,19 @@ class TipCorrector(Component):
         reference_scans: int = 4,
         problem: str = "tip-shape-changed",
     ) -> None:
-        self.workshop_center, self.test_center = pair(workshop_center), pair(test_center)
+        self.workshop_center = pair(workshop_center)
+        self.test_center = None if test_center is None else pair(test_center)
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         self.place_spacing, self.keep_away = place_spacing, keep_away
         self.problem = problem
         if place_spacing <= 0.0 or keep_away < 0.0:
             raise ConfigError("`place_spacing` must be above zero, `keep_away` not below")
         self.pairing = Pairing(channel, retrace_channel)
-        self.judge = TipJudge(reference_scans, Tolerance()) if judge == "self" else None
+        self.judge = TipJudge(reference_scans) if judge == "self" else None
 
     def run(self) -> None:
-        if self.judge is not None and "reference" in self.memory:
-            self.judge.reference = Reference.from_dict(self.memory["reference"])
+        if self.judge is not None and "judge" in self.memory:
+            self.judge.restore(self.memory["judge"])
         wanted = ("ControlState",) if self.judge is None else ("ControlState", "Scan2d")
         with self.scope.events(*wanted) as events:
             self._look()
@@ -114,7 +116,7 @@ class TipCorrector(Component):
         if region is None:
             self._give_up("the microscope does not say where the experiment scans: no place is known to be safe")
             return
-        test = Region(self.test_center, region.size_m, region.angle_rad)
+        test = region if self.test_center is None else region.moved_to(self.test_center)
         tried = int(self.memory.get("tried", 0))
         self.log.info("repairing the tip%s", f" ({tried} treatments were tried already)" if tried else "")
         with self.scope.events("ControlState", verdicts.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
@@ -216,8 +218,8 @@ class TipCorrector(Component):
         if self.judge is None or self.judge.has_learnt or self.scope.control_state.problems:
             return
         pair = self.pairing.add(scan)
-        if pair is not None and pair.judged_by(self.judge).opinion is Opinion.LEARNING and self.judge.reference:
-            self.memory["reference"] = self.judge.reference.to_dict()
+        if pair is not None and pair.judged_by(self.judge).opinion is Opinion.LEARNING:
+            self.memory["judge"] = self.judge.state()
             self.memory.save()
 
     def _restore(self, region: Region | None) -> None:

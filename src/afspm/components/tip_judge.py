@@ -1,28 +1,30 @@
-"""Is the tip still what it was? Scans against a reference that was learnt from the first ones."""
+"""Is the tip still what it was? Scans against a reference that was learnt from the first ones.
+
+At a place that it knows the judge compares like with like, and sees small changes. What it knows follows the good
+scans there, since the sample drifts; the first scans stay as the measure of slow wear. Elsewhere it can tell only what
+no place explains: a large loss of detail, or debris. A ghost image it cannot tell there from the sample's own order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
-from afspm.components.tip_metrics import (
-    LEAST_CONTRAST,
-    Array,
-    TipMetrics,
-    autocorrelation,
-    ghost,
-    metrics,
-    slopes,
-)
+from afspm.components.tip_metrics import LEAST_CONTRAST, Array, TipMetrics, autocorrelation, metrics, slopes
 from afspm.errors import ConfigError, InvalidValue
+from afspm.model import Region
 
 REACH_PX = 32  # how far beside the first the second apex of a double tip is looked for
 MAD_TO_SIGMA = 1.4826  # of normally distributed values
-SAME_PIXEL = 0.02  # relative difference of pixel sizes that are still called the same
+SAME_SIZE = 0.02  # relative difference of sizes that are still called the same
+SAME_PLACE = 0.2  # of the size: how far a place may have moved and still be the same
+MOST_PLACES = 16
+FOLLOW = 0.25  # weight of a new good scan in what is known of its place
+FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # spreads that few scans can't be better than
 
 
 class Opinion(Enum):
@@ -48,79 +50,139 @@ class Tolerance:
     """How far a tip may be from the reference and still be called good.
 
     Attributes:
-        detail: the share of the reference's fine detail that is left.
-        ghost: correlation of a ghost image beyond the reference's.
-        unrest: factor on the reference's disagreement of trace and retrace.
+        detail: at a known place, the share of the fine detail that is left at least.
+        ghost: at a known place, the correlation of a ghost image at most.
+        unrest: factor on the disagreement of trace and retrace.
+        worn: anywhere and against the first scans, the share of the fine detail that is left at least.
         sigmas: a scan is bad only if it is so many standard deviations of the reference away, too.
         margin: a scan within this share of the way to a limit is good; between it and the limit it is unclear,
             so that a tip at the limit does not go back and forth.
     """
 
-    detail: float = 0.6
-    ghost: float = 0.12
-    unrest: float = 3.0
+    detail: float = 0.85
+    ghost: float = 0.08
+    unrest: float = 2.0
+    worn: float = 0.55
     sigmas: float = 5.0
-    margin: float = 0.85
+    margin: float = 0.8
 
     def __post_init__(self) -> None:
-        if not (0 < self.detail < 1 and 0 < self.ghost < 1 and self.unrest > 1 and self.sigmas >= 0):
+        shares = (self.detail, self.ghost, self.worn, self.margin)
+        if not all(0 < share < 1 for share in shares) or self.unrest <= 1 or self.sigmas < 0:
             raise ConfigError(
-                f"these tolerances make no sense: {asdict(self)}", hint="0 < detail, ghost < 1; unrest > 1; sigmas >= 0"
+                f"these tolerances make no sense: {asdict(self)}",
+                hint="detail, ghost, worn and margin between 0 and 1, unrest above 1, sigmas not below 0",
             )
-        if not 0 < self.margin <= 1:
-            raise ConfigError(f"margin {self.margin} is not between 0 and 1")
+
+
+@dataclass
+class Place:
+    """A region as a good tip shows it.
+
+    Attributes:
+        center_m: in the coordinates that it was scanned in.
+        usual: the metrics there.
+        expected: the autocorrelation of the slopes there.
+        scans: how many told of it.
+    """
+
+    center_m: tuple[float, float]
+    usual: TipMetrics
+    expected: Array
+    scans: int = 1
+
+    def follow(self, seen: TipMetrics, correlation: Array) -> None:
+        """One more good scan: a mean at first, then forgetting."""
+        weight = max(FOLLOW, 1.0 / (self.scans + 1))
+        self.expected = self.expected + weight * (correlation - self.expected)
+        now, new = asdict(self.usual), asdict(seen)
+        self.usual = TipMetrics(**{name: now[name] + weight * (new[name] - now[name]) for name in now})
+        self.scans += 1
 
 
 @dataclass
 class Reference:
-    """What the scans of a good tip are like. They must be taken with the same pixel size and shape.
+    """What the scans of a good tip are like, all of the same size, angle and shape.
 
     Attributes:
-        pixel_m: (x, y).
-        shape: (rows, columns).
-        learnt: the metrics of the scans so far; their ghosts are against what was expected then.
-        expected: the mean autocorrelation of the slopes.
+        size_m, angle_rad, shape: of those scans.
+        places: where they were taken, the last seen at the end.
+        first: the metrics of the scans that were learnt from.
+        deviations: how such scans differed at the same place: detail and unrest as ratios, ghost as it is.
     """
 
-    pixel_m: tuple[float, float]
+    size_m: tuple[float, float]
+    angle_rad: float
     shape: tuple[int, int]
-    learnt: list[TipMetrics] = field(default_factory=list)
-    expected: Array | None = None
+    places: list[Place] = field(default_factory=list)
+    first: list[TipMetrics] = field(default_factory=list)
+    deviations: list[TipMetrics] = field(default_factory=list)
 
-    def fits(self, pixel_m: tuple[float, float], shape: tuple[int, int]) -> bool:
-        """Whether a scan can be compared."""
-        close = all(abs(a / b - 1.0) < SAME_PIXEL for a, b in zip(pixel_m, self.pixel_m, strict=True))
-        return close and tuple(shape) == tuple(self.shape)
+    def fits(self, region: Region, shape: tuple[int, int]) -> bool:
+        """Whether a scan can be compared at all."""
+        sizes = zip(region.size_m, self.size_m, strict=True)
+        same_size = all(abs(a / b - 1.0) < SAME_SIZE for a, b in sizes)
+        return same_size and abs(region.angle_rad - self.angle_rad) < SAME_SIZE and shape == self.shape
 
-    def learn(self, seen: TipMetrics, correlation: Array) -> None:
-        """One more scan of a good tip."""
-        count = len(self.learnt)
-        before = np.zeros_like(correlation) if self.expected is None else self.expected
-        self.expected = (before * count + correlation) / (count + 1)
-        self.learnt.append(seen)
+    def place(self, region: Region) -> Place | None:
+        """What is known of where a scan was taken."""
+        for place in reversed(self.places):
+            away = (abs(a - b) / size for a, b, size in zip(region.center_m, place.center_m, self.size_m, strict=True))
+            if max(away) < SAME_PLACE:
+                return place
+        return None
 
-    def centre_and_spread(self, name: str) -> tuple[float, float]:
-        """Median, and the standard deviation estimated by the median of deviations."""
-        values = np.array([getattr(seen, name) for seen in self.learnt])
-        centre = float(np.median(values))
-        return centre, MAD_TO_SIGMA * float(np.median(np.abs(values - centre)))
+    def add(self, region: Region, seen: TipMetrics, correlation: Array) -> None:
+        """A place that was not known, seen with a good tip."""
+        self.places.append(Place(region.center_m, replace(seen, ghost=0.0), correlation))
+        del self.places[:-MOST_PLACES]
+
+    def spread(self, name: str) -> float:
+        """Of good scans at the same place: relative for detail and unrest."""
+        floor: float = getattr(FLOORS, name)
+        if len(self.deviations) < 2:
+            return floor
+        values = np.array([getattr(d, name) for d in self.deviations])
+        return max(floor, MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))))
+
+    def usual_anywhere(self) -> TipMetrics:
+        """The median of the scans that were learnt from."""
+        names = asdict(self.first[0])
+        return TipMetrics(**{name: float(np.median([getattr(seen, name) for seen in self.first])) for name in names})
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
         return {
-            "pixel_m": list(self.pixel_m),
+            "size_m": list(self.size_m),
+            "angle_rad": self.angle_rad,
             "shape": list(self.shape),
-            "learnt": [seen.to_dict() for seen in self.learnt],
-            "expected": None if self.expected is None else np.round(self.expected, 4).tolist(),
+            "first": [seen.to_dict() for seen in self.first],
+            "deviations": [seen.to_dict() for seen in self.deviations],
+            "places": [
+                {
+                    "center_m": list(place.center_m),
+                    "usual": place.usual.to_dict(),
+                    "scans": place.scans,
+                    "expected": np.round(place.expected, 4).tolist(),
+                }
+                for place in self.places
+            ],
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Reference:
-        x, y = values["pixel_m"]
-        rows, columns = values["shape"]
-        expected = values["expected"]
-        learnt = [TipMetrics.from_dict(seen) for seen in values["learnt"]]
-        return cls((x, y), (rows, columns), learnt, None if expected is None else np.asarray(expected))
+        (width, height), (rows, columns) = values["size_m"], values["shape"]
+        places = [
+            Place(
+                (place["center_m"][0], place["center_m"][1]),
+                TipMetrics.from_dict(place["usual"]),
+                np.asarray(place["expected"]),
+                place["scans"],
+            )
+            for place in values["places"]
+        ]
+        first, deviations = ([TipMetrics.from_dict(seen) for seen in values[key]] for key in ("first", "deviations"))
+        return cls((width, height), values["angle_rad"], (rows, columns), places, first, deviations)
 
 
 class TipJudge:
@@ -129,98 +191,125 @@ class TipJudge:
     Args:
         reference_scans: how many are learnt from. The tip has to be good by then: nobody can tell from inside.
         tolerance: see there.
-        reference: what was learnt in an earlier life.
     """
 
-    def __init__(self, reference_scans: int, tolerance: Tolerance, reference: Reference | None = None) -> None:
+    def __init__(self, reference_scans: int, tolerance: Tolerance | None = None) -> None:
         if reference_scans < 2:
             raise ConfigError(f"{reference_scans} reference scans have no spread", hint="2 at least", where="tip")
         self.reference_scans = reference_scans
-        self.tolerance = tolerance
-        self.reference = reference
+        self.tolerance = tolerance or Tolerance()
+        self.reference: Reference | None = None
+        self._suspect = False
 
     @property
     def has_learnt(self) -> bool:
-        return self.reference is not None and len(self.reference.learnt) >= self.reference_scans
+        return self.reference is not None and len(self.reference.first) >= self.reference_scans
 
-    def judge(self, trace: Array, retrace: Array | None, pixel_m: tuple[float, float]) -> Verdict:
+    def state(self) -> dict[str, Any]:
+        """What must survive a restart, JSON-able."""
+        return {"reference": self.reference.to_dict() if self.reference else None, "suspect": self._suspect}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take up what `state` gave."""
+        self.reference = Reference.from_dict(state["reference"]) if state["reference"] else None
+        self._suspect = state["suspect"]
+
+    def judge(self, trace: Array, retrace: Array | None, region: Region) -> Verdict:
         """What a scan tells of the tip.
 
         Args:
             trace, retrace: heights in m, [y, x]; retrace None where it is not recorded.
-            pixel_m: distance of pixels (x, y).
+            region: where they were taken.
         """
         shape = (trace.shape[0], trace.shape[1])
-        if self.reference is not None and not self.reference.fits(pixel_m, shape):
-            return Verdict(Opinion.UNCLEAR, "taken with another pixel size than the reference")
+        if self.reference is not None and not self.reference.fits(region, shape):
+            return Verdict(Opinion.UNCLEAR, "of another size than the reference")
         try:
             seen_slopes = slopes(trace, retrace)
         except InvalidValue as error:
             return Verdict(Opinion.UNCLEAR, error.what)
+        if self.reference is None:
+            self.reference = Reference(region.size_m, region.angle_rad, shape)
+        place = self.reference.place(region)
         correlation = autocorrelation(seen_slopes, min(REACH_PX, min(shape) // 3))
-        seen = metrics(seen_slopes, correlation, self.reference.expected if self.reference else None)
+        seen = metrics(seen_slopes, correlation, place.expected if place else None)
         if seen.contrast < LEAST_CONTRAST:
-            # an empty terrace shows no tip; a tip that fell off shows no terrace, but unrest
-            return Verdict(Opinion.UNCLEAR, f"nothing to see but noise (contrast {seen.contrast:.1f})", seen)
+            return Verdict(Opinion.UNCLEAR, f"nothing to see but noise (contrast {seen.contrast:.2f})", seen)
         if not self.has_learnt:
-            return self._learn(seen, correlation, pixel_m, shape)
-        return self._compare(seen)
+            return self._learn(self.reference, place, seen, correlation, region)
+        verdict = self._compare(self.reference, place, seen)
+        if verdict.opinion is Opinion.GOOD:
+            self._know(self.reference, place, seen, correlation, region)
+        return verdict
 
     def _learn(
-        self, seen: TipMetrics, correlation: Array, pixel_m: tuple[float, float], shape: tuple[int, int]
+        self, reference: Reference, place: Place | None, seen: TipMetrics, correlation: Array, region: Region
     ) -> Verdict:
-        if self.reference is None:
-            self.reference = Reference(pixel_m, shape)
-            # of the first scan nothing is expected: its ghost would be the sample's own order
-            seen = TipMetrics(seen.detail, ghost(correlation, correlation), seen.unrest_m, seen.contrast)
-        self.reference.learn(seen, correlation)
-        return Verdict(Opinion.LEARNING, f"reference {len(self.reference.learnt)} of {self.reference_scans}", seen)
+        if place is not None:
+            reference.deviations.append(_relative(seen, place.usual))
+        reference.first.append(seen)
+        self._know(reference, place, seen, correlation, region)
+        return Verdict(Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans}", seen)
 
-    def _compare(self, seen: TipMetrics) -> Verdict:
-        faults = [fault for fault in (self._detail(seen), self._ghost(seen), self._unrest(seen)) if fault is not None]
-        bad = [why for way, why in faults if way >= 1.0]
-        doubtful = [why for way, why in faults if self.tolerance.margin < way < 1.0]
-        if bad:
-            return Verdict(Opinion.BAD, "; ".join(bad), seen)
-        if doubtful:
-            return Verdict(Opinion.UNCLEAR, "nearly " + "; ".join(doubtful), seen)
-        return Verdict(Opinion.GOOD, _summary(seen, self._reference()), seen)
+    def _know(
+        self, reference: Reference, place: Place | None, seen: TipMetrics, correlation: Array, region: Region
+    ) -> None:
+        if place is None:
+            reference.add(region, seen, correlation)
+        else:
+            place.follow(seen, correlation)
 
-    def _reference(self) -> Reference:
-        if self.reference is None:
-            raise InvalidValue("nothing was learnt yet")
-        return self.reference
+    def _compare(self, reference: Reference, place: Place | None, seen: TipMetrics) -> Verdict:
+        faults = self._faults_anywhere(reference, seen)
+        if place is not None:
+            faults += self._faults_here(reference, place, seen)
+        worst = max(way for way, _ in faults)
+        if worst >= 1.0:
+            self._suspect = self._suspect or place is not None
+            return Verdict(Opinion.BAD, "; ".join(why for way, why in faults if way >= 1.0), seen)
+        if worst > self.tolerance.margin:
+            return Verdict(
+                Opinion.UNCLEAR, "nearly " + "; ".join(why for way, why in faults if way > self.tolerance.margin), seen
+            )
+        if place is None and self._suspect:
+            # what was found by comparing like with like can only be found to be over in the same way
+            return Verdict(Opinion.UNCLEAR, "nothing wrong here, but only a place known from before can tell", seen)
+        self._suspect = False
+        return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
 
-    def _detail(self, seen: TipMetrics) -> tuple[float, str]:
-        centre, spread = self._reference().centre_and_spread("detail")
-        limit = max(min(centre * self.tolerance.detail, centre - self.tolerance.sigmas * spread), 0.1 * centre)
-        way = (centre - seen.detail) / (centre - limit) if centre > limit else 0.0
-        return way, f"blunt: {_share(seen.detail, centre)} of the reference's fine detail is left"
+    def _faults_anywhere(self, reference: Reference, seen: TipMetrics) -> list[tuple[float, str]]:
+        usual, tolerance = reference.usual_anywhere(), self.tolerance
+        left = seen.detail / usual.detail
+        worn = f"worn: {left:.0%} of the first scans' fine detail is left"
+        faults = [((1.0 - left) / (1.0 - tolerance.worn), worn)]
+        if usual.unrest_m > 0.0:  # else no retrace is recorded
+            factor = seen.unrest_m / usual.unrest_m
+            limit = 1.0 + max(tolerance.unrest - 1.0, tolerance.sigmas * reference.spread("unrest_m"))
+            what = f"{seen.unrest_m * 1e9:.2f} nm instead of {usual.unrest_m * 1e9:.2f} nm"
+            faults.append(((factor - 1.0) / (limit - 1.0), f"unsteady: trace and retrace disagree by {what}"))
+        return faults
 
-    def _ghost(self, seen: TipMetrics) -> tuple[float, str]:
-        centre, spread = self._reference().centre_and_spread("ghost")
-        limit = max(centre + self.tolerance.ghost, centre + self.tolerance.sigmas * spread)
-        way = (seen.ghost - centre) / (limit - centre)
-        return way, f"double: a ghost image with correlation {seen.ghost:.2f} (reference {centre:.2f})"
-
-    def _unrest(self, seen: TipMetrics) -> tuple[float, str]:
-        centre, spread = self._reference().centre_and_spread("unrest_m")
-        if centre <= 0.0:  # no retrace is recorded
-            return 0.0, ""
-        limit = max(centre * self.tolerance.unrest, centre + self.tolerance.sigmas * spread)
-        way = (seen.unrest_m - centre) / (limit - centre)
-        what = f"{seen.unrest_m * 1e9:.2f} nm (reference {centre * 1e9:.2f} nm)"
-        return way, f"unsteady: trace and retrace disagree by {what}"
+    def _faults_here(self, reference: Reference, place: Place, seen: TipMetrics) -> list[tuple[float, str]]:
+        tolerance, now = self.tolerance, _relative(seen, place.usual)
+        loss = max(1.0 - tolerance.detail, tolerance.sigmas * reference.spread("detail"))
+        ghost = max(tolerance.ghost, tolerance.sigmas * reference.spread("ghost"))
+        blunt = (1.0 - now.detail) / loss
+        # a blunt tip widens every feature, which the autocorrelation shows as well: then it is no ghost
+        what = "broad features" if blunt >= 1.0 else "double: a ghost image"
+        return [
+            (blunt, f"blunt: {now.detail:.0%} of the fine detail here is left"),
+            (max(0.0, now.ghost - place.usual.ghost) / ghost, f"{what} with correlation {now.ghost:.2f}"),
+        ]
 
 
 class Counter:
     """Turns opinions into a flag: a number of bad ones in a row sets it, a number of good ones clears it."""
 
-    def __init__(self, flag_after: int, clear_after: int, state: Sequence[int] = (0, 0)) -> None:
+    def __init__(self, flag_after: int, clear_after: int) -> None:
         if flag_after < 1 or clear_after < 1:
             raise ConfigError("it takes one scan at least to flag or to clear")
         self.flag_after, self.clear_after = flag_after, clear_after
-        self.bad, self.good = state
+        self.bad = self.good = 0
 
     def count(self, opinion: Opinion) -> None:
         """Take in one more. What is unclear neither counts nor interrupts."""
@@ -238,15 +327,20 @@ class Counter:
         return self.good >= self.clear_after
 
     @property
-    def state(self) -> list[int]:
+    def state(self) -> Sequence[int]:
         """JSON-able."""
         return [self.bad, self.good]
 
+    def restore(self, state: Sequence[int]) -> None:
+        """Take up what `state` gave."""
+        self.bad, self.good = state
 
-def _share(value: float, of: float) -> str:
-    return f"{value / of:.0%}" if of > 0 else "nothing"
+
+def _relative(seen: TipMetrics, usual: TipMetrics) -> TipMetrics:
+    unrest = seen.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
+    return TipMetrics(seen.detail / usual.detail if usual.detail > 0 else 1.0, seen.ghost, unrest, seen.contrast)
 
 
-def _summary(seen: TipMetrics, reference: Reference) -> str:
-    detail = _share(seen.detail, reference.centre_and_spread("detail")[0])
-    return f"detail {detail}, ghost {seen.ghost:.2f}, unrest {seen.unrest_m * 1e9:.2f} nm"
+def _summary(seen: TipMetrics, usual: TipMetrics) -> str:
+    detail = seen.detail / usual.detail if usual.detail > 0 else 1.0
+    return f"detail {detail:.0%}, ghost {seen.ghost:.2f}, unrest {seen.unrest_m * 1e9:.2f} nm"

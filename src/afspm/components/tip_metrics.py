@@ -7,7 +7,8 @@ tip rather than of the place:
   a blunt tip loses the short ones. (Heights of terraces, or how many particles there are, scale both.) The power is
   the cross spectrum of trace and retrace, to which noise does not add up.
 - `ghost`: the autocorrelation of the slopes away from zero. A second apex repeats everything at one distance.
-- `unrest`: how far trace and retrace disagree over stretches of a line, which edges do not cause but loose debris does.
+- `unrest`: how far trace and retrace disagree over stretches of flat ground, which loose debris causes and feedback
+  does not.
 
 (Villarrubia 1997 for what a tip does to an image; the rest is standard signal analysis.)
 """
@@ -30,7 +31,7 @@ SHORT_PX = (3.0, 8.0)  # wavelengths that a blunt tip loses
 LONG_PX = (8.0, 32.0)  # wavelengths that it keeps
 CORE_PX = 6.0  # lags that an edge correlates over by itself
 STRETCH = 10  # a stretch of a line is a tenth of it
-LEAST_CONTRAST = 2.0  # slopes common to trace and retrace against those of noise
+LEAST_CONTRAST = 0.1  # slopes common to trace and retrace against those of noise
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,12 @@ class TipMetrics:
 
 @dataclass(frozen=True)
 class Slopes:
-    """The slopes of a scan along its lines, ready to be analysed: trace and retrace, (rows, columns - 1)."""
+    """The slopes of a scan along its lines, ready to be analysed.
+
+    Attributes:
+        trace, retrace: (rows, columns - 1).
+        difference: of the levelled heights, trace less retrace, (rows, columns).
+    """
 
     trace: Array
     retrace: Array | None
@@ -123,7 +129,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
     return TipMetrics(
         detail=short / long if long > 0 else 0.0,
         ghost=ghost(correlation, expected),
-        unrest_m=_unrest_m(of.difference),
+        unrest_m=_unrest_m(of),
         contrast=(short + long) / noise if noise > 0 else float(short + long > 0) * 1e3,
     )
 
@@ -185,17 +191,30 @@ def _band_powers(of: Slopes) -> tuple[float, float, float]:
 
     bias = 1.0 / np.sqrt(len(pairs))  # what the modulus of a mean of that many random phases keeps
     common = np.maximum(common - bias * noise, 0.0)
-    return band(common, SHORT_PX), band(common, LONG_PX), band(noise, (LONG_PX[1], SHORT_PX[0]))
+    return band(common, SHORT_PX), band(common, LONG_PX), band(noise, (SHORT_PX[0], LONG_PX[1]))
 
 
-def _unrest_m(difference: Array | None) -> float:
-    if difference is None:
+def _unrest_m(of: Slopes) -> float:
+    if of.difference is None:
         return 0.0
-    width = max(3, difference.shape[1] // STRETCH)
-    # the median of a stretch ignores what edges do to trace and retrace
-    stretches = np.lib.stride_tricks.sliding_window_view(difference, width, axis=1)[:, :: max(1, width // 2)]
-    levels = np.median(stretches, axis=-1)
-    return float(np.quantile(np.ptp(levels, axis=1), 0.9))
+    flat = _flat(of.trace)
+    width = max(4, of.difference.shape[1] // STRETCH)
+    window = np.lib.stride_tricks.sliding_window_view
+    count = window(flat, width, axis=1)[:, :: width // 2].sum(axis=-1)
+    total = window(of.difference * flat, width, axis=1)[:, :: width // 2].sum(axis=-1)
+    levels = np.where(count >= width // 3, total / np.maximum(count, 1), np.nan)
+    span = np.fmax.reduce(levels, axis=1) - np.fmin.reduce(levels, axis=1)
+    there = span[np.isfinite(span)]
+    return float(np.quantile(there, 0.9)) if there.size else 0.0
+
+
+def _flat(slope: Array) -> Array:
+    """1 where the scan is flat, 0 near edges: there trace and retrace differ since feedback lags behind."""
+    steep = np.abs(slope)
+    steep = np.maximum(steep, np.maximum(np.roll(steep, 1, axis=1), np.roll(steep, -1, axis=1)))
+    flat = steep <= np.quantile(steep, 0.6)
+    padded: Array = np.pad(flat.astype(np.float64), ((0, 0), (0, 1)), mode="edge")
+    return padded
 
 
 def _smoothed(correlation: Array) -> Array:

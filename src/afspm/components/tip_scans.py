@@ -22,14 +22,8 @@ class HeightPair:
         Raises:
             UnitError: the channels are no heights.
         """
-        ny, nx = self.trace.shape
-        width, height = self.trace.region.size_m
         retrace = None if self.retrace is None else self.retrace.values * convert(1.0, self.retrace.unit, "m")
-        return judge.judge(
-            self.trace.values * convert(1.0, self.trace.unit, "m"),
-            retrace,
-            (width / max(nx - 1, 1), height / max(ny - 1, 1)),
-        )
+        return judge.judge(self.trace.values * convert(1.0, self.trace.unit, "m"), retrace, self.trace.region)
 
 
 class Pairing:
