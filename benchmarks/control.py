@@ -17,7 +17,7 @@ from afspm.transport.zmq_port import ZmqPort
 from benchmarks.processes import CLOCK, roles
 from benchmarks.rows import Row, alternate, measurement
 
-ROUND_TRIPS = 1000
+ROUND_TRIPS = 600
 ALTERNATIONS = 9
 
 

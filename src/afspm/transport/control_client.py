@@ -26,6 +26,7 @@ class ControlClient:
         self._complaints = complaints
         self._address = address
         self._scheduler_is_ours = False
+        self.sent = False
         self.socket = network.socket(zmq.DEALER)
         self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
         # a request is for the scheduler that is there now, not for one that may come later
@@ -36,6 +37,7 @@ class ControlClient:
     def send(self, frames: Sequence[bytes]) -> None:
         """Ask; dropped while there is no scheduler."""
         try:
+            self.sent = True
             send(self.socket, [b"", *frames])
         except zmq.Again:
             return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import select
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import zmq
 
@@ -22,6 +22,12 @@ def milliseconds(timeout_s: float | None) -> int | None:
     return None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
 
 
+class Sender(Protocol):
+    """Sets `sent` whenever it has sent something."""
+
+    sent: bool
+
+
 class Poller(Generic[S]):
     """Waits until one of its sockets can be received from, or it is woken up; names them by `source`.
 
@@ -34,33 +40,36 @@ class Poller(Generic[S]):
     def __init__(self, wake_up: WakeUp[Any]) -> None:
         self._wake_up = wake_up.fileno()
         self._sources: dict[int, tuple[Socket, S]] = {}
-        self._senders: list[tuple[Socket, S]] = []
+        self._senders: list[tuple[Sender, tuple[Socket, S]]] = []
         self._touched: list[tuple[Socket, S]] = []
         self._poll = select.poll()
         self._poll.register(self._wake_up, select.POLLIN)
 
-    def register(self, socket: Socket, source: S, *, sends: bool = False) -> None:
-        """Wait for `socket` too. `sends`: it is also sent on."""
+    def register(self, socket: Socket, source: S, sender: Sender | None = None) -> None:
+        """Wait for `socket` too. `sender`: who also sends on it."""
         descriptor = int(socket.getsockopt(zmq.FD))
         self._sources[descriptor] = (socket, source)
         self._poll.register(descriptor, select.POLLIN)
-        if sends:
-            self._senders.append((socket, source))
-        else:
-            self._touched.append((socket, source))
+        self._touched.append((socket, source))
+        if sender is not None:
+            self._senders.append((sender, (socket, source)))
 
     def wait(self, timeout_ms: int | None) -> tuple[list[S], bool]:
         """The sources of the sockets that can be received from, and whether we were woken up."""
-        found = [entry for entry in self._senders if readable(entry[0])]
-        found += [entry for entry in self._touched if readable(entry[0])]
+        touched = self._touched
+        for sender, entry in self._senders:
+            if sender.sent:
+                sender.sent = False
+                if entry not in touched:
+                    touched.append(entry)
+        self._touched = found = [entry for entry in touched if readable(entry[0])]
         woken = False
         for descriptor, _ in self._poll.poll(0 if found else timeout_ms):
-            entry = self._sources.get(descriptor)
-            if entry is None:
+            known = self._sources.get(descriptor)
+            if known is None:
                 woken = True
-            elif entry not in found and readable(entry[0]):
-                found.append(entry)
-        self._touched = [entry for entry in found if entry not in self._senders]
+            elif known not in found and readable(known[0]):
+                found.append(known)
         return [source for _, source in found], woken
 
 
@@ -72,7 +81,7 @@ class PortablePoller(Generic[S]):
         self._poller = zmq.Poller()
         self._poller.register(wake_up.fileno(), zmq.POLLIN)
 
-    def register(self, socket: Socket, source: S, *, sends: bool = False) -> None:
+    def register(self, socket: Socket, source: S, sender: Sender | None = None) -> None:
         self._sources[socket] = source
         self._poller.register(socket, zmq.POLLIN)
 

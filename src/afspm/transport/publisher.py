@@ -29,6 +29,7 @@ class Publisher:
 
     def __init__(self, network: Network, address: str, history: History) -> None:
         self.history = history
+        self.sent = False
         self.socket = network.socket(zmq.XPUB)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
@@ -37,6 +38,7 @@ class Publisher:
     def publish(self, packet: Packet) -> None:
         """Send to all who subscribed to the packet's envelope. Never blocks."""
         tail = None if packet.time_ns is None else wire.encode_time(packet.time_ns)
+        self.sent = True
         send_packet(self.socket, [packet.envelope.encode()], packet.payload, tail)
 
     def kill(self) -> None:
@@ -45,6 +47,7 @@ class Publisher:
 
     def serve(self) -> int:
         """Take in who subscribed and who left; returns how many joined."""
+        self.sent = True  # perhaps: what was kept
         joined = 0
         plain: dict[object, list[bytes]] = {}
         while readable(self.socket):

@@ -63,6 +63,7 @@ class Router:
         self._complaints = complaints
         self._with_keys = network.keys is not None
         self._connections = 0
+        self.sent = False
         self._by_descriptor: dict[int, _Peer] = {}
         self._identities: dict[int, bytes] = {}
         self.socket = network.socket(zmq.ROUTER)
@@ -106,6 +107,7 @@ class Router:
         """Answer by `connection`, if it is still there. Never blocks."""
         identity = self._identities.get(connection)
         if identity is not None:
+            self.sent = True
             send(self.socket, [identity, b"", *frames])
 
     def _interpret(self, peer: _Peer, frames: list[zmq.Frame]) -> list[RouterEvent]:

@@ -47,9 +47,9 @@ class SchedulerSockets:
             self._network, launch.name, sockets.subscribe[0], None, complaints, since_ns=since_ns, filtered=False
         )
         self._poller = poller(self._wake_up)
-        self._poller.register(self.router.socket, self.router, sends=True)
-        self._poller.register(self.link.socket, self.link, sends=True)
-        self._poller.register(self.publisher.socket, self.publisher, sends=True)
+        self._poller.register(self.router.socket, self.router, self.router)
+        self._poller.register(self.link.socket, self.link, self.link)
+        self._poller.register(self.publisher.socket, self.publisher, self.publisher)
         self._poller.register(self.subscriber.socket, self.subscriber)
         self._poller.register(self.subscriber.monitor.socket, self.subscriber)
         self._poller.register(self.router.monitor.socket, self.router.monitor)

@@ -38,6 +38,7 @@ class TranslatorLink:
     def __init__(self, network: Network, address: str, complaints: Complaints) -> None:
         self._complaints = complaints
         self._address = address
+        self.sent = False
         self.socket = network.socket(zmq.DEALER)
         # nothing waits for a translator that is gone, to be carried out when it is back
         self.socket.setsockopt(zmq.IMMEDIATE, 1)
@@ -47,6 +48,7 @@ class TranslatorLink:
     def send(self, number: int, frames: Sequence[bytes]) -> bool:
         """Ask; False if there is no translator to ask."""
         try:
+            self.sent = True
             send(self.socket, [b"%d" % number, b"", *frames])
         except zmq.Again:
             return False

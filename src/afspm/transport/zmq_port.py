@@ -56,10 +56,10 @@ class ZmqPort:
         self._poller = poller(self._wake_up)
         if publish is not None:
             self._publisher = Publisher(network, publish, self._published)
-            self._poller.register(self._publisher.socket, self._serve, sends=True)
+            self._poller.register(self._publisher.socket, self._serve, self._publisher)
         if control is not None:
             self._control = ControlClient(network, name, control, complaints)
-            self._poller.register(self._control.socket, self._control.receive, sends=True)
+            self._poller.register(self._control.socket, self._control.receive, self._control)
             self._poller.register(self._control.monitor.socket, self._control.follow)
         for address in subscribe:
             subscriber = Subscriber(network, name, address, envelopes, complaints)

@@ -40,15 +40,16 @@ class ZmqServerPort:
         self._allowed = allowed
         self._asker: list[bytes] | None = None
         self._closed = False
+        self.sent = False
         self._wake_up: WakeUp[Served] = WakeUp()
         self._published = Published(clock)
         self._publisher = None if publish is None else Publisher(network, publish, self._published)
         self._socket = network.socket(zmq.ROUTER)
         self.serve_address = network.bind(self._socket, serve)
         self._poller = poller(self._wake_up)
-        self._poller.register(self._socket, self._request, sends=True)
+        self._poller.register(self._socket, self._request, self)
         if self._publisher is not None:
-            self._poller.register(self._publisher.socket, self._serve, sends=True)
+            self._poller.register(self._publisher.socket, self._serve, self._publisher)
 
     @property
     def clock(self) -> Clock:
@@ -89,6 +90,7 @@ class ZmqServerPort:
     def reply(self, frames: Sequence[bytes] | None) -> None:
         asker, self._asker = self._asker, None
         if asker is not None and frames is not None:
+            self.sent = True
             send(self._socket, [*asker, *frames])
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
