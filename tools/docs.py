@@ -1,0 +1,155 @@
+"""Writes the parts of the documentation that follow from the code: `python tools/docs.py` (or `--check`).
+
+In a page, what stands between `<!-- from the code: NAME -->` and `<!-- end -->` is made here.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+import typing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from afspm import components
+from afspm.logic import arbitration, diagram
+from afspm.units import Unit
+
+ROOT = Path(__file__).resolve().parents[1]
+BLOCK = re.compile(r"(<!-- from the code: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def state_diagram() -> str:
+    return f"```mermaid\n{diagram.mermaid()}```\n"
+
+
+def transition_table() -> str:
+    lines = ["| a component … | when | it gets | and | because |", "| --- | --- | --- | --- | --- |"]
+    for row in arbitration.TABLE:
+        answer = "the translator's answer" if arbitration.Do.FORWARD in row.do else "—"
+        if row.response is not None:
+            answer = f"`REP_{row.response.name}`"
+        done = ", ".join(_done(do) for do in row.do if do is not arbitration.Do.FORWARD) or "nothing changes"
+        lines.append(f"| {row.event.value} | {row.when.text} | {answer} | {done} | {row.why} |")
+    return "\n".join(lines) + "\n"
+
+
+def _done(do: arbitration.Do) -> str:
+    return {
+        arbitration.Do.GRANT: "it is in control",
+        arbitration.Do.TAKE: "nobody is in control",
+        arbitration.Do.FLAG: "the problem is flagged",
+        arbitration.Do.UNFLAG: "the flag is removed",
+        arbitration.Do.SET_MODE: "the mode is set",
+        arbitration.Do.END: "the experiment ends",
+    }[do]
+
+
+def component_pages() -> str:
+    """Each ready-made component: what it does, and its settings."""
+    pages = []
+    for name in components.__all__:
+        pages.append(_class_page(name, getattr(components, name)))
+    return "\n".join(pages)
+
+
+def _class_page(name: str, cls: type) -> str:
+    lines = [f"## {name}", "", _docstring(cls), ""]
+    for attribute, says in (("solves", "Solves"), ("flags", "Flags"), ("publishes", "Publishes")):
+        if told := getattr(cls, attribute, ()):
+            lines += [f"{says}: {', '.join(f'`{one}`' for one in told)}.", ""]
+    hints = typing.get_type_hints(cls.__init__, include_extras=True)  # type: ignore[misc]
+    parameters = [p for p in inspect.signature(cls).parameters.values() if p.kind is not p.VAR_KEYWORD]
+    if parameters:
+        lines += ["| setting | value | default |", "| --- | --- | --- |"]
+        for parameter in parameters:
+            hint = hints.get(parameter.name, Any)
+            needed = parameter.default is parameter.empty
+            default = "(needed)" if needed else _value(parameter.default, hint, ())
+            lines.append(f"| `{parameter.name}` | {_kind(hint, ())} | {default} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _docstring(cls: type) -> str:
+    """The docstring as text; the list of settings in it as a list."""
+    text = inspect.getdoc(cls) or ""
+    text = re.sub(r"^(Settings|Args|Attributes):$", r"\1:\n", text, flags=re.MULTILINE)
+    return re.sub(r"^    (\w[\w, ]*):", r"- `\1`:", text, flags=re.MULTILINE)
+
+
+_UNITS = {"m": "length", "s": "duration", "rad": "angle", "V": "voltage", "A": "current", "m/s": "speed"}
+
+
+def _kind(hint: Any, metadata: Any) -> str:
+    unit = _unit(hint, metadata)
+    if unit:
+        return _UNITS.get(unit, f"quantity in {unit}")
+    args = [arg for arg in typing.get_args(hint) if arg is not type(None)]
+    origin = typing.get_origin(hint)
+    if origin is typing.Annotated:
+        return _kind(args[0], args[1:])
+    if origin is typing.Literal:
+        return ", ".join(f'"{arg}"' for arg in args)
+    if origin in (tuple, list) or getattr(origin, "__name__", "") in ("Sequence", "Iterable"):
+        inner = [_kind(arg, ()) for arg in args if arg is not ...]
+        return f"list of {inner[0]}" if inner and len(set(inner)) == 1 else f"[{', '.join(inner)}]"
+    if origin is dict or getattr(origin, "__name__", "") == "Mapping":
+        return "table"
+    if args:
+        return " or ".join(dict.fromkeys(_kind(arg, ()) for arg in args))
+    plain = {float: "number", int: "whole number", str: "text", bool: "true or false", Path: "path"}
+    return plain.get(hint, getattr(hint, "__name__", str(hint)))
+
+
+def _unit(hint: Any, metadata: Any) -> str:
+    for item in metadata:
+        if isinstance(item, Unit):
+            return item.si
+        if found := _unit(item, ()):
+            return found
+    if typing.get_origin(hint) is typing.Annotated:
+        return _unit(typing.get_args(hint)[0], hint.__metadata__)
+    return ""
+
+
+def _value(default: Any, hint: Any, metadata: Any) -> str:
+    if default is None:
+        return "—"
+    if isinstance(default, bool):
+        return f"`{str(default).lower()}`"
+    if isinstance(default, (list, tuple)):
+        return f"`{list(default)}`"
+    if unit := _unit(hint, metadata):
+        return f"`{default:g} {unit}`"
+    return f"`{default!r}`".replace("'", '"')
+
+
+PARTS: dict[str, Callable[[], str]] = {
+    "state-diagram": state_diagram,
+    "transition-table": transition_table,
+    "components": component_pages,
+}
+
+
+def made(text: str) -> str:
+    """A page with its parts made anew."""
+    return BLOCK.sub(lambda block: block[1] + PARTS[block[2]]() + block[3], text)
+
+
+def main() -> None:
+    stale = []
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        if (new := made(text)) != text:
+            stale.append(str(page.relative_to(ROOT)))
+            if "--check" not in sys.argv:
+                page.write_text(new, encoding="utf-8")
+    sys.stdout.write("".join(f"{page}\n" for page in stale))
+    sys.exit(bool(stale) and "--check" in sys.argv)
+
+
+if __name__ == "__main__":
+    main()
