@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from afspm import wire
-from afspm.errors import InvalidValue
+from afspm.errors import ExperimentEnded, InvalidValue
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -220,7 +220,9 @@ class Scope:
 
     def end_experiment(self) -> None:
         """End the experiment for everybody, this process included: the next call raises ExperimentEnded."""
-        self._tell(ControlRequest.END_EXPERIMENT, None)
+        self._link.wait_caught_up()  # else the signal might pass before we listen
+        with suppress(ExperimentEnded):  # it may come before the answer
+            self._tell(ControlRequest.END_EXPERIMENT, None)
 
     # --- looking ---
 

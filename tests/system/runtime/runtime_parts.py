@@ -96,5 +96,5 @@ class Survey(Component):
         say("all")
 
     def on_scan(self, scan: Scan) -> None:
-        with (self.folder / "scans").open("a") as file:
+        with (self.folder / "seen").open("a") as file:
             file.write(f"{scan.channel} {scan.region.center_m[0]:.1e} {scan.time_ns}\n")
