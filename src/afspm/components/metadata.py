@@ -1,0 +1,163 @@
+"""`Metadata`: a table of what was measured, with what the files of the microscope don't say: who was in control."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, ClassVar
+
+from afspm.components.records import LineFile
+from afspm.model import ControlState, Region, Scan, ScopeState, ScopeStatus, Spectrum
+from afspm.runtime.component import Component
+
+COLUMNS = (
+    "time",
+    "measurement",
+    "filename",
+    "channel",
+    "center_x",
+    "center_y",
+    "width",
+    "height",
+    "length_units",
+    "angle_deg",
+    "columns",
+    "rows",
+    "units",
+    "in_control",
+    "mode",
+    "problems",
+    "state",
+)
+_BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """Who was in control when a measurement began, and how things stood; texts, empty where it is not known."""
+
+    in_control: str = ""
+    mode: str = ""
+    problems: str = ""
+    state: str = ""
+
+
+class Metadata(Component):
+    """Writes `metadata.csv` in the run folder: a row for each channel of each scan, and for each spectrum.
+
+    Columns: the time it was finished (UTC), `scan` or `spectrum`, the file, the channel (or kind), its place in metres,
+    pixels, units, and as it was when the measurement began: who was in control, the mode, the problems flagged and
+    the microscope's state. What is not known is left empty: a scan that began while this component was not running.
+
+    Whatever is killed, there is one header and no row is there twice or missing.
+
+    Args:
+        file: its name in the run folder.
+    """
+
+    listens: ClassVar = ("Scan2d", "Spec1d", "ControlState", "ScopeStateMsg")
+
+    def __init__(self, file: str = "metadata.csv") -> None:
+        self.file = file
+        self._control: ControlState | None = None
+        self._saw_begin = False
+
+    def on_start(self) -> None:
+        self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
+        self._written = {_identity(row) for row in csv.reader(self._table.lines())}
+
+    def on_control(self, control_state: ControlState) -> None:
+        self._control = control_state
+
+    def on_state(self, status: ScopeStatus) -> None:
+        what = _BUSY.get(status.state)
+        now_ns = self.packet.time_ns if self.packet else None
+        if what is None:
+            self._saw_begin = self._saw_begin and status.state is not ScopeState.FREE
+            return
+        if now_ns is not None and now_ns <= self.memory.get("began_ns", -1):
+            return  # replayed after a restart: what was noted then is what holds
+        self._saw_begin = True
+        self.memory["began_ns"] = -1 if now_ns is None else now_ns
+        self.memory["what"], self.memory["finished_ns"] = what, None
+        self.memory["circumstances"] = self._now(status)
+        self.memory.save()
+
+    def _now(self, status: ScopeStatus) -> list[str]:
+        if self._control is None:
+            return ["", "", "", status.state.name.lower()]
+        problems = " ".join(self.scope.problems.name(number) for number in self._control.problems)
+        return [self._control.holder or "", self._control.mode.name.lower(), problems, status.state.name.lower()]
+
+    def on_scan(self, scan: Scan) -> None:
+        if scan.values.size:
+            self._write(scan_row(scan, self._circumstances("scan", scan.time_ns)))
+
+    def on_spectrum(self, spectrum: Spectrum) -> None:
+        self._write(spectrum_row(spectrum, self._circumstances("spectrum", spectrum.time_ns)))
+
+    def _circumstances(self, what: str, time_ns: int | None) -> Circumstances:
+        """Those noted when it began, if it is the measurement that they were noted for."""
+        if self.memory.get("what") != what:
+            return Circumstances()
+        finished_ns = self.memory["finished_ns"]
+        if finished_ns is None and time_ns is not None:
+            self.memory["finished_ns"] = time_ns
+            self.memory.save()
+        elif finished_ns != time_ns and not self._saw_begin:
+            return Circumstances()  # a later one, that began while we were not running
+        return Circumstances(*self.memory["circumstances"])
+
+    def _write(self, row: list[str]) -> None:
+        if _identity(row) in self._written:
+            return
+        line = io.StringIO()
+        csv.writer(line, lineterminator="").writerow(row)
+        self._table.append([line.getvalue().replace("\n", " ")])
+        self._written.add(_identity(row))
+
+
+def scan_row(scan: Scan, circumstances: Circumstances) -> list[str]:
+    """One channel of a scan as a row."""
+    rows, columns = scan.shape
+    what = ["scan", scan.filename, scan.channel]
+    return _row(scan.time_ns, what, _of_region(scan.region), [str(columns), str(rows), scan.unit], circumstances)
+
+
+def spectrum_row(spectrum: Spectrum, circumstances: Circumstances) -> list[str]:
+    """A spectrum as a row: its points are rows, its variables columns."""
+    points, variables = spectrum.values.shape
+    place = ["", ""] if spectrum.position_m is None else [_number(v) for v in spectrum.position_m]
+    what = ["spectrum", spectrum.filename, spectrum.kind]
+    of_values = [str(variables), str(points), " ".join(spectrum.units)]
+    return _row(spectrum.time_ns, what, [*place, "", "", "m", ""], of_values, circumstances)
+
+
+def _row(time_ns: int | None, what: list[str], place: list[str], of_values: list[str], at: Circumstances) -> list[str]:
+    return [iso_utc(time_ns), *what, *place, *of_values, at.in_control, at.mode, at.problems, at.state]
+
+
+def _of_region(region: Region) -> list[str]:
+    lengths = [_number(value) for value in (*region.center_m, *region.size_m)]
+    return [*lengths, "m", _number(math.degrees(region.angle_rad))]
+
+
+def iso_utc(time_ns: int | None) -> str:
+    """A time as ISO 8601 in UTC, to the microsecond; empty for none."""
+    if time_ns is None:
+        return ""
+    seconds, rest_ns = divmod(time_ns, 1_000_000_000)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
+
+
+def _number(value: float) -> str:
+    return f"{value:.9g}"
+
+
+def _identity(row: list[str]) -> tuple[Any, ...]:
+    """What no two rows share: when, what, which file and which channel."""
+    return tuple(row[:4])

@@ -1,0 +1,65 @@
+"""Files that grow line by line and survive a kill: a line is there as a whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from afspm.errors import FileError
+
+
+class LineFile:
+    """Appends lines to a text file. A last line that a kill cut in two is taken away before the next is written.
+
+    Args:
+        path: made when the first line is written.
+        header: the first line of a new file.
+    """
+
+    def __init__(self, path: Path, header: str = "") -> None:
+        self.path = path
+        self._header = header
+        self._is_open = False
+
+    def lines(self) -> list[str]:
+        """What is there, the header not counted; without a last line that is not whole.
+
+        Raises:
+            FileError: it can't be read.
+        """
+        try:
+            text = self.path.read_bytes().decode("utf-8", errors="replace")
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise FileError(f"can't be read: {error}", where=str(self.path)) from error
+        whole = text[: text.rfind("\n") + 1].splitlines()
+        return whole[1:] if self._header else whole
+
+    def append(self, lines: Iterable[str]) -> None:
+        """Write lines at the end, the header first if the file is new.
+
+        Raises:
+            FileError: the disk is full …
+        """
+        text = "".join(f"{line}\n" for line in lines)
+        try:
+            if not self._is_open:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                text = self._mended() + text
+                self._is_open = True
+            with self.path.open("ab") as file:
+                file.write(text.encode())
+        except OSError as error:
+            raise FileError(f"can't be written: {error}", where=str(self.path)) from error
+
+    def _mended(self) -> str:
+        """Cut off half a line at the end; returns the header that has to come before what is written."""
+        if not self.path.exists():
+            return f"{self._header}\n" if self._header else ""
+        data = self.path.read_bytes()
+        whole = data.rfind(b"\n") + 1
+        if whole < len(data):
+            with self.path.open("r+b") as file:
+                file.truncate(whole)
+        return f"{self._header}\n" if self._header and whole == 0 else ""
