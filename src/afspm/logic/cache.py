@@ -15,6 +15,7 @@ TIME_STEP_NS = 1_000
 _OVERHEAD_BYTES = 300  # of a kept packet beside its payload, so that a flood of empty ones is bounded too
 _TIMES_REMEMBERED = 4096
 _RECENT = 64
+_SET_BACK_NS = 10**9
 _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than that is not believed
 
 
@@ -43,6 +44,7 @@ class Cache:
         self._several = 0  # envelopes with more than one packet
         self._bytes = 0
         self._last_ns = 0
+        self._started_ns = 0
         self._sources: OrderedDict[int, None] = OrderedDict()
         self._newest_source_ns = -1
         self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
@@ -104,13 +106,19 @@ class Cache:
 
         How many are kept of an envelope is known again with its next packet; until then all of them are.
         """
+        newest_ns = next(reversed(self._kept), 0)
         for packet, source_ns in packets:
-            if packet.time_ns is None or packet.time_ns <= self._last_ns:
+            if packet.time_ns is None or packet.time_ns <= newest_ns:
                 continue
-            self._last_ns = packet.time_ns
+            newest_ns = packet.time_ns
+            self.not_before(newest_ns)
             if source_ns is not None:
                 self._saw(source_ns)
             self._keep(packet, source_ns, (history_of or {}).get(packet.envelope, _TIMES_REMEMBERED))
+
+    def start(self, now_ns: int) -> None:
+        """It is this time, and all that was published before a restart was published earlier."""
+        self._started_ns = now_ns
 
     def not_before(self, time_ns: int) -> None:
         """What is published from here on is after this time."""
@@ -139,7 +147,11 @@ class Cache:
         return len(self._kept)
 
     def _next_ns(self, time_ns: int) -> int:
-        self._last_ns = time_ns if time_ns >= self._last_ns + TIME_STEP_NS else self._last_ns + TIME_STEP_NS
+        last_ns = self._last_ns
+        if time_ns < last_ns - _SET_BACK_NS:
+            # far behind: what a former life of the scheduler published with made-up times is not known for certain
+            time_ns = self._started_ns
+        self._last_ns = max(time_ns, last_ns + TIME_STEP_NS)
         return self._last_ns
 
     def _saw(self, source_ns: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import OrderedDict
 from enum import Enum, auto
 
@@ -36,14 +37,17 @@ class OnceTable:
         entry = None if of_client is None else of_client.get(request.id)
         if entry is None:
             return None
-        if entry[0] != _fingerprint(request):
+        if entry[0] != fingerprint(request):
             return Response(ControlResponse.FAILURE, reason="its id was used for another request before", id=request.id)
         return entry[1]
 
     def note(self, client: str, request: Request, outcome: Fate | Response) -> None:
         """Remember what became of a request; of one without an id nothing is."""
-        if not request.id:
-            return
+        if request.id:
+            self.restore(client, request.id, fingerprint(request), outcome)
+
+    def restore(self, client: str, request_id: str, print_: int, outcome: Fate | Response) -> None:
+        """The same of a request of which only its fingerprint is known."""
         of_client = self._table.get(client)
         if of_client is None:
             of_client = self._table[client] = OrderedDict()
@@ -51,7 +55,7 @@ class OnceTable:
                 self._table.popitem(last=False)
         else:
             self._table.move_to_end(client)
-        of_client[request.id] = (_fingerprint(request), outcome)
+        of_client[request_id] = (print_, outcome)
         if len(of_client) > self._per_client:
             of_client.popitem(last=False)
 
@@ -62,5 +66,6 @@ class OnceTable:
             of_client.pop(request.id, None)
 
 
-def _fingerprint(request: Request) -> int:
-    return hash((request.kind, request.payload))
+def fingerprint(request: Request) -> int:
+    """Tells requests apart that were given the same id; the same in every process."""
+    return zlib.crc32(request.payload, request.kind)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -38,7 +39,7 @@ from afspm.logic.events import (
 from afspm.logic.forwarding import UNKNOWN, End, Forwarder, Job, Settled
 from afspm.logic.lease import Lease
 from afspm.logic.limits import Guard, Limits
-from afspm.logic.once import Fate, OnceTable
+from afspm.logic.once import Fate, OnceTable, fingerprint
 from afspm.logic.sessions import Hearing, Sessions
 from afspm.logic.watchdog import Result, Watchdog, WatchdogSettings
 from afspm.model import (
@@ -72,6 +73,7 @@ _CONTROL_EVENTS = {
 }
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
+_SENT_REMEMBERED = 100
 _PROBE_ID = "scheduler/are-ids-known"
 
 
@@ -134,8 +136,11 @@ class SchedulerCore:
         self._started_s = 0.0
         self._announce_at_s: float | None = None
         self._recent: list[tuple[int, int]] = []
+        self._missed_again_s = -math.inf
         self._probe: Job | None = None
         self._ids_known: bool | None = None
+        # actions that only we know of: a translator of version 1 would do them again
+        self._sent: deque[tuple[str, str, int]] = deque(maxlen=_SENT_REMEMBERED)
         self._told: set[object] = set()
         self._effects: list[Effect] = []
         self._handlers: dict[type, Callable[[Any, float, int], None]] = {
@@ -160,6 +165,7 @@ class SchedulerCore:
         self._effects = []
         self._started_s = now_s
         self._lease.held_by(self._control.holder, now_ns)
+        self._cache.start(now_ns)
         self._cache.remember(self._recent)
         if self._control.ended:
             self._effects.append(Kill())
@@ -197,6 +203,8 @@ class SchedulerCore:
             "last_ns": self._cache.last_ns,
             "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
+            "sent": list(self._sent),
+            "sessions": self._sessions.tokens(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -210,10 +218,16 @@ class SchedulerCore:
         self._watchdog.restore(map(str, state["wanted"]))
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
         self._announce_at_s = math.inf
+        self._sessions.restore(state["sessions"])
+        for client, request_id, print_ in state["sent"]:
+            self._sent.append((client, request_id, print_))
+            self._once.restore(client, request_id, print_, Fate.UNKNOWN)
 
     def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
         """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
         self._cache.restore(packets)
+        if len(self._cache):
+            self._announce_at_s = math.inf
 
     def cached(self) -> Iterable[tuple[Packet, int | None]]:
         """What is cached now (with `source_ns`), oldest first: for whoever tidies the journal."""
@@ -242,7 +256,8 @@ class SchedulerCore:
     def _on_disconnected(self, event: Disconnected, now_s: float, now_ns: int) -> None:
         name = self._sessions.disconnected(event.connection, now_s)
         self._told.discard(event.connection)
-        if name is not None and name == self._control.holder:
+        if name is not None and name == self._control.holder and now_s >= self._missed_again_s:
+            self._missed_again_s = now_s + self._settings.grace_s
             self._log("WARNING", f"{name} is in control and gone; it has {self._settings.grace_s:g} s to come back")
 
     def _on_greeted(self, event: Greeted, now_s: float, now_ns: int) -> None:
@@ -408,6 +423,9 @@ class SchedulerCore:
             self._effects.append(Reply(event.connection, name, refused.response))
         elif request.id:
             self._once.note(name, request, Fate.PENDING)
+            if request.kind == _ACTION and not self._ids_known:
+                self._sent.append((name, request.id, fingerprint(request)))
+                self._effects.append(SaveState(self.snapshot()))
 
     def _on_reply(self, event: TranslatorReply, now_s: float, now_ns: int) -> None:
         settled = self._forwarder.answered(event.number, event.response, now_s)

@@ -6,12 +6,15 @@ session.
 
 ROUTER hands a name over to its newest connection and closes the older one. So when a second process takes a name that
 is in use, the first is disconnected *after* the second was accepted, while a process that is restarted connects after
-its former life was disconnected. That tells the impostor, who is refused, from the restarted, who is the same client.
+its former life was disconnected. That tells the impostor, who is refused, from the restarted, who is the same client. A
+former life that speaks again was none: it was first, and has its name back.
 """
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -30,6 +33,7 @@ class Hearing(Enum):
 class _Session:
     token: str | None
     connection: int | None
+    former: str | None = None  # the token of the session that this one replaced
     lost_order: int = 0
     lost_s: float = 0.0
 
@@ -103,10 +107,21 @@ class Sessions:
     def lost_since_s(self, name: str) -> float | None:
         """Since when (real) a name that was heard of is without a connection; None if it has one, or is unknown."""
         session = self._names.get(name)
-        return session.lost_s if session is not None and session.connection is None else None
+        lost = session is not None and session.connection is None and session.lost_s > -math.inf
+        return session.lost_s if session is not None and lost else None
+
+    def tokens(self) -> dict[str, str]:
+        """The tokens of the sessions that are connected, to be kept over a restart."""
+        return {name: s.token for name, s in self._names.items() if s.token is not None and s.connection is not None}
+
+    def restore(self, tokens: Mapping[str, str]) -> None:
+        """These sessions had the names before we were restarted; whether they still live will be seen."""
+        for name, token in tokens.items():
+            self._names[name] = _Session(token, None, lost_s=-math.inf)
 
     def _gives_way(self, session: _Session, token: str | None, connection: int, now_s: float) -> bool:
-        if token is not None and token == session.token:
+        # its owner; or the one before, who was taken for dead, and was first
+        if token is not None and token in (session.token, session.former):
             return True
         if session.connection is not None:
             return False
@@ -118,5 +133,8 @@ class Sessions:
         if former is not None and former.connection is not None:
             self._name_of.pop(former.connection, None)
         self._lost.pop(name, None)
-        self._names[name] = _Session(token, connection)
+        replaced = former.token if former is not None and former.token != token else None
+        if former is not None and former.former == token:
+            replaced = None  # it is back: whoever came in between has no claim
+        self._names[name] = _Session(token, connection, replaced)
         self._name_of[connection] = name

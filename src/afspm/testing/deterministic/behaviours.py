@@ -1,0 +1,203 @@
+"""The cast: those who work well together, and those who do not."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+from afspm.model import ControlMode, ControlRequest, ControlResponse, Parameter, Problem, ScopeState, names
+from afspm.testing.deterministic.client import Client, Doing
+
+_OK = int(ControlResponse.SUCCESS)
+
+
+class Experiment(Client):
+    """Scans over and over; waits for control, survives losing it.
+
+    Attributes:
+        done: scans that it saw through, in all lives.
+    """
+
+    done = 0
+
+    def behave(self) -> Doing:
+        yield from self.until(lambda: self.scope is not ScopeState.UNDEFINED, 10.0)
+        while True:
+            if not (yield from self.regain(Problem.NONE)):
+                continue
+            yield from self.scan()
+            if self.timeline.chance(0.3):
+                yield from self.ask(ControlRequest.RELEASE_CTRL)
+                yield from self.sleep(self.some(120.0))
+
+    def regain(self, solving: int) -> Generator[float, None, bool]:
+        """Ask for control; where it is refused, wait for something to change."""
+        before = self.control
+        response = yield from self.ask(ControlRequest.REQUEST_CTRL, int(solving))
+        if response.code == _OK:
+            return True
+        yield from self.until(lambda: self.control != before, self.some(60.0))
+        return False
+
+    def scan(self) -> Doing:
+        """One scan, to its end or to the loss of control."""
+        yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+        count = len(self.scans)
+        set_ = yield from self.ask(ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "1.0", "V"))
+        if set_.code != _OK:
+            yield from self.sleep(self.some(20.0))
+            return
+        begun = yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+        if begun.code != _OK:
+            yield from self.sleep(self.some(20.0))
+            return
+        yield from self.until(lambda: self.scope is ScopeState.SCANNING, 5.0)
+        yield from self.until(lambda: self.scope is not ScopeState.SCANNING or not self._holds(), self.some(4000.0))
+        yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+        if len(self.scans) > count:
+            self.done += 1
+
+    def _holds(self) -> bool:
+        return self.control.holder == self.identity
+
+
+class Version1Experiment(Experiment):
+    """The same, without ids: what is not answered is not repeated."""
+
+    knows_ids = False
+
+
+class Classifier(Client):
+    """Flags the tip when the scans are bad, and now and then another problem; clears flags now and then."""
+
+    problems: tuple[int, ...] = (Problem.TIP_SHAPE_CHANGED, Problem.FEEDBACK_NON_OPTIMAL)
+
+    def behave(self) -> Doing:
+        seen = 0
+        while True:
+            yield from self.until(lambda n=seen: len(self.scans) > n, self.some(600.0))  # type: ignore[misc]
+            bad = any(not scan.tip_is_good for scan in self.scans[seen:])
+            seen = len(self.scans)
+            if bad:
+                yield from self.ask(ControlRequest.ADD_EXP_PRBLM, int(Problem.TIP_SHAPE_CHANGED))
+            if self.timeline.chance(0.05):
+                yield from self.ask(ControlRequest.ADD_EXP_PRBLM, int(self.timeline.random.choice(self.problems)))
+            if self.control.problems and self.timeline.chance(0.1):
+                yield from self.ask(ControlRequest.RMV_EXP_PRBLM, self.timeline.random.choice(self.control.problems))
+
+
+class Corrector(Experiment):
+    """Solves one problem: pulses, scans, and clears the flag."""
+
+    problem: int = Problem.TIP_SHAPE_CHANGED
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.until(lambda: self.problem in self.control.problems)
+            if not (yield from self.regain(self.problem)):
+                continue
+            for _ in range(3):
+                yield from self.until(lambda: self.scope is ScopeState.FREE, 30.0)
+                yield from self.ask(ControlRequest.ACTION, names.PULSE)
+                if self.timeline.chance(0.5):
+                    yield from self.scan()
+            yield from self.ask(ControlRequest.RMV_EXP_PRBLM, int(self.problem))
+            yield from self.sleep(self.some(10.0))
+
+
+class FeedbackCorrector(Corrector):
+    """Solves the other problem."""
+
+    problem = Problem.FEEDBACK_NON_OPTIMAL
+
+
+class Greedy(Experiment):
+    """Gets control and does nothing with it."""
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(3600.0))
+            if (yield from self.regain(Problem.NONE)):
+                yield from self.sleep(self.some(7200.0))
+                yield from self.ask(ControlRequest.RELEASE_CTRL)
+
+
+class Crasher(Experiment):
+    """Gets control, begins something, and dies; now and then for good (exit code 0)."""
+
+    def behave(self) -> Doing:
+        yield from self.sleep(self.some(1800.0))
+        if (yield from self.regain(Problem.NONE)):
+            yield from self.ask(ControlRequest.ACTION, names.START_SPEC)
+            yield from self.sleep(self.some(20.0))
+            self.kill(0 if self.timeline.chance(0.1) else -11)
+
+
+class Impostor(Client):
+    """Calls itself like another component, and commands, unasked, again and again."""
+
+    connects = False
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(900.0))
+            self.connect()
+            yield from self.ask(ControlRequest.REQUEST_CTRL, 0)
+            yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+            yield from self.ask(ControlRequest.RELEASE_CTRL)
+            self.kill(1)
+
+
+class Operator(Client):
+    """A person who takes over now and then."""
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(3600.0))
+            yield from self.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL))
+            yield from self.sleep(self.some(300.0))
+            yield from self.automated()
+
+    def automated(self) -> Doing:
+        while True:
+            response = yield from self.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.AUTOMATED))
+            if response.code == _OK:
+                return
+
+
+class Dawn(Operator):
+    """The person who comes in the morning and leaves everything to the components."""
+
+    def behave(self) -> Doing:
+        yield from self.automated()
+
+
+class Stranger(Client):
+    """Asks for whatever comes to its mind, except to end the experiment."""
+
+    requests: tuple[tuple[ControlRequest, Any], ...] = (
+        (ControlRequest.RELEASE_CTRL, None),
+        (ControlRequest.RMV_EXP_PRBLM, 2),
+        (ControlRequest.ADD_EXP_PRBLM, 0),
+        (ControlRequest.ADD_EXP_PRBLM, 77),
+        (ControlRequest.REQUEST_CTRL, 77),
+        (ControlRequest.SET_CONTROL_MODE, 0),
+        (ControlRequest.ACTION, names.PULSE),
+        (ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE)),
+        (ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "nan", "V")),
+        (ControlRequest.ACTION_SUPPORT, names.PULSE),
+    )
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(600.0))
+            kind, subject = self.timeline.random.choice(self.requests)
+            yield from self.ask(kind, subject)
+
+
+class Listener(Client):
+    """Only listens, as a visualiser does."""
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(1e6)

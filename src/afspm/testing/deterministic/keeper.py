@@ -1,0 +1,66 @@
+"""The supervisor as far as it decides: the real `ChildWatch` for each process, with beats that freeze with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from afspm.logic.supervision import ChildWatch, Effect, GiveUp, Kill, Policy, Start
+from afspm.testing.deterministic.process import Process
+from afspm.testing.deterministic.timeline import Timeline
+
+
+@dataclass(frozen=True)
+class Beat:
+    """See `afspm.transport.heartbeat.Heartbeat`."""
+
+    closing: bool
+    step_age_s: float | None
+    longest_step_s: float | None = None
+
+
+class Keeper:
+    """Starts all processes and keeps them going.
+
+    Attributes:
+        given_up: names of those that it gave up.
+        on_over: called with the name of a component that is not started again.
+    """
+
+    def __init__(self, timeline: Timeline, processes: Iterable[Process], policy: Policy) -> None:
+        self._timeline = timeline
+        self._policy = policy
+        self._children = {process.name: (process, ChildWatch(policy)) for process in processes}
+        self.given_up: list[str] = []
+        self.on_over: Callable[[str], None] = lambda name: None
+        for process, watch in self._children.values():
+            process.exited = lambda code, name=process.name: self._exited(name, code)  # type: ignore[misc]
+            self._do(process, watch.begin(timeline.monotonic_s()))
+        self._beat()
+
+    def _beat(self) -> None:
+        now_s = self._timeline.monotonic_s()
+        for process, watch in self._children.values():
+            if process.alive and not process.frozen:
+                self._do(process, watch.beat(Beat(closing=False, step_age_s=process.step_age_s), now_s))
+            else:
+                self._do(process, watch.tick(now_s))
+        self._timeline.after(self._policy.liveness.beat_period_s, self._beat)
+
+    def _exited(self, name: str, code: int) -> None:
+        self._timeline.after(0.01, self._heard, name, code)
+
+    def _heard(self, name: str, code: int) -> None:
+        process, watch = self._children[name]
+        self._do(process, watch.exited(code, self._timeline.monotonic_s()))
+        if watch.over:
+            self.on_over(name)
+
+    def _do(self, process: Process, effects: Iterable[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Start):
+                self._timeline.after(0.3 + 0.5 * self._timeline.random.random(), process.start)
+            elif isinstance(effect, Kill):
+                process.kill()
+            elif isinstance(effect, GiveUp):
+                self.given_up.append(process.name)

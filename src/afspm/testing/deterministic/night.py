@@ -1,0 +1,289 @@
+"""A simulated night: who takes part, under which settings, and what befalls them. All of it follows from the seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from afspm.logic.arbitration import Cause
+from afspm.logic.envelopes import Envelopes
+from afspm.logic.limits import Limit, Limits
+from afspm.logic.liveness import LivenessPolicy
+from afspm.logic.restart import RestartPolicy
+from afspm.logic.scheduling import SchedulerSettings
+from afspm.logic.supervision import Policy
+from afspm.logic.watchdog import WatchdogSettings
+from afspm.model import Packet, PacketHeader, ScopeState, names
+from afspm.testing.deterministic import behaviours
+from afspm.testing.deterministic.client import Client
+from afspm.testing.deterministic.codec import TableCodec
+from afspm.testing.deterministic.invariants import Bounds, Invariants, InvariantViolated
+from afspm.testing.deterministic.keeper import Keeper
+from afspm.testing.deterministic.microscope import FakeMicroscope, FakeScan, Habits
+from afspm.testing.deterministic.network import Weather
+from afspm.testing.deterministic.scheduler import SchedulerHost
+from afspm.testing.deterministic.timeline import Timeline
+
+_CALM = 0.15
+"""The last part of a night, in which nothing bad happens any more and all must come right again."""
+
+_SETTLED_S = 5.0
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something bad: what, to whom, when (as a part of the time before the calm), for how long (real)."""
+
+    what: str
+    whom: str
+    when: float
+    for_s: float = 0.0
+
+
+FAULTS = ("kill", "freeze", "cut", "storm", "hang", "clock", "busy")
+CAST = {
+    "experiment": behaviours.Experiment,
+    "classifier": behaviours.Classifier,
+    "corrector": behaviours.Corrector,
+    "feedback": behaviours.FeedbackCorrector,
+    "greedy": behaviours.Greedy,
+    "crasher": behaviours.Crasher,
+    "operator": behaviours.Operator,
+    "stranger": behaviours.Stranger,
+    "listener": behaviours.Listener,
+    "old": behaviours.Version1Experiment,
+}
+_ALWAYS = ("experiment", "classifier", "corrector", "feedback")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a night is made of.
+
+    Attributes:
+        seed: of all that is left to chance.
+        hours: experiment time.
+        speed: experiment seconds in a real one.
+        cast: who takes part.
+        impostor: somebody calls himself "experiment" as well.
+        ids_known: the translator is ours, not of version 1.
+        lease_s: None for none; then nobody greedy takes part.
+        faults: what befalls them.
+        doubles: the chance that a request arrives twice.
+        hangs, loses_answer: see `Habits`.
+        dies_in_step: see `SchedulerHost`.
+    """
+
+    seed: int
+    hours: float = 8.0
+    speed: float = 60.0
+    cast: tuple[str, ...] = _ALWAYS
+    impostor: bool = False
+    ids_known: bool = True
+    lease_s: float | None = 1800.0
+    faults: tuple[Fault, ...] = ()
+    doubles: float = 0.0
+    hangs: float = 0.0
+    loses_answer: float = 0.0
+    dies_in_step: float = 0.0
+    stop_when: tuple[Cause, ...] = (Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE)
+
+
+def plan(seed: int, hours: float = 8.0) -> Plan:
+    """A night as the seed has it: from a quiet one to one where nearly everything goes wrong."""
+    chance = Timeline(seed * 7919 + 1).random
+    others = [name for name in CAST if name not in _ALWAYS]
+    lease_s = chance.choice((None, 900.0, 1800.0))
+    cast = [*_ALWAYS, *(name for name in others if chance.random() < 0.5)]
+    if lease_s is None and "greedy" in cast:
+        cast.remove("greedy")
+    harm = chance.choice((0.0, 0.5, 1.0, 3.0))  # faults an hour
+    targets = ["scheduler", "translator", *cast]
+    faults = [
+        Fault(
+            chance.choice(FAULTS), chance.choice(targets), chance.random(), chance.choice((0.5, 3.0, 8.0, 20.0, 60.0))
+        )
+        for _ in range(round(harm * hours))
+    ]
+    bad = harm > 0.0
+    return Plan(
+        seed,
+        hours,
+        chance.choice((30.0, 60.0, 200.0)),
+        tuple(cast),
+        impostor=chance.random() < 0.25,
+        ids_known=chance.random() < 0.75,
+        lease_s=lease_s,
+        faults=tuple(sorted(faults, key=lambda fault: fault.when)),
+        doubles=chance.choice((0.0, 0.1)) if bad else 0.0,
+        hangs=chance.choice((0.0, 0.005)) if bad else 0.0,
+        loses_answer=chance.choice((0.0, 0.005)) if bad else 0.0,
+        dies_in_step=chance.choice((0.0, 0.0005)) if bad else 0.0,
+        stop_when=chance.choice(((), (Cause.PROBLEM,), tuple(Cause))),
+    )
+
+
+@dataclass
+class Outcome:
+    """What came of a night."""
+
+    scans: int
+    scans_in_calm: int
+    steps: int
+    given_up: list[str] = field(default_factory=list)
+
+
+class Night:
+    """One night, ready to be run."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.timeline = timeline = Timeline(plan.seed, plan.speed)
+        self.weather = Weather(doubles=plan.doubles)
+        self.codec = TableCodec()
+        habits = Habits(plan.ids_known, hangs=plan.hangs, loses_answer=plan.loses_answer)
+        self.microscope = FakeMicroscope(timeline, self.codec, habits)
+        self.settings = _settings(plan)
+        bounds = Bounds(
+            self.settings.grace_s,
+            self.settings.restart_grace_s,
+            self.settings.lease_s,
+            self.settings.request_timeout_s,
+        )
+        self.invariants = Invariants(timeline, bounds, self.microscope)
+        self.scheduler = SchedulerHost(
+            timeline,
+            self.weather,
+            self.settings,
+            self.codec,
+            self._header,
+            self.invariants,
+            dies_in_step=plan.dies_in_step,
+        )
+        self.scheduler.translator = (self.microscope, self.microscope)
+        self.components = self._components()
+        self.dawn = behaviours.Dawn(timeline, self.weather, self.codec, self.scheduler, "dawn")
+        self.keeper = Keeper(timeline, [self.microscope, self.scheduler, *self.components.values()], _policy())
+        self.keeper.on_over = self._over
+
+    def _components(self) -> dict[str, Client]:
+        made: dict[str, Client] = {
+            name: CAST[name](self.timeline, self.weather, self.codec, self.scheduler, name) for name in self.plan.cast
+        }
+        if self.plan.impostor:
+            made["impostor"] = behaviours.Impostor(
+                self.timeline, self.weather, self.codec, self.scheduler, "impostor", "experiment"
+            )
+        for client in made.values():
+            client.on_received = self.invariants.received
+            client.on_answer = self.invariants.answered
+        self.invariants.components = list(made.values())
+        return made
+
+    def _over(self, name: str) -> None:
+        if name in self.components and self.scheduler.alive:
+            self.scheduler.take(self.scheduler.component_died, name)
+
+    def _header(self, packet: Packet) -> PacketHeader:
+        thing = self.codec.decode(packet.payload)
+        if isinstance(thing, FakeScan):
+            size_m = 2e-6 if thing.number % 2 else 5e-8
+            kind = "IV" if packet.envelope == "Spec1d" else None
+            return PacketHeader(packet.envelope, thing.channel, (size_m, size_m), kind)
+        return PacketHeader(packet.envelope)
+
+    def run(self) -> Outcome:
+        """From dusk to dawn.
+
+        Raises:
+            InvariantViolated: with the seed to replay it.
+        """
+        try:
+            return self._run()
+        except InvariantViolated as error:
+            error.what = f"seed {self.plan.seed}, {self.plan}: {error.what}"
+            raise
+
+    def _run(self) -> Outcome:
+        timeline, plan = self.timeline, self.plan
+        length_s = timeline.real_s(plan.hours * 3600.0)
+        calm_s = max(length_s * _CALM, timeline.real_s(4 * 3600.0), 200.0)
+        for fault in plan.faults:
+            timeline.after(fault.when * length_s, self._befall, fault)
+        timeline.run_until(length_s)
+        self._calm()
+        timeline.run_until(length_s + 100.0)
+        before = self.microscope.scans_done
+        timeline.run_until(length_s + calm_s)
+        done = self.microscope.scans_done
+        self._come_right(done - before)
+        return Outcome(done, done - before, self.invariants.checks, self.keeper.given_up)
+
+    # --- what befalls them ---
+
+    def _befall(self, fault: Fault) -> None:
+        process = {"scheduler": self.scheduler, "translator": self.microscope, **self.components}[fault.whom]
+        if fault.what == "kill":
+            process.kill()
+        elif fault.what == "freeze":
+            process.freeze(fault.for_s)
+        elif fault.what == "busy":
+            process.step_age_s = fault.for_s
+            process.later(fault.for_s, setattr, process, "step_age_s", 0.0)
+        elif fault.what == "cut" and isinstance(process, Client):
+            process.cut()
+        elif fault.what in ("cut", "storm"):
+            self._storm(fault.for_s)
+        elif fault.what == "hang":
+            self._hang(fault.for_s)
+        elif fault.what == "clock":
+            self.microscope.habits.clock_error_s = self.timeline.random.choice((-100.0, 0.0, 100.0, 10_000.0))
+
+    def _storm(self, for_s: float) -> None:
+        """Messages take long, and all connections break at its beginning."""
+        self.weather.delay_s = 3.0
+        for client in self.components.values():
+            client.cut()
+            client.cut_s += for_s + 5.0
+        self.timeline.after(for_s, setattr, self.weather, "delay_s", 0.01)
+
+    def _hang(self, for_s: float) -> None:
+        """The translator takes ages."""
+        habits = self.microscope.habits
+        habits.service_s = for_s
+        self.timeline.after(for_s, setattr, habits, "service_s", 0.02)
+
+    def _calm(self) -> None:
+        habits = self.microscope.habits
+        self.weather.doubles = habits.hangs = habits.loses_answer = 0.0
+        self.scheduler.dies_in_step = 0.0
+        self.dawn.start()
+        for name in ("greedy", "crasher", "impostor", "operator", "stranger"):
+            if name in self.components:
+                self.components[name].banned = True
+                self.components[name].kill()
+
+    def _come_right(self, scans: int) -> None:
+        """In calm weather the experiment goes on, and everybody has what the cache holds."""
+        if not self.keeper.given_up and scans == 0:
+            self.invariants.fail(f"nothing was scanned in the calm; control: {self.scheduler.core.control}")
+        for client in self.components.values():
+            settled = self.timeline.monotonic_s() - max(client.since_s, self.scheduler.since_s) > _SETTLED_S
+            if client.alive and self.scheduler.alive and settled:
+                self.invariants.has_all(client, self.scheduler)
+
+
+def _settings(plan: Plan) -> SchedulerSettings:
+    limits = Limits(
+        {names.TIP_BIAS_VOLTAGE: Limit(low=-10.0, high=10.0, source="night")},
+    )
+    watchdog = WatchdogSettings(
+        stop_when=frozenset(plan.stop_when), dangerous=frozenset({ScopeState.SPEC.name}), retract=names.RETRACT
+    )
+    return SchedulerSettings(
+        lease_s=plan.lease_s, watchdog=watchdog, limits=limits, envelopes=Envelopes(), cache_bytes=20_000
+    )
+
+
+def _policy() -> Policy:
+    liveness = LivenessPolicy(beat_period_s=5.0, missed_beats=3, longest_step_s=30.0)
+    return Policy(liveness, RestartPolicy(budget=10**6, longest_delay_s=5.0))

@@ -1,0 +1,96 @@
+"""Simulated processes: they can be killed and frozen, and only they know what they know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from afspm.testing.deterministic.timeline import Timeline, Timer
+
+
+class Process:
+    """A process over all its lives. Subclasses set up what one life knows in `begin`.
+
+    Attributes:
+        alive: there is a life.
+        banned: it is not started any more.
+        frozen: it does nothing, and what comes waits.
+        since_s: since when it has been at work: its start, or the end of its last freeze.
+        step_age_s: for how long, by its own words, the current step has been running.
+    """
+
+    def __init__(self, timeline: Timeline, name: str) -> None:
+        self.timeline = timeline
+        self.name = name
+        self.alive = False
+        self.frozen = False
+        self.step_age_s = 0.0
+        self.life = 0
+        self.banned = False
+        self.since_s = 0.0
+        self.exited: Callable[[int], None] = lambda code: None
+        self._waiting: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
+
+    # --- for those who start and end it ---
+
+    def start(self) -> None:
+        if self.alive or self.banned:
+            return
+        self.alive, self.frozen = True, False
+        self.life += 1
+        self.step_age_s = 0.0
+        self.since_s = self.timeline.monotonic_s()
+        self._waiting.clear()
+        self.begin()
+
+    def kill(self, code: int = -9) -> None:
+        """End this life at once: nothing of it is left but what it put on its disk."""
+        if not self.alive:
+            return
+        self.alive = self.frozen = False
+        self.life += 1
+        self._waiting.clear()
+        self.ended()
+        self.exited(code)
+
+    def freeze(self, for_s: float) -> None:
+        if self.alive and not self.frozen:
+            self.frozen = True
+            self.timeline.after(for_s, self._thaw, self.life)
+
+    def _thaw(self, life: int) -> None:
+        if life != self.life or not self.frozen:
+            return
+        self.frozen = False
+        self.since_s = self.timeline.monotonic_s()
+        waiting, self._waiting = self._waiting, []
+        for do, args in waiting:
+            if life == self.life:
+                do(*args)
+
+    # --- for what happens to it ---
+
+    def take(self, do: Callable[..., None], *args: Any) -> None:
+        """Call `do(*args)` now, later if frozen, not at all if dead."""
+        if not self.alive:
+            return
+        if self.frozen:
+            self._waiting.append((do, args))
+        else:
+            do(*args)
+
+    def later(self, delay_s: float, do: Callable[..., None], *args: Any) -> Timer:
+        """In `delay_s`, if this life lasts that long."""
+        return self.timeline.after(delay_s, self._if_same_life, self.life, do, args)
+
+    def _if_same_life(self, life: int, do: Callable[..., None], args: tuple[Any, ...]) -> None:
+        if life == self.life:
+            self.take(do, *args)
+
+    # --- for subclasses ---
+
+    def begin(self) -> None:
+        """A new life begins."""
+
+    def ended(self) -> None:
+        """A life has ended: close what it held open."""

@@ -1,0 +1,253 @@
+"""The scheduler as a simulated process: the real `SchedulerCore`, with lines for sockets and a dict for a disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from afspm.logic.events import (
+    Codec,
+    ComponentDied,
+    Connected,
+    Disconnected,
+    Effect,
+    Forward,
+    Greeted,
+    Input,
+    Kill,
+    PacketIn,
+    Publish,
+    Replay,
+    Reply,
+    RequestIn,
+    SaveState,
+    SubscriberJoined,
+    Tick,
+    TranslatorCaughtUp,
+    TranslatorDown,
+    TranslatorReply,
+    TranslatorUp,
+)
+from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
+from afspm.model import Packet, PacketHeader, Request, Response
+from afspm.testing.deterministic.network import ControlLine, ControlServer, Feed, Publisher, Weather
+from afspm.testing.deterministic.process import Process
+from afspm.testing.deterministic.timeline import Timeline, Timer
+
+Entry = tuple[Packet, int | None]
+
+
+@dataclass
+class Disk:
+    """What survives a kill of the scheduler."""
+
+    state: str | None = None
+    journal: tuple[Entry, ...] = ()
+
+
+class Observer(Protocol):
+    """Whoever checks the scheduler."""
+
+    def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None: ...
+    def carried_out(self, host: SchedulerHost, effect: Effect) -> None: ...
+
+
+class SchedulerHost(Process):
+    """See `afspm.scheduler.shell`, which does the same with sockets.
+
+    Args:
+        journal_s: how long after a packet the journal is written.
+        dies_in_step: the chance that it is killed between two effects of one step.
+    """
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        weather: Weather,
+        settings: SchedulerSettings,
+        codec: Codec,
+        header: Callable[[Packet], PacketHeader],
+        observer: Observer,
+        *,
+        journal_s: float = 0.1,
+        dies_in_step: float = 0.0,
+    ) -> None:
+        super().__init__(timeline, "scheduler")
+        self.core = SchedulerCore(settings, codec)
+        self.disk = Disk()
+        self.dies_in_step = dies_in_step
+        self.translator: tuple[ControlServer, Publisher] | None = None
+        self._weather = weather
+        self._settings = settings
+        self._codec = codec
+        self._header = header
+        self._observer = observer
+        self._journal_s = journal_s
+        self._connections = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._lines: dict[ControlLine, int] = {}
+        self._by_connection: dict[int, ControlLine] = {}
+        self._by_name: dict[str, ControlLine] = {}
+        self._feeds: list[Feed] = []
+        self._ticking: Timer | None = None
+        self._journal_due = False
+        self._replay: tuple[Packet, ...] = ()
+
+    # --- lives ---
+
+    def begin(self) -> None:
+        self._forget()
+        self.core = SchedulerCore(self._settings, self._codec)
+        if self.disk.state is not None:
+            self.core.restore(json.loads(self.disk.state))
+        self.core.restore_cache(self.disk.journal)
+        assert self.translator is not None
+        server, publisher = self.translator
+        self._link = ControlLine(self.timeline, self._weather, self, server, "scheduler", doubling=False)
+        self._from_translator = Feed(self.timeline, self._weather, self, publisher)
+        self._carry_out(None, self.core.start(self.timeline.monotonic_s(), self.timeline.now_ns()))
+
+    def ended(self) -> None:
+        self._link.close()
+        self._from_translator.close()
+        for line in list(self._lines):
+            line.cut()
+        for feed in list(self._feeds):
+            feed.cut()
+        if self._ticking is not None:
+            self._ticking.cancel()
+
+    def component_died(self, name: str) -> None:
+        self._step(ComponentDied(name))
+
+    # --- as a server of requests ---
+
+    def peer_connected(self, line: ControlLine) -> None:
+        self._connections += 1
+        connection = self._connections
+        self._lines[line], self._by_connection[connection] = connection, line
+        self._step(Connected(connection))
+        self._step(Greeted(connection, line.name))
+        former = self._by_name.get(line.name)
+        self._by_name[line.name] = line
+        if former is not None and former is not line:
+            former.cut()  # ROUTER hands the name over to the newest connection
+
+    def peer_disconnected(self, line: ControlLine) -> None:
+        connection = self._lines.pop(line, None)
+        if connection is None:
+            return
+        del self._by_connection[connection]
+        if self._by_name.get(line.name) is line:
+            del self._by_name[line.name]
+        self._step(Disconnected(connection))
+
+    def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
+        connection = self._lines.get(line)
+        if connection is not None:
+            self._step(RequestIn(connection, line.name, request))
+
+    # --- as a client of the translator ---
+
+    def line_up(self, line: ControlLine) -> None:
+        self._step(TranslatorUp())
+
+    def line_down(self, line: ControlLine) -> None:
+        self._step(TranslatorDown())
+
+    def answered(self, line: ControlLine, number: int, response: Response) -> None:
+        self._step(TranslatorReply(number, Response(response.code, response.payload, response.reason, response.id)))
+
+    # --- as a listener to the translator ---
+
+    def since_ns(self, feed: Feed) -> int:
+        return self.core.newest_source_ns
+
+    def received(self, feed: Feed, packet: Packet) -> None:
+        self._step(PacketIn(packet, self._header(packet)))
+
+    def caught_up(self, feed: Feed) -> None:
+        self._step(TranslatorCaughtUp())
+
+    def killed(self, feed: Feed) -> None:
+        """The translator sends no such thing."""
+
+    # --- as a publisher ---
+
+    def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
+        self._replay = ()
+        self._step(SubscriberJoined(feed, tuple(prefixes), since_ns))
+        if feed not in self._feeds:
+            self._feeds.append(feed)
+        return self._replay
+
+    def left(self, feed: Feed) -> None:
+        if feed in self._feeds:
+            self._feeds.remove(feed)
+
+    # --- steps ---
+
+    def _step(self, event: Input) -> None:
+        self._carry_out(event, self.core.step(event, self.timeline.monotonic_s(), self.timeline.now_ns()))
+
+    def _carry_out(self, event: Input | None, effects: Sequence[Effect]) -> None:
+        life = self.life
+        for effect in effects:
+            if self.dies_in_step and self.timeline.chance(self.dies_in_step):
+                self.kill()
+                return
+            self._observer.carried_out(self, effect)
+            self._do(effect)
+            if life != self.life:
+                return
+        self._observer.stepped(self, event, effects)
+        self._plan_tick()
+
+    def _do(self, effect: Effect) -> None:
+        if isinstance(effect, Reply):
+            line = self._by_connection.get(effect.connection)
+            if line is not None:
+                line.answer(effect.response)
+        elif isinstance(effect, Forward):
+            self._link.ask(effect.request, effect.number)
+        elif isinstance(effect, Publish):
+            for feed in list(self._feeds):
+                feed.publish(effect.packet)
+            if effect.cached and not self._journal_due:
+                self._journal_due = True
+                self.later(self._journal_s * self.timeline.random.random(), self._write_journal)
+        elif isinstance(effect, Replay):
+            self._replay = effect.packets
+        elif isinstance(effect, SaveState):
+            self.disk.state = json.dumps(effect.state)
+        elif isinstance(effect, Kill):
+            for feed in self._feeds:
+                feed.kill_signal()
+            self.later(0.0, self.kill, 80)
+
+    def _write_journal(self) -> None:
+        self._journal_due = False
+        self.disk.journal = tuple(self.core.cached())
+
+    def _plan_tick(self) -> None:
+        if self._ticking is not None:
+            self._ticking.cancel()
+            self._ticking = None
+        delay_s = self._wait_s()
+        if delay_s is not None:
+            self._ticking = self.later(delay_s, self._tick)
+
+    def _wait_s(self) -> float | None:
+        deadline_s, deadline_ns = self.core.deadline_s(), self.core.deadline_ns()
+        waits = [] if deadline_s is None else [deadline_s - self.timeline.monotonic_s()]
+        if deadline_ns is not None:
+            waits.append(self.timeline.real_s((deadline_ns - self.timeline.now_ns()) / 1e9) + 1e-6)
+        return min(waits, default=None)
+
+    def _tick(self) -> None:
+        self._ticking = None
+        self._step(Tick())

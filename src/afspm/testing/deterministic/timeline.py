@@ -1,0 +1,90 @@
+"""Simulated time: what happens when, and the clock that shows it."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections.abc import Callable
+from typing import Any
+
+START_S = 1_750_000_000.0
+"""Experiment time at the beginning."""
+
+
+class Timer:
+    """Something that will happen, unless it is cancelled."""
+
+    __slots__ = ("args", "cancelled", "do")
+
+    def __init__(self, do: Callable[..., None], args: tuple[Any, ...]) -> None:
+        self.do = do
+        self.args = args
+        self.cancelled = False
+
+    def cancel(self) -> None:
+        self.cancelled = True
+
+
+class Timeline:
+    """All that is going to happen, in order. It is a `Clock` as well.
+
+    Args:
+        seed: of all chance.
+        speed: experiment seconds in a real (simulated) second.
+    """
+
+    def __init__(self, seed: int, speed: float = 1.0) -> None:
+        self.random = random.Random(seed)
+        self.speed = speed
+        self.happened = 0
+        self._time_s = 0.0
+        self._order = 0
+        self._coming: list[tuple[float, int, Timer]] = []
+
+    # --- the clock ---
+
+    def monotonic_s(self) -> float:
+        return self._time_s
+
+    def now_ns(self) -> int:
+        return self.at_ns(self._time_s)
+
+    def at_ns(self, time_s: float) -> int:
+        """Experiment time at a moment of real time."""
+        return int(START_S) * 10**9 + round(time_s * self.speed * 1e9)
+
+    def now_s(self) -> float:
+        return START_S + self._time_s * self.speed
+
+    def real_s(self, experiment_s: float) -> float:
+        return experiment_s / self.speed
+
+    # --- what happens ---
+
+    def after(self, delay_s: float, do: Callable[..., None], *args: Any) -> Timer:
+        """`do(*args)` in `delay_s` real seconds; of two at the same time the one first asked for comes first."""
+        timer = Timer(do, args)
+        self._order += 1
+        heapq.heappush(self._coming, (self._time_s + max(0.0, delay_s), self._order, timer))
+        return timer
+
+    def step(self) -> bool:
+        """Let the next thing happen; False if there is none."""
+        while self._coming:
+            time_s, _, timer = heapq.heappop(self._coming)
+            if timer.cancelled:
+                continue
+            self._time_s = time_s
+            self.happened += 1
+            timer.do(*timer.args)
+            return True
+        return False
+
+    def run_until(self, time_s: float) -> None:
+        """Let happen whatever comes before `time_s`, and go on to then."""
+        while self._coming and self._coming[0][0] <= time_s:
+            self.step()
+        self._time_s = max(self._time_s, time_s)
+
+    def chance(self, probability: float) -> bool:
+        return self.random.random() < probability
