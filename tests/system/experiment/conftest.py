@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from experiment_lab import AFSPM, EXPERIMENT, WITNESS, AfspmRun, Run
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Run]:
+    """Starts `afspm run` of an experiment file that is EXPERIMENT and `more`; it is killed after the test."""
+    runs: list[AfspmRun] = []
+
+    def start(*options: str, more: str = "", scans: int = 4, speed: float = 120.0) -> AfspmRun:
+        (tmp_path / "witness.py").write_text(WITNESS, encoding="utf-8")
+        file = tmp_path / "experiment.toml"
+        file.write_text(EXPERIMENT.format(scans=scans, speed=speed) + more, encoding="utf-8")
+        command = (*AFSPM, "run", str(file), "--runs", str(tmp_path / "runs"), "--verbose", *options)
+        # in a group of its own, so that a Ctrl-C for it is not one for the tests
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=tmp_path
+        )
+        runs.append(AfspmRun(process))
+        return runs[-1]
+
+    yield start
+    for one in runs:
+        one.process.kill()
+        one.process.wait()

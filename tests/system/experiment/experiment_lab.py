@@ -1,0 +1,151 @@
+"""What the tests of whole experiments share: `afspm run` as a process of its own, and what it leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+DEADLINE_S = 60.0
+AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
+Run = Callable[..., "AfspmRun"]
+
+EXPERIMENT = """
+[clock]
+speed = {speed}
+
+[microscope]
+component = true
+class = "Simulator"
+seed = 1
+initial = {{ scan-speed = "2 um/s" }}
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[series]
+component = true
+class = "ScanSeries"
+size = ["1 um", "1 um"]
+pixels = [32, 32]
+every = "1 min"
+scans = {scans}
+end_when_done = true
+
+[witness]
+component = true
+class = "witness.Witness"
+"""
+
+WITNESS = '''
+"""Writes down every scan that it gets."""
+
+from afspm.runtime.component import Component
+
+
+class Witness(Component):
+    def on_scan(self, scan):
+        with (self.run_dir / "witnessed.txt").open("a") as file:
+            file.write(f"{scan.channel}|{scan.time_ns}|{scan.filename}\\n")
+'''
+
+
+@dataclass
+class AfspmRun:
+    """`afspm run` at work; its output can be waited for."""
+
+    process: subprocess.Popen[bytes]
+    lines: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._changed = threading.Condition()
+        self._over = False
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as pipe:
+            for line in pipe:
+                with self._changed:
+                    self.lines.append(line.decode(errors="replace").rstrip())
+                    self._changed.notify_all()
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+
+    def wait_for(self, *wanted: str, count: int = 1) -> str:
+        """The line that matches all the patterns `wanted`, the `count`-th of that kind."""
+
+        def found() -> list[str]:
+            return [line for line in self.lines if all(re.search(text, line) for text in wanted)]
+
+        with self._changed:
+            self._changed.wait_for(lambda: len(found()) >= count or self._over, DEADLINE_S)
+            if len(found()) < count:
+                raise AssertionError(f"no line with {wanted} came:\n{self.output}")
+            return found()[count - 1]
+
+    @property
+    def output(self) -> str:
+        return "\n".join(self.lines)
+
+    def pid(self, name: str) -> int:
+        """The process id of the component's newest process."""
+        self.wait_for(rf" {name} .*started, process")
+        started = [line for line in self.lines if re.search(rf" {name} .*started, process", line)]
+        return int(started[-1].rsplit(" ", 1)[1])
+
+    def times_up(self, name: str) -> int:
+        """How often the component has come up so far."""
+        return sum(bool(re.search(rf" {name} .*is up$", line)) for line in self.lines)
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to the component's process."""
+        os.kill(self.pid(name), number)
+
+    def end(self) -> int:
+        """The exit code, once it has ended by itself."""
+        try:
+            code = self.process.wait(DEADLINE_S)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"the run did not end:\n{self.output}") from None
+        self._reader.join(DEADLINE_S)
+        return code
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.wait_for("processes, into ").split(", into ")[1])
+
+    def facts(self) -> dict[str, Any]:
+        facts: dict[str, Any] = json.loads((self.folder / "run.json").read_text(encoding="utf-8"))
+        return facts
+
+    def witnessed(self) -> Counter[tuple[str, ...]]:
+        """Each (channel, time, file) that the witness got, with how often."""
+        text = (self.folder / "witnessed.txt").read_text(encoding="utf-8")
+        return Counter(tuple(line.split("|")) for line in text.splitlines())
+
+
+def require_each_once(run: AfspmRun, scans: int) -> None:
+    """Every scan asked for was measured once, saved once, and seen once by a subscriber."""
+    saved = sorted(file.name for file in (run.folder / "scans").iterdir() if not file.name.startswith("."))
+    seen = run.witnessed()
+    channels = {channel for channel, _, _ in seen}
+    assert channels
+    assert set(seen.values()) == {1}, f"seen again: {[key for key, n in seen.items() if n > 1]}\n{run.output}"
+    for channel in channels:
+        assert len([key for key in seen if key[0] == channel]) == scans, f"{channel}: {seen}\n{run.output}"
+    assert len(saved) == scans, f"{saved}\n{run.output}"
+    for number in range(1, scans + 1):
+        run.wait_for(f"scan {number} of {scans} ")

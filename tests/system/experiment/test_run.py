@@ -1,0 +1,91 @@
+"""`afspm run`: an experiment from its file to its folder, and how it is stopped."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from experiment_lab import Run, require_each_once
+
+from afspm.clock import ExperimentClock
+
+posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+
+
+def test_an_experiment_ends_by_itself_and_leaves_its_folder(run: Run, tmp_path: Path) -> None:
+    one = run()
+    assert one.end() == 0, one.output
+    require_each_once(one, 4)
+    folder = one.folder
+    assert (tmp_path / "runs" / "latest").read_text().strip() == folder.name
+    assert "the experiment has ended" in one.output
+    assert f"everything is in {folder}" in one.output
+    log = (folder / "log.txt").read_text(encoding="utf-8")
+    assert "scheduler" in log
+    assert "[clock]" in (folder / "experiment.toml").read_text(encoding="utf-8")
+    assert one.facts()["guest"]["sockets"]["control"] == one.facts()["processes"]["scheduler"]["serve"]
+
+
+def test_errors_in_the_file_are_told_and_nothing_starts(run: Run, tmp_path: Path) -> None:
+    one = run(more="[another]\ncomponent = true\nclass = 'ScanSerie'\n")
+    assert one.end() == 1
+    one.wait_for("experiment.toml:29: error", "'ScanSerie'")
+    one.wait_for("did you mean 'ScanSeries'")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_an_unknown_name_is_told_and_nothing_starts(run: Run, tmp_path: Path) -> None:
+    one = run("--without", "witnes")
+    assert one.end() == 1
+    one.wait_for("witness")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_dry_run_says_what_it_would_start(run: Run, tmp_path: Path) -> None:
+    one = run("--dry-run", "--without", "witness,series")
+    assert one.end() == 0
+    assert [line.split(" ")[0] for line in one.lines if "(" in line] == ["microscope", "scheduler"]
+    assert not (tmp_path / "runs").exists()
+
+
+def test_part_of_an_experiment_can_be_left_out(run: Run) -> None:
+    one = run("--without", "witness")
+    assert one.end() == 0
+    one.wait_for("ran: microscope, scheduler, series$")
+
+
+@posix_only
+def test_ctrl_c_ends_all_cleanly_within_about_two_seconds(run: Run) -> None:
+    one = run(scans=1000)
+    one.wait_for("scan 1 of 1000")
+    clock = ExperimentClock.real()
+    began_s = clock.monotonic_s()
+    one.process.send_signal(signal.SIGINT)
+    assert one.end() == 130, one.output
+    assert clock.monotonic_s() - began_s < 3.0
+    for name in ("microscope", "scheduler", "series", "witness"):
+        one.wait_for(f" {name} ", r"ended \(orphan\)")  # by itself: nothing had to be killed
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="waiting for the end of another's child")
+def test_a_killed_supervisor_leaves_no_process_behind(run: Run) -> None:
+    code = "import os, threading; print('pid', os.getpid(), flush=True); threading.Event().wait()"
+    more = f"[foreign]\ncomponent = true\nheartbeats = false\ncommand = ['python', '-c', {code!r}]\n"
+    one = run(scans=1000, more=more)
+    one.wait_for("scan 1 of 1000")
+    names = ("microscope", "scheduler", "series", "witness", "foreign")
+    pids = {name: one.pid(name) for name in names}
+    pids["command of foreign"] = int(one.wait_for(" foreign ", "pid ").rsplit(" ", 1)[1])
+    watched = {name: os.pidfd_open(pid) for name, pid in pids.items()}
+    one.process.kill()
+    try:
+        for name, descriptor in watched.items():
+            readable, _, _ = select.select([descriptor], [], [], 10.0)
+            assert readable, f"{name} lives on"
+    finally:
+        for descriptor in watched.values():
+            os.close(descriptor)
