@@ -57,6 +57,7 @@ class Component:
         name: of this component in the experiment file.
         memory: a dict kept on disk: it is there again after a restart.
         run_dir: the folder of this run.
+        simulated: whether the microscope is a simulated one; say so in what you write.
         packet: the packet that is being handled (its envelope, its time), None between handlers.
         longest_step_s: how long a handler may take in real seconds before the process counts as frozen and is
             killed. Waiting inside `scope` does not count.
@@ -87,6 +88,7 @@ class Component:
     name: str
     memory: Memory
     run_dir: Path
+    simulated: bool
     packet: Packet | None
     _publish: Callable[[Any, str | None], None]
 

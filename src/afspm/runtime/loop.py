@@ -126,6 +126,7 @@ class ComponentLoop:
         component.name = context.name
         component.memory = Memory(state_dir / f"{context.name}.json" if state_dir else None)
         component.run_dir = Path(context.launch.run_dir or ".")
+        component.simulated = context.launch.simulated
         component.packet = None
         component._publish = self._publish
 
