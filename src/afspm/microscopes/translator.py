@@ -190,7 +190,7 @@ class Translator:
         try:
             request = wire.decode_request(frames)
         except WireError as error:
-            self._reply(Response(error.response, reason=str(error)))
+            self._reply(Response(error.response, reason=str(error)), logging.DEBUG)  # a stranger can send millions
             return
         known = self._ledger.outcome(request)
         if known is not None:
@@ -232,9 +232,9 @@ class Translator:
             self._save()
         self._reply(response)
 
-    def _reply(self, response: Response) -> None:
+    def _reply(self, response: Response, level: int = logging.INFO) -> None:
         if response.code != ControlResponse.SUCCESS:
-            self._log.info("refused, %s: %s", ControlResponse(response.code).name, response.reason)
+            self._log.log(level, "refused, %s: %s", ControlResponse(response.code).name, response.reason)
         self._port.reply(wire.encode_response(response))
 
     def _save(self) -> None:

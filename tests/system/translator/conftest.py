@@ -122,7 +122,7 @@ class Running:
 
     def __init__(self, folder: Path, settings: dict[str, Any], speed: float) -> None:
         ports = FreePorts()
-        self.folder = folder
+        self.folder, self.log = folder, folder / "log.txt"
         self.serve, self.publish = f"tcp://127.0.0.1:{ports.take()}", f"tcp://127.0.0.1:{ports.take()}"
         self.clock = ExperimentClock.starting_now(start_s=1_767_225_600.0, speed=speed)
         self._launch = Launch(
@@ -139,9 +139,12 @@ class Running:
         self.start()
 
     def start(self) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE, stderr=subprocess.PIPE
-        )
+        self.folder.mkdir(exist_ok=True)
+        # into a file: a pipe that nobody reads fills up and holds the process
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE, stderr=log
+            )
         assert self.process.stdin is not None
         self.process.stdin.write(self._launch.to_json().encode() + b"\n")
         self.process.stdin.flush()
@@ -150,11 +153,16 @@ class Running:
         self.process.kill()
         self._reap()
 
+    def wait(self, timeout_s: float) -> int:
+        """The exit code of a process that ends by itself."""
+        code = self.process.wait(timeout_s)
+        self._reap()
+        return code
+
     def _reap(self) -> None:
         self.process.wait(10)
-        for stream in (self.process.stdin, self.process.stderr):
-            assert stream is not None
-            stream.close()
+        assert self.process.stdin is not None
+        self.process.stdin.close()
 
     def peer(self) -> Peer:
         peer = Peer(self.serve, self.publish)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 
@@ -48,7 +49,7 @@ class FaultyTranslator(Translator):
         if fault.kind == "hang":
             threading.Event().wait(fault.duration_s)
 
-    def _reply(self, response: Response) -> None:
+    def _reply(self, response: Response, level: int = logging.INFO) -> None:
         faults = self._faults
         if faults is not None and faults.strikes("lose") is not None:
             self._log.warning("a simulated fault: the answer %s is lost", response)
@@ -56,4 +57,4 @@ class FaultyTranslator(Translator):
         elif faults is not None and (delay_s := faults.strikes("slow")) is not None:
             self._late = (self._clock.monotonic_s() + delay_s, response)
         else:
-            super()._reply(response)
+            super()._reply(response, level)
