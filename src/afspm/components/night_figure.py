@@ -1,0 +1,327 @@
+"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close look at each repair.
+
+    python -m afspm.components.night_figure RUN_FOLDER
+
+draws it again from what a run has left.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.components import verdicts
+from afspm.components.night_record import Mark, NightRecord, Shot, Span
+from afspm.model import ProblemNames, names
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH_IN = 7.2  # two columns of a journal
+THUMB_PX = 64
+GAP_PX = 6
+BAR_PX = 6
+COLUMNS = 14
+MOST_SHOTS = 98
+MOST_LOOKS = 3
+AROUND_NS = 8 * 60 * 1_000_000_000
+HOUR_NS = 3600 * 1_000_000_000
+# of Paul Tol's bright scheme: told apart by everybody, red kept for problems
+COLOURS = ("#4477AA", "#228833", "#AA3377", "#66CCEE", "#CCBB44")
+PROBLEM = "#EE6677"
+NOBODY = "#BBBBBB"
+PAPER = (255, 255, 255)
+
+
+def prepare() -> None:
+    """Load what takes long to load."""
+    _figure(1.0)
+
+
+def draw(
+    record: NightRecord, path: Path, problems: Mapping[int, str], *, title: str = "", simulated: bool = False
+) -> None:
+    """Write the picture.
+
+    Args:
+        problems: number -> name.
+        simulated: written on it, so that nobody takes it for a measurement.
+    """
+    shots = _chosen(record)
+    repairs = _episodes(record)[:MOST_LOOKS]
+    rows = max(1, math.ceil(len(shots) / COLUMNS))
+    lanes = len(record.holders) + len(record.problems)
+    sheet_in = rows * WIDTH_IN / COLUMNS * (THUMB_PX + GAP_PX + BAR_PX) / (THUMB_PX + GAP_PX)
+    bands_in, looks_in = 0.17 * lanes + 0.05, (0.17 * lanes + 0.05) if repairs else 0.0
+    height_in = 0.32 + sheet_in + 0.42 + bands_in + (0.62 + looks_in if repairs else 0.0) + 0.42
+    figure = _figure(height_in)
+    colours = {holder: COLOURS[i % len(COLOURS)] for i, holder in enumerate(record.holders)}
+
+    def axes(left_in: float, top_in: float, width_in: float, tall_in: float) -> Axes:
+        box = (left_in / WIDTH_IN, 1 - (top_in + tall_in) / height_in, width_in / WIDTH_IN, tall_in / height_in)
+        return figure.add_axes(box)
+
+    _head(figure, record, title, height_in, simulated=simulated)
+    top = 0.32
+    _sheet(axes(0.0, top, WIDTH_IN, sheet_in), record, shots, colours, rows)
+    top += sheet_in + 0.42
+    label_in = 1.35
+    night = axes(label_in, top, WIDTH_IN - label_in - 0.12, bands_in)
+    _bands(night, record, problems, colours, (record.start_ns, record.end_ns), names_too=True)
+    _hours(night, record)
+    _letter(figure, "b", 0.0, 1 - (top - 0.06) / height_in)
+    if repairs:
+        top += bands_in + 0.62
+        width = (WIDTH_IN - label_in - 0.12 - 0.25 * (len(repairs) - 1)) / len(repairs)
+        for i, span in enumerate(repairs):
+            look = axes(label_in + i * (width + 0.25), top, width, looks_in)
+            _bands(look, record, problems, colours, _around(span, record), names_too=i == 0)
+            _minutes(look, span, record)
+        _letter(figure, "c", 0.0, 1 - (top - 0.06) / height_in)
+    figure.savefig(path, dpi=200)
+
+
+def _figure(height_in: float) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH_IN, height_in), facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, simulated: bool) -> None:
+    begin, end = _utc(record.start_ns), _utc(record.end_ns)
+    until = f"{end:%H:%M}" if begin.date() == end.date() else f"{end:%Y-%m-%d %H:%M}"
+    what = f"{title}   " if title else ""
+    y = 1 - 0.17 / height_in
+    figure.text(0.03, y, f"{what}{begin:%Y-%m-%d %H:%M} to {until} UTC, {len(record.shots)} scans", size=7, va="center")
+    _letter(figure, "a", 0.0, y)
+    if simulated:
+        figure.text(0.995, y, "SIMULATED", size=9, weight="bold", color=PROBLEM, ha="right", va="center")
+
+
+def _letter(figure: Figure, letter: str, x: float, y: float) -> None:
+    figure.text(x + 0.008, y, letter, size=9, weight="bold", va="center")
+
+
+def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mapping[str, str], rows: int) -> None:
+    """All pictures as one image, which is much faster than an image each; under each a bar of who took it."""
+    pitch, tall = THUMB_PX + GAP_PX, THUMB_PX + GAP_PX + BAR_PX
+    canvas = np.full((rows * tall, COLUMNS * pitch, 3), PAPER, np.uint8)
+    palette = _palette()
+    for i, shot in enumerate(shots):
+        y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
+        picture = palette[_fitted(shot.picture)[::-1]]  # drawn with y upwards
+        canvas[y : y + THUMB_PX, x : x + THUMB_PX] = picture
+        bar = _rgb(colours.get(shot.holder or "", NOBODY))
+        canvas[y + THUMB_PX + 1 : y + THUMB_PX + BAR_PX, x : x + THUMB_PX] = bar
+        if record.verdict(shot) == verdicts.BAD:
+            _frame(canvas[y : y + THUMB_PX, x : x + THUMB_PX], _rgb(PROBLEM))
+    ax.imshow(canvas, interpolation="nearest", aspect="auto")
+    ax.set_axis_off()
+    for i, shot in enumerate(shots):
+        y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
+        label = f"{_utc(shot.time_ns):%H:%M}"
+        ax.text(x + 2, y + 2, label, size=4.5, color="white", va="top", bbox=_LABEL)
+
+
+_LABEL: dict[str, Any] = {"boxstyle": "square,pad=0.12", "facecolor": "black", "alpha": 0.55, "linewidth": 0}
+
+
+def _bands(
+    ax: Axes,
+    record: NightRecord,
+    problems: Mapping[int, str],
+    colours: Mapping[str, str],
+    limits: tuple[int, int],
+    *,
+    names_too: bool,
+) -> None:
+    """A lane for each that was in control, and one for each problem; time in ns."""
+    labels: list[str] = []
+    for lane, holder in enumerate(record.holders):
+        _lane(ax, lane, record.control_spans(holder), limits, facecolor=colours[holder])
+        labels.append(holder)
+    first = len(labels)
+    for lane, problem in enumerate(record.problems, start=first):
+        spans = record.problem_spans(problem)
+        _lane(ax, lane, spans, limits, facecolor=PROBLEM, hatch="////", edgecolor="white")
+        labels.append(problems.get(problem, f"problem {problem}"))
+        _flaggers(ax, lane, record, spans, limits)
+    for span in record.manual_spans():
+        ax.axvspan(*_clipped(span, limits), color=NOBODY, alpha=0.5, linewidth=0)
+    _actions(ax, record, {holder: lane for lane, holder in enumerate(record.holders)}, limits)
+    ax.axhline(first - 0.5, color="black", linewidth=0.5)
+    ax.set_xlim(*limits)
+    ax.set_ylim(len(labels) - 0.5, -0.5)
+    ax.set_yticks(range(len(labels)), labels if names_too else [""] * len(labels), size=6)
+    ax.tick_params(axis="y", length=0)
+    ax.set_facecolor("#F4F4F4")
+    for side in ("top", "right", "left"):
+        ax.spines[side].set_visible(False)
+
+
+def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], **style: Any) -> None:
+    least = (limits[1] - limits[0]) / 600  # what is too short to be seen is drawn so wide that it is
+    bars = []
+    for span in spans:
+        start, end = _clipped(span, limits)
+        if end > start or limits[0] <= start <= limits[1]:
+            bars.append((start, max(end - start, least)))
+    ax.broken_barh(bars, (lane - 0.36, 0.72), linewidth=0, **style)
+
+
+def _flaggers(ax: Axes, lane: int, record: NightRecord, spans: Sequence[Span], limits: tuple[int, int]) -> None:
+    """Who flagged it, as far as a verdict tells."""
+    for span in spans:
+        by = flagged_by(record, span)
+        if by and limits[0] <= span.start_ns <= limits[1]:
+            ax.annotate(
+                f"flagged by {by} ",
+                (span.start_ns, lane),
+                size=4.5,
+                ha="right" if span.start_ns - limits[0] > 0.25 * (limits[1] - limits[0]) else "left",
+                va="center",
+                color="#AA3344",
+            )
+
+
+def flagged_by(record: NightRecord, span: Span) -> str:
+    """Who thought badly of a scan just when a problem was flagged; empty if nobody said so."""
+    near = [m for m in record.marks if m.score == verdicts.BAD and abs(m.time_ns - span.start_ns) < AROUND_NS / 4]
+    return min(near, key=lambda m: abs(m.time_ns - span.start_ns)).by if near else ""
+
+
+def _actions(ax: Axes, record: NightRecord, lanes: Mapping[str, int], limits: tuple[int, int]) -> None:
+    for action, marker in ((names.PULSE, "v"), (names.CRASH, "X")):
+        done: list[Mark] = [m for m in record.marks if m.what == action and limits[0] <= m.time_ns <= limits[1]]
+        if done:
+            at = [lanes.get(m.by, 0) for m in done]
+            label = action.removeprefix("x-")
+            ax.scatter(
+                [m.time_ns for m in done], at, s=16, marker=marker, color="black", linewidths=0.4, edgecolors="white",
+                label=label, zorder=3,
+            )  # fmt: skip
+
+
+def _hours(ax: Axes, record: NightRecord) -> None:
+    span_h = (record.end_ns - record.start_ns) / HOUR_NS
+    step = next((s for s in (0.25, 0.5, 1, 2, 4, 8, 24) if span_h / s <= 12), 48)
+    ticks = np.arange(0, span_h + 1e-9, step)
+    ax.set_xticks([record.start_ns + t * HOUR_NS for t in ticks], [f"{t:g}" for t in ticks], size=6)
+    ax.set_xlabel("time / h", size=6, labelpad=1)
+    _legend(ax)
+
+
+def _legend(ax: Axes) -> None:
+    if ax.get_legend_handles_labels()[1]:
+        ax.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=5.5, frameon=False, handletextpad=0.1,
+            borderpad=0.1,
+        )  # fmt: skip
+
+
+def _minutes(ax: Axes, span: Span, record: NightRecord) -> None:
+    """Minutes from the moment that the problem was flagged."""
+    low, high = ax.get_xlim()
+    minute = 60e9
+    span_min = (high - low) / minute
+    step = next((s for s in (1, 2, 5, 10, 15, 30, 60, 120) if span_min / s <= 6), 240)
+    ticks = np.arange(math.ceil((low - span.start_ns) / minute / step), (high - span.start_ns) / minute / step) * step
+    ax.set_xticks([span.start_ns + t * minute for t in ticks], [f"{t:g}" for t in ticks], size=6)
+    hours = (span.start_ns - record.start_ns) / HOUR_NS
+    ax.set_xlabel(f"min from {hours:.2f} h", size=6, labelpad=1)
+
+
+def _episodes(record: NightRecord) -> list[Span]:
+    """From a problem flagged until none is."""
+    spans = sorted((s for p in record.problems for s in record.problem_spans(p)), key=lambda s: s.start_ns)
+    merged: list[Span] = []
+    for span in spans:
+        if merged and (merged[-1].end_ns is None or span.start_ns <= merged[-1].end_ns):
+            last = merged[-1]
+            end = None if span.end_ns is None or last.end_ns is None else max(last.end_ns, span.end_ns)
+            merged[-1] = Span(last.what, last.start_ns, end)
+        else:
+            merged.append(span)
+    return merged
+
+
+def _around(span: Span, record: NightRecord) -> tuple[int, int]:
+    end_ns = record.end_ns if span.end_ns is None else span.end_ns
+    margin = max(AROUND_NS // 4, (end_ns - span.start_ns) // 3)
+    return span.start_ns - margin, end_ns + margin
+
+
+def _chosen(record: NightRecord) -> list[Shot]:
+    """All scans, or if there are too many, those evenly through the night and every one that something happened to."""
+    shots = sorted(record.shots, key=lambda shot: shot.time_ns)
+    if len(shots) <= MOST_SHOTS:
+        return shots
+    series = record.holders[0] if record.holders else None
+    odd = {i for i, shot in enumerate(shots) if shot.holder != series or record.verdict(shot) == verdicts.BAD}
+    odd = set(sorted(odd)[: MOST_SHOTS // 2])
+    rest = [i for i in range(len(shots)) if i not in odd]
+    even = np.linspace(0, len(rest) - 1, MOST_SHOTS - len(odd)).round().astype(int)
+    return [shots[i] for i in sorted(odd | {rest[k] for k in even})]
+
+
+def _clipped(span: Span, limits: tuple[int, int]) -> tuple[float, float]:
+    end = limits[1] if span.end_ns is None else span.end_ns
+    return float(max(span.start_ns, limits[0])), float(min(end, limits[1]))
+
+
+def _fitted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """On THUMB_PX by THUMB_PX, nearest pixel; narrow ones in the middle."""
+    ny, nx = picture.shape
+    scale = THUMB_PX / max(ny, nx)
+    rows = np.minimum((np.arange(max(1, round(ny * scale))) / scale).astype(int), ny - 1)
+    columns = np.minimum((np.arange(max(1, round(nx * scale))) / scale).astype(int), nx - 1)
+    small = picture[np.ix_(rows, columns)]
+    canvas = np.zeros((THUMB_PX, THUMB_PX), np.uint8)
+    y, x = (THUMB_PX - small.shape[0]) // 2, (THUMB_PX - small.shape[1]) // 2
+    canvas[y : y + small.shape[0], x : x + small.shape[1]] = small
+    return canvas
+
+
+def _frame(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> None:
+    for edge in (picture[:3], picture[-3:], picture[:, :3], picture[:, -3:]):
+        edge[...] = colour
+
+
+def _palette() -> NDArray[np.uint8]:
+    """Gold on dark, as height maps are usually shown, for each of 256 greys."""
+    from matplotlib import colormaps
+
+    rgb: NDArray[np.uint8] = (colormaps["afmhot"](np.linspace(0.05, 0.95, 256))[:, :3] * 255).astype(np.uint8)
+    return rgb
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def _utc(time_ns: int) -> datetime:
+    return datetime.fromtimestamp(time_ns / 1e9, UTC)
+
+
+def main(folder: str) -> None:
+    """Draw the night of a run again."""
+    run = Path(folder)
+    for file in sorted((run / "state").glob("*.night.jsonl")):
+        record = NightRecord.from_lines(file.read_text(encoding="utf-8").splitlines())
+        known = {number: name for name, number in ProblemNames().items()}
+        draw(record, run / "night.png", known, simulated=(run / "truth.jsonl").exists())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,95 @@
+"""`NightPicture`: the night on one page: the scans, who was in control when, and which problems were flagged."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from afspm.components import verdicts
+from afspm.components.night_record import NightRecord, control_entry, mark_entry, scan_entry
+from afspm.components.records import LineFile
+from afspm.model import ControlState, Scan, ScopeState, ScopeStatus
+from afspm.runtime.component import Component
+
+
+class NightPicture(Component):
+    """Draws `night.png` when the experiment ends: the scans in a row, control and problems over time.
+
+    Where the microscope is simulated, the picture says so. It listens to everything, and keeps what it needs on disk as
+    it goes: killed and started again, it draws the same.
+    It needs matplotlib (`pip install "afspm[plot]"`).
+
+    Args:
+        channel: shown of each scan.
+        file: the picture's name in the run folder.
+        title: above the picture.
+    """
+
+    period_s = 2.0
+    period_time: Literal["experiment", "real"] = "real"
+
+    def __init__(self, channel: str = "Height", file: str = "night.png", title: str = "") -> None:
+        self.channel, self.file, self.title = channel, file, title
+        self._control: ControlState | None = None
+        self._begin: tuple[int | None, str | None] = (None, None)
+        self._drawing_is_loaded = False
+
+    def on_start(self) -> None:
+        self._file = LineFile(Path(self.run_dir) / "state" / f"{self.name}.night.jsonl")
+        self.record = NightRecord.from_lines(self._file.lines())
+
+    def on_tick(self) -> None:
+        if not self._drawing_is_loaded and importlib.util.find_spec("matplotlib"):
+            # now, when there is time: at the end all must be quick
+            importlib.import_module("afspm.components.night_figure").prepare()
+        self._drawing_is_loaded = True
+
+    def on_control(self, control_state: ControlState) -> None:
+        self._control = control_state
+        self._add(control_entry(control_state, self._packet_ns()))
+
+    def on_state(self, status: ScopeStatus) -> None:
+        if status.state is ScopeState.SCANNING:
+            self._begin = (self._packet_ns(), self._control.holder if self._control else None)
+        elif status.state is ScopeState.INTERRUPTED:
+            self._add({"kind": "interrupted", "time_ns": self._packet_ns()})
+
+    def on_scan(self, scan: Scan) -> None:
+        if scan.channel == self.channel and scan.values.size:
+            start_ns, holder = self._begin
+            self._add(scan_entry(scan, scan.time_ns or self._packet_ns(), start_ns, holder))
+            self._begin = (None, None)
+
+    def on_message(self, envelope: str, message: Any) -> None:
+        by = envelope.partition("_")[2]
+        if envelope.startswith("ActionMsg"):
+            self._add(mark_entry(by, message.action, self._packet_ns()))
+        elif envelope.startswith(verdicts.MESSAGE) and (verdict := verdicts.read_verdict(message)) is not None:
+            of_ns, score = verdict
+            self._add(mark_entry(by, "verdict", self._packet_ns(), score, of_ns))
+
+    def on_end(self) -> None:
+        if not self.record.shots:
+            self.log.info("no scan, no picture")
+            return
+        try:
+            from afspm.components.night_figure import draw
+        except ImportError:
+            self.log.error(
+                'no picture without matplotlib: pip install "afspm[plot]"; the record is in %s', self._file.path
+            )
+            return
+        path = Path(self.run_dir) / self.file
+        names = {number: self.scope.problems.name(number) for number in self.record.problems}
+        draw(self.record, path, names, title=self.title, simulated=self.simulated)
+        self.log.info("the night is drawn: %s", path)
+
+    def _packet_ns(self) -> int:
+        time_ns = self.packet.time_ns if self.packet else None
+        return self.clock.now_ns() if time_ns is None else time_ns
+
+    def _add(self, entry: dict[str, Any]) -> None:
+        if self.record.add(entry):
+            self._file.append([json.dumps(entry, separators=(",", ":"))])

@@ -1,0 +1,188 @@
+"""The story of a night as it is told to us, kept line by line so that a restart loses nothing."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.model import ControlMode, ControlState, Scan
+
+THUMBNAIL_PX = 64
+
+
+@dataclass(frozen=True)
+class Span:
+    """Something that was so from one time to another; end_ns None: it still is."""
+
+    what: str
+    start_ns: int
+    end_ns: int | None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A scan: when it was finished and began, who was in control then, and a small picture of it."""
+
+    time_ns: int
+    start_ns: int | None
+    holder: str | None
+    picture: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Something that a component did or said at a moment: an action, or a verdict on the scan of `of_ns`."""
+
+    time_ns: int
+    by: str
+    what: str
+    score: float | None = None
+    of_ns: int | None = None
+
+
+@dataclass
+class NightRecord:
+    """Everything that the picture shows."""
+
+    shots: list[Shot] = field(default_factory=list)
+    control: list[tuple[int, ControlState]] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)
+    interruptions: list[int] = field(default_factory=list)
+    end_ns: int = 0
+    _known: set[str] = field(default_factory=set, repr=False)
+
+    @classmethod
+    def from_lines(cls, lines: Iterable[str]) -> NightRecord:
+        """From the lines that `add` was given; what is no such line is left out."""
+        record = cls()
+        for line in lines:
+            try:
+                entry = json.loads(line)
+                record.add(entry)
+            except (ValueError, KeyError, TypeError):
+                continue
+        return record
+
+    def add(self, entry: dict[str, Any]) -> bool:
+        """Take an entry in; False if it is known already (packets are replayed after a restart)."""
+        kind, time_ns = entry["kind"], int(entry["time_ns"])
+        identity = f"{kind} {time_ns} {entry.get('by', '')}"
+        if identity in self._known:
+            return False
+        if kind == "scan":
+            picture = np.frombuffer(base64.b64decode(entry["picture"]), np.uint8).reshape(entry["shape"])
+            self.shots.append(Shot(time_ns, entry["start_ns"], entry["holder"], picture))
+        elif kind == "control":
+            state = ControlState(ControlMode(entry["mode"]), entry["holder"], tuple(entry["problems"]))
+            self.control.append((time_ns, state))
+        elif kind == "mark":
+            self.marks.append(Mark(time_ns, entry["by"], entry["what"], entry["score"], entry["of_ns"]))
+        elif kind == "interrupted":
+            self.interruptions.append(time_ns)
+        else:
+            raise ValueError(kind)
+        self._known.add(identity)
+        self.end_ns = max(self.end_ns, time_ns)
+        return True
+
+    @property
+    def start_ns(self) -> int:
+        """When the first thing happened: the first scan, or the first control."""
+        times = [shot.start_ns or shot.time_ns for shot in self.shots] + [t for t, s in self.control if s.holder]
+        return min(times, default=self.end_ns)
+
+    @property
+    def holders(self) -> list[str]:
+        """All who were in control, in the order in which they came."""
+        return list(dict.fromkeys(state.holder for _, state in sorted_by_time(self.control) if state.holder))
+
+    @property
+    def problems(self) -> list[int]:
+        """All that were flagged, in the order in which they came."""
+        return list(dict.fromkeys(p for _, state in sorted_by_time(self.control) for p in state.problems))
+
+    def control_spans(self, holder: str) -> list[Span]:
+        """When a component was in control."""
+        return self._spans(holder, lambda state: state.holder == holder)
+
+    def problem_spans(self, problem: int) -> list[Span]:
+        """When a problem was flagged."""
+        return self._spans(str(problem), lambda state: problem in state.problems)
+
+    def manual_spans(self) -> list[Span]:
+        """When a person had it."""
+        return self._spans("manual", lambda state: state.mode is ControlMode.MANUAL)
+
+    def verdict(self, shot: Shot) -> float | None:
+        """What was thought of a scan; None if nobody said."""
+        return next((m.score for m in reversed(self.marks) if m.of_ns == shot.time_ns), None)
+
+    def _spans(self, what: str, holds: Any) -> list[Span]:
+        spans: list[Span] = []
+        since: int | None = None
+        for time_ns, state in sorted_by_time(self.control):
+            if holds(state) and since is None:
+                since = time_ns
+            elif not holds(state) and since is not None:
+                spans.append(Span(what, since, time_ns))
+                since = None
+        if since is not None:
+            spans.append(Span(what, since, None))
+        return spans
+
+
+def sorted_by_time(control: list[tuple[int, ControlState]]) -> list[tuple[int, ControlState]]:
+    """Control states oldest first."""
+    return sorted(control, key=lambda pair: pair[0])
+
+
+def scan_entry(scan: Scan, time_ns: int, start_ns: int | None, holder: str | None) -> dict[str, Any]:
+    """A scan as an entry."""
+    picture = thumbnail(scan.values)
+    return {
+        "kind": "scan",
+        "time_ns": time_ns,
+        "start_ns": start_ns,
+        "holder": holder,
+        "shape": list(picture.shape),
+        "picture": base64.b64encode(picture.tobytes()).decode(),
+    }
+
+
+def control_entry(state: ControlState, time_ns: int) -> dict[str, Any]:
+    """A control state as an entry."""
+    problems = list(state.problems)
+    return {
+        "kind": "control",
+        "time_ns": time_ns,
+        "mode": int(state.mode),
+        "holder": state.holder,
+        "problems": problems,
+    }
+
+
+def mark_entry(
+    by: str, what: str, time_ns: int, score: float | None = None, of_ns: int | None = None
+) -> dict[str, Any]:
+    """An action done, or a verdict, as an entry."""
+    return {"kind": "mark", "time_ns": time_ns, "by": by, "what": what, "score": score, "of_ns": of_ns}
+
+
+def thumbnail(values: NDArray[np.float64], largest_px: int = THUMBNAIL_PX) -> NDArray[np.uint8]:
+    """A scan as a small grey picture: lines levelled, contrast from the 1st to the 99th percentile."""
+    step = max(1, -(-max(values.shape) // largest_px))
+    finite = np.where(np.isfinite(values), values, 0.0)
+    rows, columns = (n // step * step for n in values.shape)
+    blocks = finite[:rows, :columns].reshape(rows // step, step, columns // step, step)
+    small = blocks.mean(axis=(1, 3))
+    small = small - np.median(small, axis=1, keepdims=True)
+    low, high = np.percentile(small, (1, 99))
+    grey = np.clip((small - low) / (high - low if high > low else 1.0), 0.0, 1.0)
+    picture: NDArray[np.uint8] = np.round(grey * 255).astype(np.uint8)
+    return picture
