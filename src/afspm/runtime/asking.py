@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from afspm.errors import NoResponse, Refused
@@ -38,18 +39,33 @@ class Asker:
             NoResponse: the microscope stays silent, or is not free until `until_s`.
             ControlLost: control was not back until `until_s`.
         """
+        request_id = self._link.next_id()
         while True:
             self._holding.regain(until_s)
             states = self._link.view.count("ScopeStateMsg")
-            response = self.send(kind, subject, until_s=until_s)
+            response = self.send(kind, subject, request_id=request_id, until_s=until_s)
             if response.ok:
                 return response
-            self.get_over(kind, response, states, until_s)
+            if response.code != ControlResponse.NO_RESPONSE:  # else it may have been carried out: the same id again
+                self.get_over(kind, response, states, until_s)
+                request_id = self._link.next_id()
 
     def send(
-        self, kind: ControlRequest, subject: Any = None, *, request_id: str = "", until_s: float | None = None
+        self,
+        kind: ControlRequest,
+        subject: Any = None,
+        *,
+        request_id: str = "",
+        until_s: float | None = None,
+        is_seen: Callable[[], bool] = lambda: False,
     ) -> Response:
         """Ask once, but have patience with a microscope that is silent: same id, so it is executed once.
+
+        Args:
+            is_seen: whether what was asked for is seen to happen, which is as good as an answer.
+
+        Returns:
+            The answer; NO_RESPONSE only if control was lost before there was any.
 
         Raises:
             NoResponse: it stays silent.
@@ -62,11 +78,13 @@ class Asker:
         told = False
         while True:
             response = self._link.request(kind, subject, request_id=request_id, until_s=until_s)
-            if response.code != ControlResponse.NO_RESPONSE:
+            if response.code != ControlResponse.NO_RESPONSE or self._holding.was_lost:
                 return response
+            if is_seen():
+                return Response(ControlResponse.SUCCESS, id=request_id)
             if clock.monotonic_s() >= give_up_s:
                 raise NoResponse(
-                    f"the microscope does not answer {kind.name}",
+                    f"the microscope does not answer {kind.name}: {response.reason or 'no reason given'}",
                     where=self._link.name,
                     hint="is its translator running? whether it was carried out is not known",
                 )
@@ -81,6 +99,8 @@ class Asker:
         Args:
             states: how many states had been published before it was asked.
         """
+        if response.code == ControlResponse.NO_RESPONSE:
+            return  # control is lost, and waited for when it is asked again
         if response.code in _NOT_IN_CONTROL:
             self._holding.lost(response.reason)
         elif response.code == ControlResponse.NOT_FREE:
@@ -114,10 +134,14 @@ class Asker:
             link.wait(lambda: view.state is not ScopeState.MOVING, until_s)
 
     def _wait_for_something(self, until_s: float) -> None:
-        """Until the microscope says anything, or `until_s`."""
+        """Until the microscope says anything, control changes, or `until_s`."""
         view = self._link.view
-        count = view.count("ScopeStateMsg")
-        self._link.wait(lambda: view.count("ScopeStateMsg") != count, until_s)
+
+        def counts() -> tuple[int, int]:
+            return view.count("ScopeStateMsg"), view.count("ControlState")
+
+        before = counts()
+        self._link.wait(lambda: counts() != before, until_s)
 
 
 def refused(kind: ControlRequest, response: Response, where: str) -> Refused:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from afspm import wire
 from afspm.errors import ControlLost, ExperimentEnded, NoResponse, Refused
 from afspm.model import ControlMode, ControlRequest, ControlResponse, ControlState, Packet, Problem, ProblemNames
 from afspm.runtime.link import Link
@@ -22,6 +21,11 @@ _WAIT_FOR = {
 class Holding:
     """Whether this component is in control, and what for.
 
+    Attributes:
+        held: we are in control.
+        why_lost: for a person, why we no longer are.
+        gives_back_inherited: give back whatever control an earlier life of this component died with.
+
     That it is, the scheduler's answers say; that it no longer is, its published control state, once that has named us.
     (A state from before the grant may still be under way: it must not be taken for a loss.)
     """
@@ -33,7 +37,13 @@ class Holding:
         self._seen = False
         self.held = False
         self.why_lost = ""
+        self.gives_back_inherited = False
         link.listen(self._on_packet)
+
+    @property
+    def was_lost(self) -> bool:
+        """Whether control is wanted and not there."""
+        return bool(self._wanted) and not self.held
 
     @contextmanager
     def hold(self, *, solving: int = Problem.NONE, until_s: float | None = None) -> Iterator[None]:
@@ -100,10 +110,10 @@ class Holding:
             self._link.log.info("in control again")
 
     def release_inherited(self) -> None:
-        """Give back control that an earlier life of this component had and we don't need: others wait for it."""
+        """Give back control that an earlier life had and nobody wants now: others wait for it."""
         state = self._link.view.control
-        if state is not None and state.holder == self._link.name and not self._wanted:
-            self._link.request(ControlRequest.RELEASE_CTRL)
+        if state is not None and state.holder == self._link.name and not self._wanted and not self.held:
+            self._link.send_only(ControlRequest.RELEASE_CTRL)
 
     def lost(self, why: str) -> None:
         """The scheduler says that we are not in control."""
@@ -143,10 +153,12 @@ class Holding:
 
     def _on_packet(self, packet: Packet, ours: bool) -> None:
         # the link's view is up to date before its listeners are called
-        if not ours or not self.held or not packet.envelope.startswith("ControlState"):
+        if not ours or not packet.envelope.startswith("ControlState") or self._link.view.control is None:
             return
-        if wire.message_of(packet.envelope) == "ControlState" and self._link.view.control is not None:
+        if self.held:
             self._on_control(self._link.view.control)
+        elif self.gives_back_inherited:
+            self.release_inherited()
 
     def _on_control(self, state: ControlState) -> None:
         if state.holder == self._link.name:

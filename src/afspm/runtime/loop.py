@@ -82,9 +82,8 @@ class ComponentLoop:
     def _begin(self) -> None:
         with self._activity.step():
             self._component.on_start()
-        if not self._is_script:
-            self._link.wait_caught_up()
-            self._scope.release_inherited()
+        if not self._is_script:  # a script may go on with what it held control for
+            self._scope.give_back_inherited()
 
     def _serve(self) -> None:
         """Handle what comes, and tick, until something ends it."""

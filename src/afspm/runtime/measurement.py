@@ -115,15 +115,16 @@ class Measuring:
         return result
 
     def _taken_up(self, progress: _Progress) -> Cycle | None:
-        """What an earlier life was at, if it was this."""
+        """What an earlier life, or an earlier call, was at, if it was this."""
         intent, cycle = self._results.pending, self._resumed
         self._resumed = None
-        if intent is None or cycle is None or intent["key"] != progress.key or intent["plan"] != progress.plan.facts:
+        if intent is None or intent["key"] != progress.key or intent["plan"] != progress.plan.facts:
             self._forget_resumed()
             return None
-        progress.attempt = intent["attempt"]
+        progress.attempt = intent["attempt"]  # ids of attempts before are answered, not executed
         progress.interruptions = intent["interruptions"]
-        self._link.log.info("%s %s: taken up where it was", progress.plan.what, progress.key)
+        if cycle is not None:
+            self._link.log.info("%s %s: taken up where it was", progress.plan.what, progress.key)
         return cycle
 
     def _is_complete(self, progress: _Progress, cycle: Cycle) -> bool:
@@ -160,17 +161,27 @@ class Measuring:
         states = link.view.count("ScopeStateMsg")
         cycle = resumed or Cycle(plan.busy, plan.fits, since_ns=link.view.newest_ns)
         forget = self._forget_resumed if resumed else link.listen(self._listener(cycle, plan.message))
+        is_unknown = True  # until we know what became of it, an error in between leaves it to be taken up
         try:
             response = self._asker.send(
-                ControlRequest.ACTION, plan.action, request_id=progress.request_id(), until_s=progress.until_s
+                ControlRequest.ACTION,
+                plan.action,
+                request_id=progress.request_id(),
+                until_s=progress.until_s,
+                is_seen=lambda: cycle.begun,
             )
-            if not response.ok:
+            if not response.ok and not cycle.begun:
+                is_unknown = False
                 self._asker.get_over(ControlRequest.ACTION, response, states, progress.until_s)
                 return None
             self._follow(progress, cycle)
+            is_unknown = False
             return cycle
         finally:
-            forget()
+            if is_unknown and progress.key is not None:
+                self._resumed, self._forget_resumed = cycle, forget
+            else:
+                forget()
 
     def _write_down(self, progress: _Progress) -> None:
         if progress.key is None:

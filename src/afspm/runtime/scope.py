@@ -287,8 +287,9 @@ class Scope:
 
     # --- within ---
 
-    def release_inherited(self) -> None:
-        """Give back control that an earlier life of this component died with. Called by the component's loop."""
+    def give_back_inherited(self) -> None:
+        """Never keep control that an earlier life of this component died with. Called by the component's loop."""
+        self._holding.gives_back_inherited = True
         self._holding.release_inherited()
 
     @contextmanager

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_lab import REGION, SCAN_S, SOURCE, Lab, LabPort
 
-from afspm.errors import InvalidValue
+from afspm.errors import InvalidValue, NoResponse, Refused
 from afspm.logic.arbitration import Event
-from afspm.model import ControlRequest, Problem, ScanSet
+from afspm.model import ControlRequest, ControlResponse, Problem, Response, ScanSet
 from afspm.runtime.link import Link
 from afspm.runtime.scope import Scope
 
@@ -182,3 +182,24 @@ def test_a_spectrum_with_a_key_is_taken_once(tmp_path: Path) -> None:
         lab.restart_component()
     assert lab.begun_scans == 1
     assert lab.count(ControlRequest.SET_PROBE_POS) == 1
+
+
+def test_a_scan_that_was_given_up_waiting_for_is_taken_up_by_the_next_call(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    with pytest.raises(NoResponse):
+        scope.scan(TILES[0], key="tile", timeout_s=0.5 * SCAN_S)
+    scope.scan(TILES[0], key="tile")
+    assert lab.begun_scans == 1
+
+
+def test_after_a_refusal_the_same_key_is_asked_for_with_another_id(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    lab.intercept = lambda request: Response(ControlResponse.ACTION_ERROR) if request.subject else "go on"
+    with pytest.raises(Refused):
+        scope.scan(None, key="tile")
+    lab.intercept = lambda request: "go on"
+    scope.scan(None, key="tile")
+    ids = [request.id for request in lab.requests if request.subject == "start-scan"]
+    assert ids == ["experiment/tile/1", "experiment/tile/2"]

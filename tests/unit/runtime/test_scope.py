@@ -469,3 +469,49 @@ def test_a_microscope_that_says_nothing_of_itself_can_still_be_asked() -> None:
     lab._inbox = lab._inbox[:1]  # connected, and neither states nor the end of the replay: a scheduler of version 1
     scope = Scope(Link(LabPort(lab), lab.name, source=SOURCE))
     assert scope.scan(REGION).region == REGION
+
+
+def test_control_that_is_lost_while_the_microscope_is_silent_is_waited_for(lab: Lab, scope: Scope) -> None:
+    """Then the answer is never coming: nobody asks for somebody who is not in control."""
+    lab.intercept = lambda request: (
+        Response(ControlResponse.NO_RESPONSE)
+        if request.subject == "start-scan" and lab.clock.passed_s < 300.0
+        else "go on"
+    )
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(400.0, lambda: lab.clear(TIP))
+    scope.scan(REGION)
+    assert lab.begun_scans == 1
+
+
+def test_an_action_whose_answer_and_control_were_lost_is_not_done_twice(lab: Lab, scope: Scope) -> None:
+    done: list[str] = []
+
+    def silent(request: model.Request) -> Response | str:
+        if request.subject != "x-pulse":
+            return "go on"
+        if not done:
+            lab._answer_once(request)
+            lab.flag(TIP)
+            lab.at(30.0, lambda: lab.clear(TIP))
+        done.append(request.id)
+        return Response(ControlResponse.NO_RESPONSE) if lab.clock.passed_s < 20.0 else "go on"
+
+    lab.intercept = silent
+    scope.action("x-pulse")
+    assert len(set(done)) == 1
+    assert lab.executed.count(done[0]) == 1
+
+
+def test_a_scan_that_is_seen_to_begin_needs_no_answer(lab: Lab, scope: Scope) -> None:
+    """A translator of version 1 whose answer was lost: the scheduler can't ask it again."""
+
+    def lost(request: model.Request) -> Response | str:
+        if request.subject != "start-scan":
+            return "go on"
+        lab._answer_once(request)
+        return Response(ControlResponse.NO_RESPONSE, reason="outcome unknown")
+
+    lab.intercept = lost
+    assert scope.scan(REGION).region == REGION
+    assert lab.begun_scans == 1
