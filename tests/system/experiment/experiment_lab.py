@@ -57,6 +57,9 @@ class Witness(Component):
     def on_scan(self, scan):
         with (self.run_dir / "witnessed.txt").open("a") as file:
             file.write(f"{scan.channel}|{scan.time_ns}|{scan.filename}\\n")
+
+    def on_state(self, status):
+        self.log.info("state %s", status.state.name)
 '''
 
 
@@ -106,9 +109,15 @@ class AfspmRun:
         started = [line for line in self.lines if re.search(rf" {name} .*started, process", line)]
         return int(started[-1].rsplit(" ", 1)[1])
 
-    def times_up(self, name: str) -> int:
-        """How often the component has come up so far."""
-        return sum(bool(re.search(rf" {name} .*is up$", line)) for line in self.lines)
+    def wait_for_next(self, *wanted: str) -> str:
+        """The next line of a kind, after those that have come already."""
+        with self._changed:
+            already = sum(all(re.search(text, line) for text in wanted) for line in self.lines)
+        return self.wait_for(*wanted, count=already + 1)
+
+    def wait_up(self, name: str, times: int) -> None:
+        """Wait until the component has come up so many times."""
+        self.wait_for(rf" {name} .*is up$", count=times)
 
     def signal(self, name: str, number: signal.Signals) -> None:
         """Send a signal to the component's process."""

@@ -1,0 +1,82 @@
+"""Processes of a running experiment are killed and frozen, and it ends complete all the same."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+import pytest
+from experiment_lab import AfspmRun, Run, require_each_once
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+
+MORE = """
+[tip_classifier]
+component = true
+class = "TipClassifier"
+
+[tip_corrector]
+component = true
+class = "TipCorrector"
+workshop_center = ["8 um", "0 um"]
+test_center = ["0 um", "4 um"]
+
+[metadata]
+component = true
+class = "Metadata"
+
+[restart]
+beat_period = 0.25
+missed_beats = 6
+"""
+EACH = ("microscope", "scheduler", "series", "tip_classifier", "tip_corrector", "metadata")
+
+
+@pytest.mark.parametrize("when", ["while scanning", "between scans"])
+def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, when: str) -> None:
+    one = run(more=MORE, scans=10, speed=60.0)
+    one.wait_for("scan 1 of 10")
+    for name in EACH:
+        one.wait_for_next(" witness ", "state SCANNING" if when == "while scanning" else "state FREE")
+        one.signal(name, signal.SIGKILL)
+        one.wait_up(name, times=2)
+    assert one.end() == 0, one.output
+    require_each_once(one, 10)
+    for name in EACH:
+        one.wait_for(f"{name} was restarted once")
+
+
+@pytest.mark.parametrize("name", ["microscope", "scheduler", "series"])
+def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run, name: str) -> None:
+    one = run(more=MORE, scans=6)
+    one.wait_for("scan 2 of 6")
+    one.wait_for_next(" witness ", "state SCANNING")
+    one.signal(name, signal.SIGSTOP)
+    one.wait_for(f" {name} ", "no heartbeat")
+    assert one.end() == 0, one.output
+    require_each_once(one, 6)
+
+
+def test_a_component_that_always_crashes_does_not_keep_the_rest_from_ending(run: Run) -> None:
+    more = """
+[hopeless]
+component = true
+heartbeats = false
+command = ["python", "-c", "raise SystemExit('no hope')"]
+
+[restart]
+budget = 2
+"""
+    one = run(more=more)
+    assert one.end() == 0, one.output
+    require_each_once(one, 4)
+    one.wait_for("CRITICAL hopeless is given up, the rest goes on")
+    one.wait_for("hopeless was GIVEN UP")
+
+
+def test_without_a_microscope_the_run_ends_and_says_so(run: Run) -> None:
+    one: AfspmRun = run(more="[restart]\nbudget = 0\n", scans=1000)
+    one.wait_for("scan 1 of 1000")
+    one.signal("microscope", signal.SIGKILL)
+    assert one.end() == 1, one.output
+    one.wait_for("CRITICAL microscope, which the experiment can't do without, is given up")
