@@ -1,0 +1,198 @@
+"""A whole experiment: how soon it is up, how soon a killed process is back, and what it costs while nothing happens."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from time import perf_counter
+
+import zmq
+
+import afspm
+from afspm.errors import RequestError
+from afspm.supervisor.ports import FreePorts
+from benchmarks.rows import Row, measurement
+
+DEADLINE_S = 30.0
+STARTS = 5
+KILLS = 5
+IDLE_S = 10.0
+
+# six processes, none of which has anything to do
+EXPERIMENT = """
+[microscope]
+component = true
+class = "Simulator"
+
+[scheduler]
+component = true
+class = "Scheduler"
+pubsubcache = "{address}"
+
+[tip_classifier]
+component = true
+class = "TipClassifier"
+
+[tip_corrector]
+component = true
+class = "TipCorrector"
+workshop_center = ["8 um", "0 um"]
+test_center = ["0 um", "4 um"]
+
+[metadata]
+component = true
+class = "Metadata"
+
+[watcher]
+component = true
+class = "watcher.Watcher"
+"""
+WATCHER = """
+from afspm.runtime.component import Component
+
+
+class Watcher(Component):
+    def on_state(self, status):
+        self.log.info("knows the state")
+"""
+
+
+class Running:
+    """`afspm run` of the experiment above."""
+
+    def __init__(self, folder: Path) -> None:
+        self.address = FreePorts().address()
+        self.runs = folder / "runs"
+        self.file = folder / "experiment.toml"
+        self.file.write_text(EXPERIMENT.format(address=self.address), encoding="utf-8")
+        (folder / "watcher.py").write_text(WATCHER, encoding="utf-8")
+        command = [sys.executable, "-c", "from afspm.cli import main; main()"]
+        self.process = subprocess.Popen(
+            [*command, "run", str(self.file), "--runs", str(self.runs), "--verbose"],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.pids: dict[str, int] = {}
+        self._lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self._lines.put(line)
+
+    def wait_for(self, pattern: str) -> None:
+        """Wait for a line of the log, from where the last wait ended."""
+        while True:
+            line = self._lines.get(timeout=DEADLINE_S)
+            if started := re.search(r"(\w+) +started, process (\d+)", line):
+                self.pids[started[1]] = int(started[2])
+            if re.search(pattern, line):
+                return
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait()
+
+
+@contextlib.contextmanager
+def running() -> Iterator[Running]:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        run = Running(Path(folder))
+        try:
+            yield run
+        finally:
+            run.close()
+
+
+@measurement
+def start_up() -> Iterator[Row]:
+    yield Row("afspm run to the first ScopeState", "s", statistics.median(map(_start_s, range(STARTS))), None, 2.0)
+
+
+def _start_s(_: int) -> float:
+    context = zmq.Context()
+    subscriber = context.socket(zmq.SUB)
+    subscriber.subscribe(b"ScopeStateMsg")
+    subscriber.setsockopt(zmq.RECONNECT_IVL, 10)
+    try:
+        began_s = perf_counter()
+        with running() as run:
+            subscriber.connect(run.address)
+            if not subscriber.poll(DEADLINE_S * 1000):
+                raise TimeoutError("no ScopeState came")
+            return perf_counter() - began_s
+    finally:
+        context.destroy(linger=0)
+
+
+@measurement
+def recovery() -> Iterator[Row]:
+    if sys.platform == "win32":
+        return
+    with running() as run:
+        run.wait_for(r"watcher .*knows the state")
+        took_s = [_component_back_s(run) for _ in range(KILLS)]
+        yield Row("kill -9 a component until it has the cache again", "s", statistics.median(took_s), None, 1.0)
+    for name in ("microscope", "scheduler"):
+        took_s = [_back_s(name) for _ in range(KILLS)]
+        role = "translator" if name == "microscope" else name
+        yield Row(f"kill -9 the {role} until a request is served", "s", statistics.median(took_s), None, 1.5)
+
+
+def _component_back_s(run: Running) -> float:
+    began_s = perf_counter()
+    os.kill(run.pids["watcher"], signal.SIGKILL)
+    run.wait_for(r"watcher .*knows the state")
+    return perf_counter() - began_s
+
+
+def _back_s(name: str) -> float:
+    """From the kill until the one in control has an answer of the microscope again."""
+    with running() as run:
+        run.wait_for(r"watcher .*knows the state")
+        scope = afspm.connect(run.runs, name="benchmark")
+        with scope.control():
+            scope.get("scan-speed")
+            began_s = perf_counter()
+            os.kill(run.pids[name], signal.SIGKILL)
+            deadline_s = began_s + DEADLINE_S
+            while perf_counter() < deadline_s:
+                with contextlib.suppress(RequestError):
+                    scope.get("scan-speed")
+                    return perf_counter() - began_s
+    raise TimeoutError(f"{name} did not come back")
+
+
+@measurement
+def idle() -> Iterator[Row]:
+    if not Path("/proc/self/stat").exists():
+        return
+    with running() as run:
+        run.wait_for(r"watcher .*knows the state")
+        pids = [run.process.pid, *run.pids.values()]
+        # the last of them are still starting: what they do in the first seconds is not idling
+        threading.Event().wait(3.0)
+        began_s, before_s = perf_counter(), _cpu_s(pids)
+        threading.Event().wait(IDLE_S)
+        percent = 100.0 * (_cpu_s(pids) - before_s) / (perf_counter() - began_s)
+    yield Row(f"idle: {len(pids) - 1} processes and their supervisor", "% of a core", percent, None, 2.0)
+
+
+def _cpu_s(pids: list[int]) -> float:
+    """Time that these processes have been computing, user and system."""
+    ticks = 0
+    for pid in pids:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
