@@ -17,7 +17,9 @@ from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
 
 ANY = "tcp://127.0.0.1:0"
-LAST = b"last"
+MARK = "FeedbackAnalysis"
+"""What is published beside scans: a message that every scheduler lets through."""
+LAST = bytes.fromhex("0d0000803f")
 PROBE = 100
 """Payloads up to this size are no scans: they ask whether anybody is there, or say that it was the last."""
 
@@ -91,7 +93,7 @@ def bare_subscriber(source: str, tally: str, queue: int) -> None:
     socket: Any = zmq.Context.instance().socket(zmq.SUB)
     socket.set_hwm(queue)
     socket.setsockopt(zmq.SUBSCRIBE, b"Scan2d")
-    socket.setsockopt(zmq.SUBSCRIBE, b"Mark")
+    socket.setsockopt(zmq.SUBSCRIBE, MARK.encode())
     socket.connect(source)
     told = Tally(tally)
     ready()
@@ -100,7 +102,7 @@ def bare_subscriber(source: str, tally: str, queue: int) -> None:
 
 
 def our_subscriber(source: str, tally: str, name: str) -> None:
-    port = ZmqPort(Network(), name, ExperimentClock.real(), subscribe=[source], envelopes=["Scan2d", "Mark"])
+    port = ZmqPort(Network(), name, ExperimentClock.real(), subscribe=[source], envelopes=["Scan2d", MARK])
     told = Tally(tally)
     ready()
     while True:

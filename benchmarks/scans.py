@@ -1,0 +1,105 @@
+"""Scans through the scheduler to many subscribers, against PUB, XSUB/XPUB proxy, SUB."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from functools import partial
+from time import perf_counter
+from typing import Any
+
+import zmq
+
+from afspm import wire
+from afspm.transport.network import Network
+from afspm.transport.zmq_server import ZmqServerPort
+from benchmarks.codec import scan
+from benchmarks.processes import CLOCK, Roles, roles
+from benchmarks.roles import ANY, LAST, MARK
+from benchmarks.rows import Row, alternate, measurement
+
+SCANS = {128: 400, 512: 60, 2048: 8}
+"""By edge in pixels: how many are published in a batch. All of a batch may be under way, so no queue is shorter."""
+QUEUE = 1000
+ALTERNATIONS = 5
+
+
+class Line:
+    """A publisher in this process, the middle in another, and subscribers each in its own."""
+
+    def __init__(self, processes: Roles) -> None:
+        self._publish: Callable[[bytes, bytes], None]
+        self._context: Any = processes.enter_context(zmq.Context())
+        self._tally = self._context.socket(zmq.PULL)
+        self._tally_address = f"tcp://127.0.0.1:{self._tally.bind_to_random_port('tcp://127.0.0.1')}"
+        self._processes = processes
+
+    def bare(self, subscribers: int) -> None:
+        publisher = self._context.socket(zmq.PUB)
+        publisher.set_hwm(QUEUE)
+        source = f"tcp://127.0.0.1:{publisher.bind_to_random_port('tcp://127.0.0.1')}"
+        middle = self._processes.start("bare_packet_proxy", publisher=source, queue=QUEUE)
+        for _ in range(subscribers):
+            self._processes.start("bare_subscriber", source=middle, tally=self._tally_address, queue=QUEUE)
+
+        def publish(envelope: bytes, payload: bytes) -> None:
+            stamp = wire.encode_time(CLOCK.now_ns())
+            publisher.send(envelope, zmq.SNDMORE)
+            publisher.send(payload, zmq.SNDMORE, copy=False)
+            publisher.send(stamp)
+
+        self._publish = publish
+        self._wait_for(subscribers)
+
+    def ours(self, subscribers: int) -> None:
+        port = ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)
+        self._processes.callback(port.close)
+        middle, _ = self._processes.scheduler(str(port.publish_address), port.serve_address)
+        for n in range(subscribers):
+            self._processes.start("our_subscriber", source=middle, tally=self._tally_address, name=f"Subscriber {n}")
+
+        def publish(envelope: bytes, payload: bytes) -> None:
+            port.publish(envelope.decode(), payload)
+
+        while not self._tally.poll(0):
+            port.poll(0.05)
+            publish(MARK.encode(), b"")
+        self._publish = publish
+        self._wait_for(subscribers)
+
+    def _wait_for(self, subscribers: int) -> None:
+        self._subscribers = subscribers
+        there = 0
+        while there < subscribers:
+            self._publish(MARK.encode(), b"")
+            if self._tally.poll(20):
+                there += self._tally.recv() == b"there"
+
+    def scans_per_s(self, payload: bytes, count: int) -> float:
+        """How many scans a second arrive at every subscriber."""
+        gc.collect()
+        began = perf_counter()
+        for _ in range(count):
+            self._publish(b"Scan2d", payload)
+        self._publish(MARK.encode(), LAST)
+        for _ in range(self._subscribers):
+            arrived = int(self._tally.recv())
+            assert arrived == count, f"{count - arrived} of {count} scans were lost"
+        return count / (perf_counter() - began)
+
+
+@measurement
+def scans() -> Iterator[Row]:
+    for subscribers in (1, 4, 16):
+        with roles() as processes:
+            bare, ours = Line(processes), Line(processes)
+            bare.bare(subscribers)
+            ours.ours(subscribers)
+            for pixels, count in SCANS.items():
+                payload = wire.encode(scan(pixels))[1]
+                fast, reference = alternate(
+                    partial(ours.scans_per_s, payload, count),
+                    partial(bare.scans_per_s, payload, count),
+                    ALTERNATIONS,
+                )
+                yield Row(f"scans of {pixels}² to {subscribers} subscribers", "1/s", fast, reference, 0.8, "high")

@@ -75,6 +75,8 @@ class Shell:
                 sockets.publisher.serve()
             elif source is sockets.router.monitor:
                 self._requests(sockets.router.follow())
+            elif source is sockets.subscriber.monitor:
+                sockets.subscriber.follow()
             else:
                 for change in sockets.link.follow():
                     self._take(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())

@@ -26,7 +26,7 @@ class ControlClient:
         self._complaints = complaints
         self._address = address
         self._scheduler_is_ours = False
-        self.sent = False
+        self.touched = True
         self.socket = network.socket(zmq.DEALER)
         self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
         # a request is for the scheduler that is there now, not for one that may come later
@@ -37,14 +37,17 @@ class ControlClient:
     def send(self, frames: Sequence[bytes]) -> None:
         """Ask; dropped while there is no scheduler."""
         try:
-            self.sent = True
+            self.touched = True
             send(self.socket, [b"", *frames])
         except zmq.Again:
             return
 
     def receive(self) -> list[Incoming]:
         """The next answer."""
+        self.touched = True
         frames = [frame.bytes for frame in receive(self.socket)]
+        if not frames:
+            return []
         try:
             return [self._interpret(frames)]
         except WireError as error:

@@ -29,8 +29,11 @@ def readable(socket: Socket) -> bool:
 
 
 def receive(socket: Socket) -> list[zmq.Frame]:
-    """One whole message as it lies in the library's buffers. Raises zmq.Again if there is none."""
-    frame: zmq.Frame = _receive(socket, _NOBLOCK, copy=False)
+    """One whole message as it lies in the library's buffers; empty if there is none."""
+    try:
+        frame: zmq.Frame = _receive(socket, _NOBLOCK, copy=False)
+    except zmq.Again:
+        return []
     frames = [frame]
     while frame.more:
         frame = _receive(socket, _NOBLOCK, copy=False)

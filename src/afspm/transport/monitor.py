@@ -33,6 +33,7 @@ class Monitor:
 
     def __init__(self, socket: zmq.Socket[bytes], events: int) -> None:
         self._watched = socket
+        self.touched = True
         address = f"inproc://monitor-{next(_numbers)}"
         socket.monitor(address, events)
         self.socket: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)
@@ -42,6 +43,7 @@ class Monitor:
 
     def drain(self) -> list[ConnectionEvent]:
         """All events that have come; mostly none, which costs half a microsecond."""
+        self.touched = False
         events: list[ConnectionEvent] = []
         while readable(self.socket):
             kind, value = _HEADER.unpack(self.socket.recv_multipart(zmq.NOBLOCK)[0])

@@ -22,55 +22,50 @@ def milliseconds(timeout_s: float | None) -> int | None:
     return None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
 
 
-class Sender(Protocol):
-    """Sets `sent` whenever it has sent something."""
+class Touching(Protocol):
+    """Owns a socket. `touched` is true if it has sent, or has not received all that there was, since it was last false:
+    its socket may then have something to receive without telling so again."""
 
-    sent: bool
+    touched: bool
 
 
 class Poller(Generic[S]):
-    """Waits until one of its sockets can be received from, or it is woken up; names them by `source`.
+    """Waits until one of its sockets has news, or it is woken up; names them by `source`.
 
     A socket of ZeroMQ has a descriptor that tells of news, but only once: news may also be taken notice of while
-    sending or receiving. Whoever asks each socket again before waiting may wait on the descriptors, which takes a
-    tenth of the time of zmq_poll. Only those need to be asked that were touched since: read from after the last wait,
-    or sent on.
+    sending or receiving. Whoever asks the sockets that were touched again before waiting may wait on the descriptors,
+    which takes a tenth of the time of zmq_poll.
     """
 
     def __init__(self, wake_up: WakeUp[Any]) -> None:
-        self._wake_up = wake_up.fileno()
-        self._sources: dict[int, tuple[Socket, S]] = {}
-        self._senders: list[tuple[Sender, tuple[Socket, S]]] = []
-        self._touched: list[tuple[Socket, S]] = []
+        self._by_descriptor: dict[int, S] = {}
+        self._owners: list[tuple[Touching, Socket, S]] = []
         self._poll = select.poll()
-        self._poll.register(self._wake_up, select.POLLIN)
+        self._poll.register(wake_up.fileno(), select.POLLIN)
 
-    def register(self, socket: Socket, source: S, sender: Sender | None = None) -> None:
-        """Wait for `socket` too. `sender`: who also sends on it."""
+    def register(self, socket: Socket, source: S, owner: Touching) -> None:
+        """Wait for `socket` too."""
         descriptor = int(socket.getsockopt(zmq.FD))
-        self._sources[descriptor] = (socket, source)
+        self._by_descriptor[descriptor] = source
+        self._owners.append((owner, socket, source))
         self._poll.register(descriptor, select.POLLIN)
-        self._touched.append((socket, source))
-        if sender is not None:
-            self._senders.append((sender, (socket, source)))
 
     def wait(self, timeout_ms: int | None) -> tuple[list[S], bool]:
-        """The sources of the sockets that can be received from, and whether we were woken up."""
-        touched = self._touched
-        for sender, entry in self._senders:
-            if sender.sent:
-                sender.sent = False
-                if entry not in touched:
-                    touched.append(entry)
-        self._touched = found = [entry for entry in touched if readable(entry[0])]
+        """The sources of the sockets that have news, mostly something to receive, and whether we were woken up."""
+        found = []
+        for owner, socket, source in self._owners:
+            if owner.touched:
+                owner.touched = False
+                if readable(socket):
+                    found.append(source)
         woken = False
         for descriptor, _ in self._poll.poll(0 if found else timeout_ms):
-            known = self._sources.get(descriptor)
-            if known is None:
+            entry = self._by_descriptor.get(descriptor)
+            if entry is None:
                 woken = True
-            elif known not in found and readable(known[0]):
-                found.append(known)
-        return [source for _, source in found], woken
+            elif entry not in found:
+                found.append(entry)
+        return found, woken
 
 
 class PortablePoller(Generic[S]):
@@ -81,7 +76,7 @@ class PortablePoller(Generic[S]):
         self._poller = zmq.Poller()
         self._poller.register(wake_up.fileno(), zmq.POLLIN)
 
-    def register(self, socket: Socket, source: S, sender: Sender | None = None) -> None:
+    def register(self, socket: Socket, source: S, owner: Touching) -> None:
         self._sources[socket] = source
         self._poller.register(socket, zmq.POLLIN)
 

@@ -29,7 +29,7 @@ class Publisher:
 
     def __init__(self, network: Network, address: str, history: History) -> None:
         self.history = history
-        self.sent = False
+        self.touched = True
         self.socket = network.socket(zmq.XPUB)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
@@ -38,7 +38,7 @@ class Publisher:
     def publish(self, packet: Packet) -> None:
         """Send to all who subscribed to the packet's envelope. Never blocks."""
         tail = None if packet.time_ns is None else wire.encode_time(packet.time_ns)
-        self.sent = True
+        self.touched = True
         send_packet(self.socket, [packet.envelope.encode()], packet.payload, tail)
 
     def kill(self) -> None:
@@ -47,7 +47,7 @@ class Publisher:
 
     def serve(self) -> int:
         """Take in who subscribed and who left; returns how many joined."""
-        self.sent = True  # perhaps: what was kept
+        self.touched = True  # perhaps: what was kept
         joined = 0
         plain: dict[object, list[bytes]] = {}
         while readable(self.socket):

@@ -63,7 +63,7 @@ class Router:
         self._complaints = complaints
         self._with_keys = network.keys is not None
         self._connections = 0
-        self.sent = False
+        self.touched = True
         self._by_descriptor: dict[int, _Peer] = {}
         self._identities: dict[int, bytes] = {}
         self.socket = network.socket(zmq.ROUTER)
@@ -73,7 +73,10 @@ class Router:
 
     def receive(self) -> list[RouterEvent]:
         """The next request, and what happened to connections if it may have to do with it."""
+        self.touched = True
         frames = receive(self.socket)
+        if not frames:
+            return []
         identity, descriptor = frames[0].bytes, int(frames[0].get(_DESCRIPTOR))
         peer = self._by_descriptor.get(descriptor)
         if peer is not None and peer.identity == identity and not readable(self.monitor.socket):
@@ -107,7 +110,7 @@ class Router:
         """Answer by `connection`, if it is still there. Never blocks."""
         identity = self._identities.get(connection)
         if identity is not None:
-            self.sent = True
+            self.touched = True
             send(self.socket, [identity, b"", *frames])
 
     def _interpret(self, peer: _Peer, frames: list[zmq.Frame]) -> list[RouterEvent]:

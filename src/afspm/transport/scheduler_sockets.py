@@ -47,13 +47,10 @@ class SchedulerSockets:
             self._network, launch.name, sockets.subscribe[0], None, complaints, since_ns=since_ns, filtered=False
         )
         self._poller = poller(self._wake_up)
-        self._poller.register(self.router.socket, self.router, self.router)
-        self._poller.register(self.link.socket, self.link, self.link)
-        self._poller.register(self.publisher.socket, self.publisher, self.publisher)
-        self._poller.register(self.subscriber.socket, self.subscriber)
-        self._poller.register(self.subscriber.monitor.socket, self.subscriber)
-        self._poller.register(self.router.monitor.socket, self.router.monitor)
-        self._poller.register(self.link.monitor.socket, self.link.monitor)
+        for source in (self.router, self.link, self.publisher, self.subscriber):
+            self._poller.register(source.socket, source, source)
+        for monitor in (self.router.monitor, self.link.monitor, self.subscriber.monitor):
+            self._poller.register(monitor.socket, monitor, monitor)
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
         """Those that have something to receive; returns early, perhaps with none, after `wake_up`."""

@@ -18,7 +18,8 @@ from afspm.transport.port import CaughtUp, Incoming, Killed, PacketReceived
 from afspm.transport.replay import Marker, topic
 
 _MOST_ENVELOPES = 10_000
-_BATCH = 256
+# few: what waits in the library's queue costs nothing, what we hold keeps large buffers from being used again
+_BATCH = 16
 
 
 class Subscriber:
@@ -53,6 +54,7 @@ class Subscriber:
         self._started_ns = since_ns
         self._nonces = itertools.count()
         self._marker: Marker | None = None
+        self.touched = True
         # unlike SUB, XSUB takes what is sent to it under any topic, and lets the marker through as it is
         self.socket = network.socket(zmq.XSUB, max_bytes=MAX_PACKET_BYTES)
         self.monitor = Monitor(self.socket, CONNECTED)
@@ -62,22 +64,32 @@ class Subscriber:
 
     def receive(self) -> list[Incoming]:
         """What has come, a batch at a time: the rest is still there for the next call."""
-        for _ in self.monitor.drain():
-            self._ask_for_missed()
+        socket = self.socket
         found: list[Incoming] = []
-        while len(found) < _BATCH and readable(self.socket):
-            frames = receive(self.socket)
+        while frames := receive(socket):
             try:
                 incoming = self._interpret(frames)
             except WireError as error:
                 self._complaints.say(f"dropped a packet from {self.address}: {error}")
-                continue
-            if incoming is not None:
-                found.append(incoming)
+            else:
+                if incoming is not None:
+                    found.append(incoming)
+            if not readable(socket):
+                break
+            if len(found) == _BATCH:
+                self.touched = True
+                break
         return found
+
+    def follow(self) -> list[Incoming]:
+        """Connections were made: what was missed is asked for."""
+        if self.monitor.drain():
+            self._ask_for_missed()
+        return []
 
     def _ask_for_missed(self) -> None:
         """A connection was made, the first or another: say what we have, and be sent the rest."""
+        self.touched = True
         self._forget_marker()
         self._marker = Marker(topic(self._name, next(self._nonces)), self._newest_ns, self._prefixes)
         self.socket.send(b"\1" + self._marker.encode())
@@ -85,6 +97,7 @@ class Subscriber:
     def _forget_marker(self) -> None:
         """Else the socket would ask for the same again when the connection is next made."""
         if self._marker is not None:
+            self.touched = True
             self.socket.send(b"\0" + self._marker.encode())
             self._marker = None
 

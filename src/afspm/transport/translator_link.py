@@ -38,7 +38,7 @@ class TranslatorLink:
     def __init__(self, network: Network, address: str, complaints: Complaints) -> None:
         self._complaints = complaints
         self._address = address
-        self.sent = False
+        self.touched = True
         self.socket = network.socket(zmq.DEALER)
         # nothing waits for a translator that is gone, to be carried out when it is back
         self.socket.setsockopt(zmq.IMMEDIATE, 1)
@@ -48,15 +48,18 @@ class TranslatorLink:
     def send(self, number: int, frames: Sequence[bytes]) -> bool:
         """Ask; False if there is no translator to ask."""
         try:
-            self.sent = True
+            self.touched = True
             send(self.socket, [b"%d" % number, b"", *frames])
         except zmq.Again:
             return False
         return True
 
     def receive(self) -> LinkReply | None:
-        """The next answer; None: it was none."""
+        """The next answer; None: there is none, or it is malformed."""
+        self.touched = True
         frames = [frame.bytes for frame in receive(self.socket)]
+        if not frames:
+            return None
         if len(frames) < 3 or frames[1] or not frames[0].isdigit() or len(frames[0]) > _LONGEST_NUMBER:
             self._complaints.say(f"dropped a malformed answer from {self._address}")
             return None

@@ -40,7 +40,7 @@ class ZmqServerPort:
         self._allowed = allowed
         self._asker: list[bytes] | None = None
         self._closed = False
-        self.sent = False
+        self.touched = True
         self._wake_up: WakeUp[Served] = WakeUp()
         self._published = Published(clock)
         self._publisher = None if publish is None else Publisher(network, publish, self._published)
@@ -72,6 +72,7 @@ class ZmqServerPort:
 
     def _request(self) -> list[Served]:
         """The next request, if the last one was answered."""
+        self.touched = True
         while self._asker is None and readable(self._socket):
             frames = receive(self._socket)
             parts = [frame.bytes for frame in frames]
@@ -90,7 +91,7 @@ class ZmqServerPort:
     def reply(self, frames: Sequence[bytes] | None) -> None:
         asker, self._asker = self._asker, None
         if asker is not None and frames is not None:
-            self.sent = True
+            self.touched = True
             send(self._socket, [*asker, *frames])
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
