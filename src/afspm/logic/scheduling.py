@@ -362,10 +362,10 @@ class SchedulerCore:
         """Save, act and tell, in this order, before whoever asked is answered."""
         after = self._control
         self._lease.held_by(after.holder, now_ns)
-        self._cache.not_before(now_ns)
         wanted: list[str] = []
         if row.cause is not None and (before.holder is not None or row.cause is Cause.MANUAL):
             wanted = self._watchdog.control_taken(row.cause, self._action_in_flight())
+        publish = self._stamp_control(now_ns) if after.published() != before.published() else None
         self._effects.append(SaveState(self.snapshot()))
         self._log("INFO", _said(before, after, ask, row, self._rules))
         for action in wanted:
@@ -373,8 +373,8 @@ class SchedulerCore:
         if before.holder is not None and after.holder is None:
             self._call_back(before.holder, row.cause)
         self._send_own(now_s)
-        if after.published() != before.published():
-            self._publish_control(now_ns)
+        if publish is not None:
+            self._effects.append(publish)
 
     def _call_back(self, former: str, cause: Cause | None) -> None:
         """Commands of a former holder that have not been sent are not sent any more."""
@@ -387,10 +387,15 @@ class SchedulerCore:
         return str(flight.request.subject) if flight is not None and flight.request.kind == _ACTION else None
 
     def _publish_control(self, now_ns: int) -> None:
+        publish = self._stamp_control(now_ns)
+        self._effects += [SaveState(self.snapshot()), publish]
+
+    def _stamp_control(self, now_ns: int) -> Publish:
+        """The control state as a packet, which has its time before it is published: that is saved first."""
         self._announce_at_s = None
         payload = self._codec.encode_control_state(self._control.published())
         packet, cached = self._cache.stamp(CONTROL_STATE, payload, now_ns)
-        self._effects.append(Publish(packet, None, cached))
+        return Publish(packet, None, cached)
 
     def _holder_dead_at_s(self) -> float | None:
         """When the holder is given up, if it does not come back; None if it is there, or nobody is in control."""

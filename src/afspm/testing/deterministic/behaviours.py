@@ -36,7 +36,7 @@ class Experiment(Client):
         response = yield from self.ask(ControlRequest.REQUEST_CTRL, int(solving))
         if response.code == _OK:
             return True
-        yield from self.until(lambda: self.control != before, self.some(60.0))
+        yield from self.until(lambda: self.control != before, self.some(600.0))
         return False
 
     def scan(self) -> Doing:
@@ -169,7 +169,9 @@ class Dawn(Operator):
     """The person who comes in the morning and leaves everything to the components."""
 
     def behave(self) -> Doing:
-        yield from self.automated()
+        while True:
+            yield from self.automated()
+            yield from self.until(lambda: self.control.mode is ControlMode.MANUAL)
 
 
 class Stranger(Client):

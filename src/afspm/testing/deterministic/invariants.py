@@ -71,7 +71,7 @@ class Invariants:
         self._scheduler_since_s = 0.0
         self.components: list[Client] = []
         self.checks = 0
-        self._trace: deque[str] = deque(maxlen=_TRACE)
+        self._trace: deque[tuple[float, Input | None, tuple[Effect, ...]]] = deque(maxlen=_TRACE)
         self._holder: str | None = None
         self._held_since_s = 0.0
         self._absent_since_s: dict[str, float] = {}
@@ -267,9 +267,9 @@ class Invariants:
             f"{client.name} received {packet.envelope} at {packet.time_ns}, which nobody published",
         )
 
-    def has_all(self, client: Client, host: SchedulerHost) -> None:
-        """In calm weather a component has, of every envelope, what the cache holds."""
-        for packet, _ in host.core.cached():
+    def has_all(self, client: Client, cached: Sequence[Packet]) -> None:
+        """In calm weather a component has, of every envelope, what the cache held a moment ago."""
+        for packet in cached:
             have = client.newest.get(packet.envelope)
             self._must(
                 have is not None and have[0] >= (packet.time_ns or 0),
@@ -293,7 +293,7 @@ class Invariants:
 
     def _note(self, event: Input | None, effects: Sequence[Effect]) -> None:
         if effects or event is None:
-            self._trace.append(f"{self._timeline.monotonic_s():12.4f} {event} -> {list(effects)}"[:600])
+            self._trace.append((self._timeline.monotonic_s(), event, tuple(effects)))
 
     def _must(self, holds: bool, what: str) -> None:
         if not holds:
@@ -301,7 +301,7 @@ class Invariants:
 
     def fail(self, what: str) -> None:
         """Say what was violated, and what led to it."""
-        trace = "\n".join(self._trace)
+        trace = "\n".join(f"{time_s:12.4f} {event} -> {list(effects)}"[:600] for time_s, event, effects in self._trace)
         raise InvariantViolated(f"at {self._timeline.monotonic_s():.4f} s: {what}\n{trace}")
 
 

@@ -100,12 +100,6 @@ class FakeMicroscope(Process):
         self._publish("ScanParameters2d", "the region")
         self._publish_state(self.state)
 
-    def ended(self) -> None:
-        for line in list(self._lines):
-            line.cut()
-        for feed in list(self._feeds):
-            feed.cut()
-
     # --- as a server ---
 
     def peer_connected(self, line: ControlLine) -> None:

@@ -32,6 +32,10 @@ class Host(Protocol):
 
     @property
     def alive(self) -> bool: ...
+    @property
+    def sockets(self) -> dict[Any, None]:
+        """The lines that end here; they break when it dies."""
+
     def take(self, do: Callable[..., None], *args: Any) -> None:
         """Call `do(*args)` now, later if the process is frozen, never if this life of it ends first."""
 
@@ -128,6 +132,7 @@ class ControlLine:
         there, back = self._there, self._back
         self._there = self._back = None
         there.open = back.open = False
+        self._server.sockets.pop(self, None)
         self._server.take(self._server.peer_disconnected, self)
         self._client.take(self._client.line_down, self)
         self._retry()
@@ -149,6 +154,7 @@ class ControlLine:
             return
         self._there = Pipe(self._timeline, self._weather, self._server)
         self._back = Pipe(self._timeline, self._weather, self._client)
+        self._server.sockets[self] = None
         self._there.send(self._server.peer_connected, self)
         self._back.send(self._client.line_up, self)
 
@@ -205,6 +211,7 @@ class Feed:
         self._there.open = self._back.open = False
         self._there = self._back = None
         self._joined = False
+        self._publisher.sockets.pop(self, None)
         self._publisher.take(self._publisher.left, self)
         if not self._closed:
             self._timeline.after(self._weather.reconnect_s * (0.5 + self._timeline.random.random()), self._try)
@@ -221,6 +228,7 @@ class Feed:
             return
         self._there = Pipe(self._timeline, self._weather, self._publisher)
         self._back = Pipe(self._timeline, self._weather, self._listener)
+        self._publisher.sockets[self] = None
         self._there.send(self._join, self._listener.since_ns(self), self._back)
 
     def _join(self, since_ns: int, back: Pipe) -> None:

@@ -124,8 +124,9 @@ def plan(seed: int, hours: float = 8.0) -> Plan:
 
 @dataclass
 class Outcome:
-    """What came of a night."""
+    """What came of a night: experiment hours, scans, steps of the scheduler."""
 
+    hours: float
     scans: int
     scans_in_calm: int
     steps: int
@@ -216,7 +217,8 @@ class Night:
         timeline.run_until(length_s + calm_s)
         done = self.microscope.scans_done
         self._come_right(done - before)
-        return Outcome(done, done - before, self.invariants.checks, self.keeper.given_up)
+        hours = timeline.monotonic_s() * plan.speed / 3600.0
+        return Outcome(hours, done, done - before, self.invariants.checks, self.keeper.given_up)
 
     # --- what befalls them ---
 
@@ -266,10 +268,12 @@ class Night:
         """In calm weather the experiment goes on, and everybody has what the cache holds."""
         if not self.keeper.given_up and scans == 0:
             self.invariants.fail(f"nothing was scanned in the calm; control: {self.scheduler.core.control}")
+        cached = [packet for packet, _ in self.scheduler.core.cached()]
+        self.timeline.run_until(self.timeline.monotonic_s() + 1.0)
         for client in self.components.values():
             settled = self.timeline.monotonic_s() - max(client.since_s, self.scheduler.since_s) > _SETTLED_S
             if client.alive and self.scheduler.alive and settled:
-                self.invariants.has_all(client, self.scheduler)
+                self.invariants.has_all(client, cached)
 
 
 def _settings(plan: Plan) -> SchedulerSettings:

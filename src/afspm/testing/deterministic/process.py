@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from afspm.testing.deterministic.timeline import Timeline, Timer
+
+
+class Cuttable(Protocol):
+    """A connection that breaks when a process dies."""
+
+    def cut(self) -> None: ...
 
 
 class Process:
@@ -15,6 +21,7 @@ class Process:
         alive: there is a life.
         banned: it is not started any more.
         frozen: it does nothing, and what comes waits.
+        sockets: the connections that others have made to it, whether it has noticed or not.
         since_s: since when it has been at work: its start, or the end of its last freeze.
         step_age_s: for how long, by its own words, the current step has been running.
     """
@@ -29,6 +36,7 @@ class Process:
         self.banned = False
         self.since_s = 0.0
         self.exited: Callable[[int], None] = lambda code: None
+        self.sockets: dict[Cuttable, None] = {}
         self._waiting: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
 
     # --- for those who start and end it ---
@@ -50,6 +58,8 @@ class Process:
         self.alive = self.frozen = False
         self.life += 1
         self._waiting.clear()
+        for socket in list(self.sockets):
+            socket.cut()
         self.ended()
         self.exited(code)
 

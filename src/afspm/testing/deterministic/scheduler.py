@@ -114,10 +114,6 @@ class SchedulerHost(Process):
     def ended(self) -> None:
         self._link.close()
         self._from_translator.close()
-        for line in list(self._lines):
-            line.cut()
-        for feed in list(self._feeds):
-            feed.cut()
         if self._ticking is not None:
             self._ticking.cancel()
 
