@@ -7,7 +7,7 @@ import itertools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from afspm.transport.port import (
     ReplyReceived,
 )
 
+T = TypeVar("T")
 SOURCE = "memory://scheduler"
 EPOCH_S = 1_700_000_000.0
 SCAN_S = 100.0
@@ -221,9 +222,7 @@ class Lab:
     def _answer_once(self, request: Request) -> Response:
         if request.id and request.id in self.answers:
             return self.answers[request.id]
-        response = self._answer(request)
-        if response.ok:
-            self.answers[request.id] = response
+        response = self.answers[request.id] = self._answer(request)
         return response
 
     def _answer(self, request: Request) -> Response:
@@ -301,19 +300,53 @@ class Lab:
         self.publish(Spectrum(self.position.xy_m, "IV", ("U", "I"), ("V", "A"), values, self.clock.now_ns()))
 
 
-class LabPort:
-    """The port of the laboratory (a port's own `publish` is the component's, not the scheduler's)."""
+class Kill9(BaseException):
+    """The component is gone, in the middle of whatever it did."""
 
-    def __init__(self, lab: Lab) -> None:
+
+class LabPort:
+    """The port of the laboratory for one life of a component.
+
+    Killed at a call to the network, or from outside; then nothing it does on its way reaches anybody any more.
+
+    Args:
+        deadly_call: the number of the call that it does not survive.
+        is_late: whether that call has done its work.
+    """
+
+    def __init__(self, lab: Lab, deadly_call: int = 0, *, is_late: bool = False) -> None:
         self._lab = lab
         self.clock = lab.clock
-        self.send = lab.send
-        self.poll = lab.poll
-        self.publish = lab.publish_out
-        self.close = lab.close
+        self.calls = 0
+        self.is_dead = False
+        self._deadly_call, self._is_late = deadly_call, is_late
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        self._live(lambda: self._lab.send(frames))
+
+    def poll(self, timeout_s: float | None) -> list[Incoming]:
+        return self._live(lambda: self._lab.poll(timeout_s))
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        self._lab.publish_out(envelope, payload)
+
+    def close(self) -> None:
+        self._lab.close()
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
         raise NotImplementedError
+
+    def _live(self, work: Callable[[], T]) -> T:
+        self.calls += 1
+        is_struck = self.calls == self._deadly_call
+        if self.is_dead or (is_struck and not self._is_late):
+            self.is_dead = True
+            raise Kill9
+        done = work()
+        if is_struck or self.is_dead:
+            self.is_dead = True
+            raise Kill9
+        return done
 
 
 def context_of(lab: Lab, state_dir: Path | None = None, **launch: Any) -> Context:

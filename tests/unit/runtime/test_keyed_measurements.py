@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from runtime_lab import REGION, SCAN_S, SOURCE, Lab, LabPort
+from runtime_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 
 from afspm.errors import InvalidValue, NoResponse, Refused
 from afspm.logic.arbitration import Event
@@ -21,12 +19,15 @@ from afspm.runtime.scope import Scope
 TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
 
 
-class Kill9(BaseException):
-    """The component is gone, in the middle of whatever it did."""
+def scope_of(lab: Lab, folder: Path, life: int, port: LabPort | None = None) -> Scope:
+    return Scope(Link(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
 
 
-def scope_of(lab: Lab, folder: Path, life: int) -> Scope:
-    return Scope(Link(LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
+def kill_in(lab: Lab, seconds: float, port: LabPort) -> None:
+    def die() -> None:
+        port.is_dead = True
+
+    lab.at(seconds, die)
 
 
 def survey(scope: Scope) -> list[ScanSet]:
@@ -36,14 +37,11 @@ def survey(scope: Scope) -> list[ScanSet]:
 def survive(lab: Lab, folder: Path, kills_s: list[float], *, is_noticed: bool) -> list[ScanSet]:
     """Run the survey, kill it after each of `kills_s` (from the start of each life), and start it again."""
     for life, kill_s in enumerate([*kills_s, None]):
+        port = LabPort(lab)
         if kill_s is not None:
-
-            def die() -> None:
-                raise Kill9
-
-            lab.at(kill_s, die)
+            kill_in(lab, kill_s, port)
         try:
-            return survey(scope_of(lab, folder, life))
+            return survey(scope_of(lab, folder, life, port))
         except Kill9:
             if is_noticed:  # the scheduler takes control from the dead, and stops the scan
                 lab.does(Event.DEAD, lab.name)
@@ -75,35 +73,15 @@ def test_every_tile_is_scanned_exactly_once_whenever_it_is_killed(kills_s: list[
     assert lab.control.holder is None
 
 
-class DeadlyPort(LabPort):
-    """Kills the component at a certain call to the network, before or after that has done its work."""
-
-    def __init__(self, lab: Lab, deadly_call: int, *, is_late: bool) -> None:
-        super().__init__(lab)
-        self.calls = 0
-        self.send = lambda frames: self.strike(lambda: lab.send(frames))
-        self.poll = lambda timeout_s: self.strike(lambda: lab.poll(timeout_s))
-        self.deadly_call, self.is_late = deadly_call, is_late
-
-    def strike(self, work: Callable[[], Any]) -> Any:
-        self.calls += 1
-        if self.calls == self.deadly_call and not self.is_late:
-            raise Kill9
-        done = work()
-        if self.calls == self.deadly_call:
-            raise Kill9
-        return done
-
-
 @pytest.mark.parametrize("is_noticed", [True, False])
 @pytest.mark.parametrize("is_late", [True, False])
 def test_every_tile_is_scanned_exactly_once_at_whichever_step_it_is_killed(*, is_late: bool, is_noticed: bool) -> None:
     for deadly_call in range(1, 1000):
         lab = Lab()
         with TemporaryDirectory() as folder:
-            port = DeadlyPort(lab, deadly_call, is_late=is_late)
+            port = LabPort(lab, deadly_call, is_late=is_late)
             try:
-                survey(Scope(Link(port, lab.name, source=SOURCE, session="0"), state_dir=Path(folder)))
+                survey(scope_of(lab, Path(folder), 0, port))
                 break  # survived: all steps were tried
             except Kill9:
                 pass
@@ -123,13 +101,11 @@ def test_a_scan_that_went_on_during_the_death_is_taken_up_and_not_asked_for_agai
 
 def test_a_scan_that_was_finished_during_the_death_is_found_in_the_cache(tmp_path: Path) -> None:
     lab = Lab()
-
-    def die() -> None:
-        raise Kill9
-
-    lab.at(50.0, die)
+    port = LabPort(lab)
+    kill_in(lab, 50.0, port)
     with pytest.raises(Kill9):
-        survey(scope_of(lab, tmp_path, 0))
+        survey(scope_of(lab, tmp_path, 0, port))
+    lab.publish(lab.control.published())
     while lab._happenings:  # nobody takes what arrives
         lab.poll(1000.0)
     lab.restart_component()

@@ -81,3 +81,13 @@ def test_a_packet_larger_than_the_limit_is_kept_all_the_same() -> None:
     backlog.put(Packet("Scan2d", b"x" * 100, 1))
     backlog.put(Packet("Scan2d", memoryview(b"y" * 100), 2))
     assert [bytes(p.payload[:1]) for p in iter(backlog.take, None)] == [b"x", b"y"]
+
+
+def test_what_comes_later_does_not_overtake_what_waits_on_disk() -> None:
+    backlog = Backlog(limit_bytes=10)
+    for time_ns in range(3):  # the first in memory, the others on disk
+        backlog.put(Packet("Scan2d", b"x" * 8, time_ns))
+    first = backlog.take()
+    backlog.put(Packet("Scan2d", b"x", 3))  # there would be room for it in memory
+    assert first is not None
+    assert [first.time_ns, *(packet.time_ns for packet in iter(backlog.take, None))] == [0, 1, 2, 3]

@@ -204,6 +204,7 @@ def test_a_microscope_that_is_busy_is_waited_for(lab: Lab, scope: Scope) -> None
     scope.scan(REGION)
     assert lab.begun_scans == 1
     assert lab.clock.passed_s > 12.0 + SCAN_S
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) <= 4, "asked when it is free, not again and again"
 
 
 def test_a_lost_answer_repeats_the_request_with_its_id_and_executes_it_once(lab: Lab, scope: Scope) -> None:
@@ -335,13 +336,49 @@ def test_an_error_in_the_block_still_gives_control_back(lab: Lab, scope: Scope) 
 
 
 def test_an_old_control_state_is_not_taken_for_a_loss(lab: Lab, scope: Scope) -> None:
-    """Control was granted; a state published before that arrives only now."""
+    """Control was granted; a state from before that arrives only now."""
+
+    def grant_quietly(request: model.Request) -> Response | str:
+        if request.kind != ControlRequest.REQUEST_CTRL:
+            return "go on"
+        lab.at(0.5, lambda: lab.publish(model.ControlState(ControlMode.AUTOMATED, None, ())))
+        lab.at(0.6, lambda: lab.publish(lab.control.published()))
+        publish, lab.publish = lab.publish, lambda thing, envelope=None: None  # type: ignore[assignment,misc]
+        response = lab._answer(request)
+        lab.publish = publish  # type: ignore[method-assign]
+        return response
+
+    lab.intercept = grant_quietly
     with scope.control():
-        lab.publish(model.ControlState(ControlMode.AUTOMATED, None, ()))
-        assert scope.state is ScopeState.FREE
-        lab.control = lab.control
-    asked = lab.count(ControlRequest.REQUEST_CTRL)
-    assert asked <= 2
+        scope.scan(REGION)
+        assert scope.in_control
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 1
+
+
+def test_changes_that_leave_the_obstacle_are_no_reason_to_ask(lab: Lab, scope: Scope) -> None:
+    lab.flag(TIP)
+    for second in range(1, 9):
+        lab.at(second, lambda second=second: lab.flag(second + 10))  # type: ignore[misc]
+        lab.at(second + 0.5, lambda second=second: lab.clear(second + 10))  # type: ignore[misc]
+    lab.at(9.5, lambda: lab.clear(TIP))
+    scope.scan(REGION)
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 2
+
+
+def test_a_scheduler_that_is_restarted_again_and_again_is_waited_for(lab: Lab, scope: Scope) -> None:
+    lives: list[str] = []
+
+    def dies(request: model.Request) -> str | None:
+        lives.append(request.id)
+        if len(lives) > 8:
+            return "go on"
+        lab.at(0.1, lab.disconnect)
+        lab.at(2.0, lab.connect)
+        return None
+
+    lab.intercept = dies
+    scope.flag(TIP)
+    assert len(set(lives)) == 1
 
 
 def test_a_spectrum_is_taken_where_it_was_asked_for(lab: Lab, scope: Scope) -> None:
