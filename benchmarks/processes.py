@@ -30,13 +30,14 @@ class Roles(ExitStack):
         assert process.stdout is not None
         return process.stdout.readline().strip()
 
-    def scheduler(self, translator_publish: str, translator_serve: str) -> tuple[str, str]:
+    def scheduler(self, translator_publish: str, translator_serve: str, **settings: Any) -> tuple[str, str]:
         """The real scheduler, which keeps its state on disk; returns the addresses (publish, serve)."""
         folder = self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
         publish, serve = PORTS.address(), PORTS.address()
         launch = Launch(
             "scheduler",
             "afspm.scheduler.Scheduler",
+            settings,
             sockets=Sockets(publish, (translator_publish,), serve, translator_serve),
             state_dir=folder,
             log_level="ERROR",

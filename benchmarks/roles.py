@@ -111,5 +111,19 @@ def our_subscriber(source: str, tally: str, name: str) -> None:
                 told.add(len(incoming.packet.payload))
 
 
+def bare_replayer(count: int, size: int) -> None:
+    """Sends so many messages to everyone who subscribes."""
+    socket: Any = zmq.Context.instance().socket(zmq.XPUB)
+    socket.setsockopt(zmq.XPUB_VERBOSE, 1)
+    ready(bound(socket))
+    payload, stamp = bytes(size), wire.encode_time(1)
+    while True:
+        if socket.recv().startswith(b"\1"):
+            for _ in range(count):
+                socket.send(b"Scan2d", zmq.SNDMORE)
+                socket.send(payload, zmq.SNDMORE, copy=False)
+                socket.send(stamp)
+
+
 if __name__ == "__main__":
     globals()[sys.argv[1]](**json.loads(sys.argv[2]))
