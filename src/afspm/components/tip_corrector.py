@@ -18,7 +18,6 @@ from afspm.runtime.events import Events
 from afspm.units import Duration, Length, Speed, Voltage
 
 VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
-MOST_LOOKS = 3  # test scans after one treatment, while the verdict is unclear or more good ones are wanted
 DONE_ACTION = "ActionMsg"
 _REGION_PARAMETERS = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
 
@@ -37,8 +36,9 @@ class TipCorrector(Component):
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
-        test_center: (x, y) of the middle of the test scans; by default that of the experiment's own scans: nowhere else
-            is it known as well what a good tip shows.
+        test_center: (x, y) of a first test scan, so that a tip that is worse stays off the experiment's region.
+            Whether it is good is seen best in that region, which is known; there it is tested next, or at once if no
+            place is given here.
         pulse_voltages: those of one repair, in order.
         pulse_duration: of each pulse.
         crash_depths: those of one repair, in order, after the pulses.
@@ -117,13 +117,14 @@ class TipCorrector(Component):
             self._give_up("the microscope does not say where the experiment scans: no place is known to be safe")
             return
         test = region if self.test_center is None else region.moved_to(self.test_center)
+        looks = (test, region, region) if self.test_center else (region,) * 3
         tried = int(self.memory.get("tried", 0))
         self.log.info("repairing the tip%s", f" ({tried} treatments were tried already)" if tried else "")
         with self.scope.events("ControlState", verdicts.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
-            if tried and self._is_cured(test, shape, answers):  # a kill may have come between treatment and test
+            if tried and self._is_cured(looks, shape, answers):  # a kill may have come between treatment and test
                 return
             for treatment in self.allowed[tried:]:
-                if self._treat(treatment, (region, test)) and self._is_cured(test, shape, answers):
+                if self._treat(treatment, (region, test)) and self._is_cured(looks, shape, answers):
                     self.log.info("the tip is repaired")
                     return
         self._restore(region)
@@ -176,10 +177,10 @@ class TipCorrector(Component):
             self.scope.set(names.CRASH_DEPTH, treatment.depth_m, "m")
             self.scope.set(names.CRASH_SPEED, treatment.speed_m_per_s, "m/s")
 
-    def _is_cured(self, test: Region, shape: tuple[int, int] | None, answers: Events) -> bool:
+    def _is_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
         """Test scans until it is known whether the tip is good."""
-        for _ in range(MOST_LOOKS):
-            scans = self.scope.scan(test, shape=shape)
+        for place in looks:
+            scans = self.scope.scan(place, shape=shape)
             score = self._own_score(scans) if self.judge is not None else self._score_of_others(scans, answers)
             if not self._is_flagged(self.problem):
                 return True

@@ -156,15 +156,20 @@ class World:
 
     # -- treating the tip
 
-    def pulse(self, voltage_v: float, duration_s: float, t_s: float) -> str:
-        """A bias pulse where the tip stands: may cure or worsen it, and leaves a little mound.
+    def pulse(
+        self, voltage_v: float, duration_s: float, t_s: float, position_m: tuple[float, float] | None = None
+    ) -> str:
+        """A bias pulse: may cure or worsen the tip, and leaves a little mound.
+
+        Args:
+            position_m: where the tip was moved to; None: where it measured last.
 
         Returns:
             "cured", "worsened" or "unchanged".
         """
         if not (math.isfinite(voltage_v) and math.isfinite(duration_s) and duration_s > 0):
             raise InvalidValue(f"a pulse of {voltage_v} V for {duration_s} s", hint="finite, and longer than nothing")
-        call = self._begin(t_s, self._at_m)
+        call = self._begin(t_s, self._at_m if position_m is None else position_m)
         s = self.settings.tip_changes
         strength = max(0.0, abs(voltage_v) / s.pulse_threshold_v - 1.0) if s.pulse_threshold_v else 1.0
         if strength == 0.0:

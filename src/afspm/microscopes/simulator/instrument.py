@@ -205,12 +205,14 @@ class Instrument:
             self._note(now_s, f"{doing['what']} stopped", {})
 
     def pulse(self, now_s: float) -> None:
-        """A bias pulse where the tip is."""
+        """A bias pulse where the probe is."""
         self._prepare()
         values = self._si(self._kept["values"])
+        position_m = (float(values[names.PROBE_POS_X]), float(values[names.PROBE_POS_Y]))
         voltage_v, duration_s = float(values[names.PULSE_VOLTAGE]), float(values[names.PULSE_DURATION])
-        outcome = self._world.pulse(voltage_v, duration_s, now_s)
-        self._treated("pulse", now_s, duration_s, {"voltage_v": voltage_v, "outcome": outcome})
+        outcome = self._world.pulse(voltage_v, duration_s, now_s, position_m)
+        facts = {"voltage_v": voltage_v, "position_m": position_m, "outcome": outcome}
+        self._treated("pulse", now_s, duration_s, facts)
 
     def crash(self, now_s: float) -> None:
         """Drive the tip into the sample where the probe is, and out again."""
@@ -219,7 +221,8 @@ class Instrument:
         position_m = (float(values[names.PROBE_POS_X]), float(values[names.PROBE_POS_Y]))
         speed_m_s, depth_m = float(values[names.CRASH_SPEED]), float(values[names.CRASH_DEPTH])
         outcome = self._world.crash(position_m, speed_m_s, now_s)
-        self._treated("crash", now_s, 2.0 * depth_m / speed_m_s, {"position_m": position_m, "outcome": outcome})
+        facts = {"position_m": position_m, "speed_m_per_s": speed_m_s, "depth_m": depth_m, "outcome": outcome}
+        self._treated("crash", now_s, 2.0 * depth_m / speed_m_s, facts)
 
     def retract(self, now_s: float) -> None:
         """Take the tip away from the sample, whatever is going on."""
