@@ -29,7 +29,8 @@ def main(arguments: list[str]) -> int:
         return ExitCode.CONFIG
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=sys.platform != "win32")
+        # in our process group, so that a supervisor who kills us, or finds us killed, sweeps the command away too
+        child = subprocess.Popen(command, stdin=subprocess.PIPE)
     except (OSError, ValueError) as error:
         sys.stderr.write(f"ERROR {command[0]} can't be started: {error} (is it installed and executable?)\n")
         return ExitCode.CONFIG
@@ -38,7 +39,7 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGTERM, lambda *_: guard.end_soon())
     threading.Thread(target=guard.pass_on, name="stdin", daemon=True).start()
     code = child.wait()
-    guard.kill_group()
+    guard.sweep()
     if guard.ending and code < 0:  # it did not end by itself: that it was stopped is what counts
         return ExitCode.ORPHAN
     return 128 - code if code < 0 else code
@@ -49,6 +50,7 @@ class _Guard:
 
     def __init__(self, child: subprocess.Popen[bytes]) -> None:
         self._child = child
+        self._parent = os.getppid()
         self.ending = False
 
     def pass_on(self) -> None:
@@ -65,11 +67,10 @@ class _Guard:
         """End the child from a signal handler, which must not wait."""
         threading.Thread(target=self._end, name="end", daemon=True).start()
 
-    def kill_group(self) -> None:
-        """End what the command itself has started and left behind."""
-        if sys.platform != "win32":
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._child.pid, signal.SIGKILL)
+    def sweep(self) -> None:
+        """End what the command has started and left behind, if our parent is dead; else that is the parent's to do."""
+        if sys.platform != "win32" and os.getppid() != self._parent and os.getpgrp() == os.getpid():
+            os.killpg(0, signal.SIGKILL)  # us too: nobody is there to be told the exit code
 
     def _end(self) -> None:
         self.ending = True

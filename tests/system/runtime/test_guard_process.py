@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -19,11 +18,6 @@ ECHO = "import sys; print(sys.stdin.readline().strip(), flush=True); print('eof'
 DEAF = (
     "import signal, threading; print('deaf', flush=True); "
     "signal.signal(signal.SIGTERM, signal.SIG_IGN); threading.Event().wait()"
-)
-PARENT = (
-    "import subprocess, sys; "
-    "p = subprocess.Popen([sys.executable, '-c', 'import threading; threading.Event().wait()']); "
-    "print(p.pid, flush=True); sys.stdin.read()"
 )
 
 
@@ -61,15 +55,6 @@ def test_a_guard_that_is_terminated_takes_its_command_along(start: Any) -> None:
     assert child.exit_code() == ExitCode.ORPHAN
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="process groups of Unix")
-def test_what_the_command_has_started_does_not_outlive_it(start: Any) -> None:
-    child = start([*GUARD, *python(PARENT)], "{}")
-    grandchild = int(child.lines.get(timeout=20.0))
-    child.let_go()
-    child.exit_code()
-    assert gone(lambda: _is_running(grandchild))
-
-
 def test_a_crash_is_a_crash(start: Any) -> None:
     child = start([*GUARD, *python("import os; os.abort()")], "{}")
     assert child.exit_code() not in (ExitCode.DONE, ExitCode.ENDED, ExitCode.ORPHAN, ExitCode.CONFIG)
@@ -80,24 +65,3 @@ def test_what_can_not_be_started_is_told(start: Any, command: list[str]) -> None
     child = start([*GUARD, *command], "{}")
     assert child.exit_code() == ExitCode.CONFIG
     assert child.error_text.startswith("ERROR ")
-
-
-def gone(is_there: Callable[[], bool]) -> bool:
-    end_s = CLOCK.monotonic_s() + 10.0
-    while CLOCK.monotonic_s() < end_s:
-        if not is_there():
-            return True
-    return False
-
-
-def _is_running(pid: int) -> bool:
-    """Whether a process is there and no zombie that nobody has buried yet."""
-    import os
-    from pathlib import Path
-
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    status = Path(f"/proc/{pid}/stat")
-    return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")

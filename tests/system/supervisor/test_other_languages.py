@@ -1,0 +1,79 @@
+"""Commands of other languages end with the guard that runs them, however that ends, and so does what they start."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from queue import Queue
+
+import pytest
+from supervisor_lab import DEADLINE_S
+
+from afspm.supervisor.process import ChildEvent, ChildProcess, Exited
+from afspm.supervisor.task import GUARD
+
+# a command that listens to nobody, with a child of its own that doesn't either; each calls us for as long as it lives
+DEAF = "import socket; socket.create_connection(('127.0.0.1', {port})).recv(1)"
+FAMILY = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', {child!r}]); {child}"
+SUPERVISOR = (
+    "import subprocess, sys; "
+    "p = subprocess.Popen({command!r}, stdin=subprocess.PIPE, start_new_session=True); p.stdin.write(b'{{}}\\n'); "
+    "p.stdin.flush(); sys.stdin.read()"
+)
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="process groups")
+
+
+class Family:
+    """A guarded command and its child, as seen from here: by the connection that each of them holds."""
+
+    def __init__(self, server: socket.socket) -> None:
+        self._server = server
+        self._calls: list[socket.socket] = []
+        child = DEAF.format(port=server.getsockname()[1])
+        self.command = [sys.executable, "-m", GUARD, "--", sys.executable, "-c", FAMILY.format(child=child)]
+
+    def wait_there(self) -> None:
+        for _ in range(2):
+            call, _address = self._server.accept()
+            call.settimeout(DEADLINE_S)
+            self._calls.append(call)
+
+    def wait_gone(self) -> None:
+        for call in self._calls:
+            with call:
+                assert call.recv(1) == b""  # closed by the system: that process is no more
+
+
+@pytest.fixture
+def family(calls: socket.socket) -> Family:
+    return Family(calls)
+
+
+def test_when_the_guard_is_asked_to_end(family: Family) -> None:
+    events: Queue[ChildEvent] = Queue()
+    guard = ChildProcess("foreign", family.command, "{}", events.put, {})
+    family.wait_there()
+    guard.close_stdin()
+    family.wait_gone()
+    assert events.get(timeout=DEADLINE_S) == Exited("foreign", guard.pid, 81)
+
+
+def test_when_the_guard_is_killed(family: Family) -> None:
+    events: Queue[ChildEvent] = Queue()
+    guard = ChildProcess("foreign", family.command, "{}", events.put, {})
+    family.wait_there()
+    os.kill(guard.pid, signal.SIGKILL)  # the guard alone
+    family.wait_gone()
+    assert events.get(timeout=DEADLINE_S) == Exited("foreign", guard.pid, -signal.SIGKILL)
+
+
+def test_when_the_supervisor_is_killed(family: Family) -> None:
+    code = SUPERVISOR.format(command=family.command)
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as supervisor:
+        family.wait_there()
+        supervisor.kill()
+    family.wait_gone()
