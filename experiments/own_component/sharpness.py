@@ -10,12 +10,12 @@ class Sharpness(Component):
 
     listens = ("Scan2d",)
 
-    def __init__(self, threshold: float = 0.5, channel: str = "Height"):
+    def __init__(self, threshold: float = 0.8, channel: str = "Height"):
         self.threshold, self.channel = threshold, channel
 
     def on_scan(self, scan):
         if scan.channel == self.channel:
-            sharpness = float(np.abs(np.diff(scan.values, axis=1)).mean())
+            sharpness = float(np.percentile(np.abs(np.diff(scan.values, axis=1)), 99))  # how steep the edges are
             first = self.memory.setdefault("first", sharpness)
             self.memory.save()
             if sharpness < self.threshold * first:
