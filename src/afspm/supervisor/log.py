@@ -7,7 +7,7 @@ import logging
 import re
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TextIO
@@ -47,24 +47,31 @@ class LineReader:
 
 
 class RunLog:
-    """Writes every line to `file`, and those of `level` and above to the terminal.
+    """Writes every line to `file`, and those of `level` and above to the terminal; `names` are made equally wide.
 
     A terminal that has gone away is no reason to end a measurement: what can't be written there is still in the file.
     """
 
-    def __init__(self, file: Path, clock: Clock, *, terminal: TextIO | None = None, level: int = logging.INFO) -> None:
+    def __init__(
+        self,
+        file: Path,
+        clock: Clock,
+        *,
+        terminal: TextIO | None = None,
+        level: int = logging.INFO,
+        names: Iterable[str] = (),
+    ) -> None:
         self._file = file.open("a", encoding="utf-8", errors="replace")
         self._clock = clock
         self._wall = ExperimentClock.real()
         self._level = level
         terminal = terminal or sys.stdout
         self._show = _coloured(terminal) if terminal.isatty() else _plain(terminal)
-        self._widest = len(SUPERVISOR)
+        self._widest = max(map(len, (SUPERVISOR, *names)))
 
     def write(self, name: str, level: int, text: str) -> None:
         """One line of the process `name`; `level` is that of `logging`."""
         wall = datetime.fromtimestamp(self._wall.now_s()).astimezone()
-        self._widest = max(self._widest, len(name))
         with contextlib.suppress(OSError, ValueError):  # a full disk must not end the run from here
             stamp = f"{wall:%Y-%m-%d %H:%M:%S}.{wall.microsecond // 1000:03d}{self._experiment_time()}"
             self._file.write(f"{stamp} {logging.getLevelName(level):8} {name:{self._widest}} {text}\n")

@@ -123,16 +123,23 @@ class ChildProcess:
                 self._tell(Printed(self.name, self.pid, stream, text))
 
 
+_IN_WORDS = {
+    ExitCode.DONE: "done",
+    ExitCode.CRASHED: "crashed",
+    ExitCode.CONFIG: "its settings can't work",
+    ExitCode.ENDED: "the experiment has ended",
+    ExitCode.ORPHAN: "as it was asked to",
+}
+
+
 def describe_exit(code: int) -> str:
-    """What an exit code says, in words."""
-    if code in set(ExitCode):
-        return f"ended ({ExitCode(code).name.lower()})"
+    """Why a process ended, as its exit code says."""
     if code < 0:
         try:
             return f"killed by {signal.Signals(-code).name}"
         except ValueError:
             return f"killed by signal {-code}"
-    return f"ended with exit code {code}"
+    return next((words for known, words in _IN_WORDS.items() if known == code), f"exit code {code}")
 
 
 def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path | None) -> subprocess.Popen[bytes]:

@@ -57,9 +57,10 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     """
     experiment.require_valid()
     clock = _clock(experiment, options.speed)
-    _starts(experiment, options, clock, FreePorts())  # whatever is wrong is told before a folder is made
+    # whatever is wrong is told before a folder is made
+    names = [start.launch.name for start in _starts(experiment, options, clock, FreePorts())]
     folder = run_folder.create(options.runs, experiment.name, _now())
-    log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level)
+    log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:
         starts = _starts(experiment, options, clock, FreePorts(), folder)
         run_folder.write_experiment(folder, experiment.expanded())

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from afspm.supervisor.supervisor import Outcome
+
+TABLE = "metadata.csv"  # of the component Metadata
 
 
 def lines(outcome: Outcome, folder: Path) -> list[str]:
@@ -18,8 +22,20 @@ def lines(outcome: Outcome, folder: Path) -> list[str]:
             told.append(f"{report.name} was restarted {_times(report.starts - 1)}")
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
+    told += _measured(folder / TABLE)
     told.append(f"everything is in {folder}")
     return told
+
+
+def _measured(table: Path) -> list[str]:
+    """What the table of measurements counts, where the experiment kept one; a scan's channels are one scan."""
+    try:
+        with table.open(encoding="utf-8", newline="") as file:
+            rows = {(row.get("measurement"), row.get("time")) for row in csv.DictReader(file)}
+    except (OSError, ValueError, csv.Error):
+        return []
+    counts = Counter(measurement for measurement, _ in rows)
+    return [f"measured: {counts['scan']} scans, {counts['spectrum']} spectra"]
 
 
 def _times(count: int) -> str:

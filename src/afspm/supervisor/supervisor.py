@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 from afspm.clock import Clock
 from afspm.errors import AfspmError
+from afspm.experiment import Role
 from afspm.logic import supervision
 from afspm.runtime.exit_codes import ExitCode
 from afspm.supervisor import signals
@@ -148,7 +149,7 @@ class Supervisor:
         child.process = None
         child.last_exit = describe_exit(exited.code)
         if self._ending is not None:
-            self._log.write(child.name, logging.DEBUG, child.last_exit)
+            self._log.write(child.name, logging.DEBUG, f"ended: {child.last_exit}")
             return
         self._carry_out(child, child.watch.exited(exited.code, self._clock.monotonic_s(), child.last_exit))
         if exited.code == ExitCode.ENDED:
@@ -212,7 +213,7 @@ class Supervisor:
     def _give_up(self, child: _Child, why: str) -> None:
         child.given_up = True
         if child.task.essential:
-            self._end(Why.LOST, f"{child.name}, which the experiment can't do without, is given up: {why}")
+            self._end(Why.LOST, f"{child.name} is given up, and the experiment can't go on without it: {why}")
         else:
             self._log.write(SUPERVISOR, logging.CRITICAL, f"{child.name} is given up, the rest goes on: {why}")
 
@@ -222,6 +223,9 @@ class Supervisor:
             self._ending = Ending.begin(why, text, now_s)
             for child in self._children.values():
                 child.watch.stop(now_s)
+                # the signal that the experiment has ended is the scheduler's, whom a translator does not listen to
+                if child.task.role is Role.TRANSLATOR and child.process:
+                    child.process.close_stdin()
             self._log.write(SUPERVISOR, logging.INFO if why is not Why.LOST else logging.CRITICAL, text)
 
     def _go_on_ending(self, ending: Ending, now_s: float) -> None:

@@ -79,4 +79,4 @@ def test_without_a_microscope_the_run_ends_and_says_so(run: Run) -> None:
     one.wait_for("scan 1 of 1000")
     one.signal("microscope", signal.SIGKILL)
     assert one.end() == 1, one.output
-    one.wait_for("CRITICAL microscope, which the experiment can't do without, is given up")
+    one.wait_for("CRITICAL microscope is given up, and the experiment can't go on without it")

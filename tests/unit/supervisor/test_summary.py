@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from afspm.supervisor.ending import Why
+from afspm.supervisor.summary import lines
+from afspm.supervisor.supervisor import Outcome, Report
+
+REPORTS = (
+    Report("scheduler", starts=1, given_up=False, last_exit="the experiment has ended"),
+    Report("series", starts=3, given_up=False, last_exit="done"),
+    Report("hopeless", starts=2, given_up=True, last_exit="crashed"),
+)
+
+
+def test_it_says_what_ran_what_was_restarted_and_what_was_given_up(tmp_path: Path) -> None:
+    told = lines(Outcome(Why.EXPERIMENT_ENDED, "the experiment has ended", REPORTS, 3725.0), tmp_path)
+    assert told == [
+        "the experiment has ended, after 1 h 2 min",
+        "ran: scheduler, series, hopeless",
+        "series was restarted twice",
+        "hopeless was restarted once",
+        "hopeless was GIVEN UP: crashed",
+        f"everything is in {tmp_path}",
+    ]
+
+
+def test_a_scan_of_two_channels_is_one_scan(tmp_path: Path) -> None:
+    rows = ["time,measurement,channel", "t1,scan,Height", "t1,scan,Phase", "t2,scan,Height", "t3,spectrum,IV"]
+    (tmp_path / "metadata.csv").write_text("\n".join(rows), encoding="utf-8")
+    told = lines(Outcome(Why.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)
+    assert "measured: 2 scans, 1 spectra" in told
+
+
+def test_a_table_that_can_not_be_read_is_no_reason_to_fail(tmp_path: Path) -> None:
+    (tmp_path / "metadata.csv").write_bytes(b"\xff\xfe\x00,\x00")
+    assert lines(Outcome(Why.STOPPED, "", (), 1.0), tmp_path)[-1] == f"everything is in {tmp_path}"
