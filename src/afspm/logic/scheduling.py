@@ -555,8 +555,6 @@ class SchedulerCore:
     # --- time ---
 
     def _on_tick(self, event: Tick, now_s: float, now_ns: int) -> None:
-        for settled in self._forwarder.expire(now_s):
-            self._settle(settled, now_s, now_ns)
         if self._announce_at_s is not None and now_s >= self._announce_at_s:
             self._publish_control(now_ns)
         dead_at_s, holder = self._holder_dead_at_s(), self._control.holder
@@ -565,6 +563,8 @@ class SchedulerCore:
         lease_ns, holder = self._lease.deadline_ns(), self._control.holder
         if holder is not None and lease_ns is not None and now_ns >= lease_ns:
             self._arbitrate(Ask(Event.IDLE, holder), None, now_s, now_ns)
+        for settled in self._forwarder.expire(now_s):
+            self._settle(settled, now_s, now_ns)
 
     # --- telling people ---
 
