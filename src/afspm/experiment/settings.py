@@ -13,6 +13,7 @@ from typing import Any
 
 import pydantic
 
+from afspm.experiment import classes
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, closest, nearest
 from afspm.experiment.sections import report
@@ -83,7 +84,9 @@ def jsonable(value: Any, folder: Path) -> Any:
 def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document, findings: Findings) -> Any:
     folder = document.folder_of(*path)
     if _is_object(value):
-        return jsonable(value, folder)  # an intermediary class of the user, made by the process itself
+        return _object(value, path, document, findings)
+    if isinstance(value, list) and any(map(_is_object, value)):
+        return [_value(Any, item, path, document, findings) for item in value]
     try:
         adapter = pydantic.TypeAdapter(annotation, config=None if _has_own_config(annotation) else _TYPES)
     except pydantic.PydanticUndefinedAnnotation:
@@ -94,6 +97,21 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
         for one in error.errors(include_url=False):
             report(one, path, document, findings)
         return jsonable(value, folder)
+
+
+def _object(value: dict[str, Any], path: tuple[str, ...], document: Document, findings: Findings) -> dict[str, Any]:
+    """An intermediary class of the user's own: checked here, made by the process."""
+    settings = {key: item for key, item in value.items() if key != "class"}
+    place = document.place(*path)
+    try:
+        wanted = classes.load(value["class"])
+    except classes.Unloadable as error:
+        findings.error(f"[{path[0]}] {'.'.join(path[1:])} class: {error.what}", place, error.hint)
+        return {"class": value["class"]}
+    if not isinstance(wanted, type):
+        findings.error(f"[{path[0]}] {'.'.join(path[1:])}: {value['class']} is not a class", place)
+        return {"class": value["class"]}
+    return {"class": value["class"], **check(wanted, settings, path, document, findings)}
 
 
 def _is_object(value: Any) -> bool:

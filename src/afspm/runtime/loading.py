@@ -21,7 +21,7 @@ def load(launch: Launch) -> Process:
     class_ = find_class(launch.class_, launch.name)
     _check_settings(class_, launch)
     try:
-        made = class_(**launch.settings)
+        made = class_(**{name: made_of(value, launch.name) for name, value in launch.settings.items()})
     except AfspmError as error:
         where = f"{launch.name}: {error.where}" if error.where else launch.name
         raise ConfigError(error.what, where=where, hint=error.hint) from error
@@ -32,6 +32,19 @@ def load(launch: Launch) -> Process:
             hint="derive it from afspm.runtime.component.Component",
         )
     return made
+
+
+def made_of(value: Any, where: str) -> Any:
+    """A setting; a table in it with a `class` (an intermediary class of the experiment file) as the object it means."""
+    if isinstance(value, list | tuple):
+        return [made_of(item, where) for item in value]
+    if not isinstance(value, dict):
+        return value
+    inside = {key: made_of(item, where) for key, item in value.items()}
+    path = inside.pop("class", None)
+    if isinstance(path, str):
+        return find_class(path, where)(**inside)
+    return inside if path is None else {"class": path, **inside}
 
 
 def find_class(path: str, where: str) -> type[Any]:

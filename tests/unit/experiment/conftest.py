@@ -58,6 +58,16 @@ class Anything(Component):
     def __init__(self, **settings): ...
 
 
+class Plan:
+    def __init__(self, size: Length, rounds: int = 1):
+        self.size, self.rounds = size, rounds
+
+
+class Planner(Component):
+    def __init__(self, plan: Plan, more: list[Plan] | None = None):
+        self.plan, self.more = plan, more
+
+
 class Derived(Scanner):
     def __init__(self, extra: int = 0, **settings):
         super().__init__(**settings)

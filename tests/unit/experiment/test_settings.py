@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from afspm.runtime import loading
+from afspm.runtime.launch import Launch
 
 from .conftest import Write, errors, line_of, only_error
 
@@ -136,3 +140,42 @@ def test_modules_of_two_experiments_with_the_same_name_are_kept_apart(write: Wri
     assert "'first'" in only_error(write(text)).what
     (tmp_path / "own.py").write_text(own.format("another"))
     assert "'another'" in only_error(write(text)).what
+
+
+OBJECT = """
+scan_size = "2 um"
+[my_plan]
+class = "parts.Plan"
+size = "scan_size"
+[planner]
+component = true
+class = "parts.Planner"
+plan = "my_plan"
+more = ["my_plan"]
+"""
+
+
+def test_an_intermediary_class_of_one_s_own_is_made_by_the_process(
+    write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = write(OBJECT)
+    assert experiment.check() == []
+    settings = experiment.resolved.settings["planner"]
+    assert settings == {"plan": {"class": "parts.Plan", "size": 2e-6}, "more": [settings["plan"]]}
+    monkeypatch.syspath_prepend(tmp_path)
+    made: Any = loading.load(Launch("planner", "parts.Planner", json.loads(json.dumps(settings))))
+    assert (made.plan.size, made.plan.rounds, made.more[0].size) == (2e-6, 1, 2e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('size = "scan_size"', 'size = "2 V"', "V can't be converted to m"),
+        ("size = ", "sizes = ", "no setting 'sizes'"),
+        ('"parts.Plan"', '"parts.Plam"', "has no 'Plam'"),
+    ],
+)
+def test_the_settings_of_an_intermediary_class_are_checked(write: Write, old: str, new: str, said: str) -> None:
+    found = errors(write(OBJECT.replace(old, new)))
+    assert found
+    assert all(said in error.what for error in found)
