@@ -213,7 +213,7 @@ class _Drawing:
 
     def _lane(self, lane: Lane, y: float) -> None:
         start = lane.publisher.x + lane.publisher.width / 4
-        ends = [box.x - box.width / 4 for box in lane.listeners]
+        ends = [self._entry(lane, box) for box in lane.listeners]
         top = self._top()
         for x in ends:
             self.svg.line([(start, top), (start, y), (x, y), (x, top - 1)], stroke=ENVELOPES)
@@ -223,6 +223,11 @@ class _Drawing:
         half = text_width(lane.label, LABEL_SIZE) / 2
         middle = min(max((start + far) / 2, MARGIN + half), MARGIN + self.bar_width - half)
         self.svg.text(middle, y - 6, lane.label, size=LABEL_SIZE, fill=ENVELOPES, halo=True)
+
+    def _entry(self, lane: Lane, box: Box) -> float:
+        """Where a lane comes down to a listener: each at a place of its own, left of where the box's own goes up."""
+        arriving = [other for other in self.lanes if box in other.listeners]
+        return box.x - box.width / 4 + arriving.index(lane) * min(14.0, box.width / 2 / (len(arriving) + 1))
 
     def _scheduler(self, part: Part) -> None:
         fill, stroke = FILLS[Role.SCHEDULER]

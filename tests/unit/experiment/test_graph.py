@@ -55,6 +55,14 @@ def test_no_texts_overlap_and_none_leaves_the_picture(write: Write) -> None:
     assert all(left >= 0 and right <= width for left, _, right, _, _ in boxes)
 
 
+def test_no_two_arrows_end_at_the_same_place(write: Write) -> None:
+    text = TEXT + TEXT[TEXT.index("[peaks]") : TEXT.index("[choose]")].replace("peaks", "more").replace("9000", "9009")
+    root = ElementTree.fromstring(draw(write(text)))
+    paths = [e.get("d", "") for e in root.iter("{http://www.w3.org/2000/svg}path") if e.get("fill") == "none"]
+    ends = [path.rpartition("L")[2] for path in paths]
+    assert len(ends) == len(set(ends))
+
+
 def test_an_experiment_of_nothing_but_scheduler_and_translator_can_be_drawn(write: Write) -> None:
     ElementTree.fromstring(draw(write("")))
 
