@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH_IN = 7.2  # two columns of a journal
+LANE_IN = 0.2
 THUMB_PX = 64
 GAP_PX = 6
 BAR_PX = 6
@@ -60,7 +61,8 @@ def draw(
     rows = max(1, math.ceil(len(shots) / COLUMNS))
     lanes = len(record.holders) + len(record.problems)
     sheet_in = rows * WIDTH_IN / COLUMNS * (THUMB_PX + GAP_PX + BAR_PX) / (THUMB_PX + GAP_PX)
-    bands_in, looks_in = 0.17 * lanes + 0.05, (0.17 * lanes + 0.05) if repairs else 0.0
+    bands_in = LANE_IN * lanes + 0.05
+    looks_in = bands_in if repairs else 0.0
     height_in = 0.32 + sheet_in + 0.42 + bands_in + (0.62 + looks_in if repairs else 0.0) + 0.42
     figure = _figure(height_in)
     colours = {holder: COLOURS[i % len(COLOURS)] for i, holder in enumerate(record.holders)}
@@ -103,7 +105,10 @@ def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, 
     until = f"{end:%H:%M}" if begin.date() == end.date() else f"{end:%Y-%m-%d %H:%M}"
     what = f"{title}   " if title else ""
     y = 1 - 0.17 / height_in
-    figure.text(0.03, y, f"{what}{begin:%Y-%m-%d %H:%M} to {until} UTC, {len(record.shots)} scans", size=7, va="center")
+    about = f"{what}{begin:%Y-%m-%d %H:%M} to {until} UTC, {len(record.shots)} scans"
+    figure.text(0.03, y, about, size=7, va="center")
+    legend = "bar: who was in control, as in b; framed: the tip was judged bad"
+    figure.text(0.86, y, legend, size=5.5, va="center", ha="right")
     _letter(figure, "a", 0.0, y)
     if simulated:
         figure.text(0.995, y, "SIMULATED", size=9, weight="bold", color=PROBLEM, ha="right", va="center")
@@ -122,7 +127,7 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
         picture = palette[_fitted(shot.picture)[::-1]]  # drawn with y upwards
         canvas[y : y + THUMB_PX, x : x + THUMB_PX] = picture
-        bar = _rgb(colours.get(shot.holder or "", NOBODY))
+        bar = _rgb(colours.get(record.holder_of(shot) or "", NOBODY))
         canvas[y + THUMB_PX + 1 : y + THUMB_PX + BAR_PX, x : x + THUMB_PX] = bar
         if record.verdict(shot) == verdicts.BAD:
             _frame(canvas[y : y + THUMB_PX, x : x + THUMB_PX], _rgb(PROBLEM))
@@ -155,15 +160,15 @@ def _bands(
     for lane, problem in enumerate(record.problems, start=first):
         spans = record.problem_spans(problem)
         _lane(ax, lane, spans, limits, facecolor=PROBLEM, hatch="////", edgecolor="white")
-        labels.append(problems.get(problem, f"problem {problem}"))
-        _flaggers(ax, lane, record, spans, limits)
+        by = " or ".join(dict.fromkeys(filter(None, (flagged_by(record, span) for span in spans))))
+        labels.append(problems.get(problem, f"problem {problem}") + (f"\nflagged by {by}" if by else ""))
     for span in record.manual_spans():
         ax.axvspan(*_clipped(span, limits), color=NOBODY, alpha=0.5, linewidth=0)
     _actions(ax, record, {holder: lane for lane, holder in enumerate(record.holders)}, limits)
     ax.axhline(first - 0.5, color="black", linewidth=0.5)
     ax.set_xlim(*limits)
     ax.set_ylim(len(labels) - 0.5, -0.5)
-    ax.set_yticks(range(len(labels)), labels if names_too else [""] * len(labels), size=6)
+    ax.set_yticks(range(len(labels)), labels if names_too else [""] * len(labels), size=5.5, linespacing=0.95)
     ax.tick_params(axis="y", length=0)
     ax.set_facecolor("#F4F4F4")
     for side in ("top", "right", "left"):
@@ -178,21 +183,6 @@ def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], *
         if end > start or limits[0] <= start <= limits[1]:
             bars.append((start, max(end - start, least)))
     ax.broken_barh(bars, (lane - 0.36, 0.72), linewidth=0, **style)
-
-
-def _flaggers(ax: Axes, lane: int, record: NightRecord, spans: Sequence[Span], limits: tuple[int, int]) -> None:
-    """Who flagged it, as far as a verdict tells."""
-    for span in spans:
-        by = flagged_by(record, span)
-        if by and limits[0] <= span.start_ns <= limits[1]:
-            ax.annotate(
-                f"flagged by {by} ",
-                (span.start_ns, lane),
-                size=4.5,
-                ha="right" if span.start_ns - limits[0] > 0.25 * (limits[1] - limits[0]) else "left",
-                va="center",
-                color="#AA3344",
-            )
 
 
 def flagged_by(record: NightRecord, span: Span) -> str:
@@ -268,7 +258,9 @@ def _chosen(record: NightRecord) -> list[Shot]:
     if len(shots) <= MOST_SHOTS:
         return shots
     series = record.holders[0] if record.holders else None
-    odd = {i for i, shot in enumerate(shots) if shot.holder != series or record.verdict(shot) == verdicts.BAD}
+    odd = {
+        i for i, shot in enumerate(shots) if record.holder_of(shot) != series or record.verdict(shot) == verdicts.BAD
+    }
     odd = set(sorted(odd)[: MOST_SHOTS // 2])
     rest = [i for i in range(len(shots)) if i not in odd]
     even = np.linspace(0, len(rest) - 1, MOST_SHOTS - len(odd)).round().astype(int)

@@ -107,6 +107,13 @@ class NightRecord:
         """All that were flagged, in the order in which they came."""
         return list(dict.fromkeys(p for _, state in sorted_by_time(self.control) for p in state.problems))
 
+    def holder_of(self, shot: Shot) -> str | None:
+        """Who was in control when a scan began; of one whose beginning was not seen, when it ended."""
+        if shot.start_ns is not None:
+            return shot.holder
+        before = [state for time_ns, state in sorted_by_time(self.control) if time_ns < shot.time_ns]
+        return before[-1].holder if before else None
+
     def control_spans(self, holder: str) -> list[Span]:
         """When a component was in control."""
         return self._spans(holder, lambda state: state.holder == holder)

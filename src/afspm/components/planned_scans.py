@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -25,6 +26,7 @@ class PlannedScans(Component):
     Args:
         plan: the regions, and how often.
         period_s: between the beginnings of two rounds, experiment time; 0 for one right after the other.
+        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last scan.
         parameters: set before the first scan, e.g. {"scan-speed": "2 um/s"}.
     """
@@ -34,9 +36,11 @@ class PlannedScans(Component):
         plan: ScanPlan,
         *,
         period_s: float = 0.0,
+        keep_control: bool = False,
         end_when_done: bool = False,
         parameters: Mapping[str, str | float] | None = None,
     ) -> None:
+        self.keep_control = keep_control
         self.plan = plan
         self.beat_s = period_s
         self.end_when_done = end_when_done
@@ -50,9 +54,10 @@ class PlannedScans(Component):
         done = int(self.memory.get("done", 0))
         if done:
             self.log.info("going on with scan %d%s", done + 1, self._of_total())
-        for step in self.plan.steps(done):
-            self._await(step, rhythm)
-            self._take(step)
+        with self.scope.control() if self.keep_control else nullcontext():
+            for step in self.plan.steps(done):
+                self._await(step, rhythm)
+                self._take(step)
         self.log.info("all %d scans are taken", self.plan.total)
         if self.end_when_done:
             self.scope.end_experiment()
@@ -100,6 +105,7 @@ class ScanSeries(PlannedScans):
         every: from the beginning of one scan to that of the next, experiment time; 0 for no pause.
         scans: how many.
         duration: for how long scans are begun (instead of `scans`).
+        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment then.
         parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
     """
@@ -113,6 +119,7 @@ class ScanSeries(PlannedScans):
         every: Duration = 0.0,
         scans: int | None = None,
         duration: Duration | None = None,
+        keep_control: bool = False,
         end_when_done: bool = False,
         parameters: dict[str, str | float] | None = None,
     ) -> None:
@@ -122,7 +129,9 @@ class ScanSeries(PlannedScans):
         if end_when_done and rounds is None:
             raise ConfigError("`end_when_done` without an end", hint="give `scans` or `duration`")
         plan = _plan((Region(pair(center), pair(size), angle),), pixels, rounds)
-        super().__init__(plan, period_s=every, end_when_done=end_when_done, parameters=parameters)
+        super().__init__(
+            plan, period_s=every, keep_control=keep_control, end_when_done=end_when_done, parameters=parameters
+        )
 
 
 @dataclass(frozen=True)
@@ -151,6 +160,7 @@ class ScanList(PlannedScans):
         pixels: (columns, rows) of each.
         rounds: how often the list is gone through.
         every: from the beginning of one round to that of the next, experiment time.
+        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment then.
         parameters: set before the first scan.
     """
@@ -161,11 +171,14 @@ class ScanList(PlannedScans):
         pixels: Pixels = (128, 128),
         rounds: int = 1,
         every: Duration = 0.0,
+        keep_control: bool = False,
         end_when_done: bool = False,
         parameters: dict[str, str | float] | None = None,
     ) -> None:
         plan = _plan(tuple(Place.of(place).region for place in regions), pixels, rounds)
-        super().__init__(plan, period_s=every, end_when_done=end_when_done, parameters=parameters)
+        super().__init__(
+            plan, period_s=every, keep_control=keep_control, end_when_done=end_when_done, parameters=parameters
+        )
 
 
 class RegionGrid(PlannedScans):
@@ -180,6 +193,7 @@ class RegionGrid(PlannedScans):
         pixels: (columns, rows) of each scan.
         rounds: how often the grid is gone through.
         every: from the beginning of one round to that of the next, experiment time.
+        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment then.
         parameters: set before the first scan.
     """
@@ -194,12 +208,15 @@ class RegionGrid(PlannedScans):
         pixels: Pixels = (128, 128),
         rounds: int = 1,
         every: Duration = 0.0,
+        keep_control: bool = False,
         end_when_done: bool = False,
         parameters: dict[str, str | float] | None = None,
     ) -> None:
         points = grid_centers(pair(center), (counts[0], counts[1]), pair(spacing or size), angle)
         plan = _plan(squares(points, pair(size), angle), pixels, rounds)
-        super().__init__(plan, period_s=every, end_when_done=end_when_done, parameters=parameters)
+        super().__init__(
+            plan, period_s=every, keep_control=keep_control, end_when_done=end_when_done, parameters=parameters
+        )
 
 
 def pair(values: Sequence[float]) -> XY:

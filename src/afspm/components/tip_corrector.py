@@ -12,12 +12,13 @@ from afspm.components.tip_scans import Pairing
 from afspm.components.treatments import Pulse, Treatment, clearance_m, fresh_place, treatments
 from afspm.components.verdicts import read_verdict
 from afspm.errors import ConfigError, ControlLost, Refused
-from afspm.model import Problem, Region, Scan, ScanSet, names
+from afspm.model import Problem, Region, Scan, ScanSet, ScopeState, names
 from afspm.runtime.component import Component
 from afspm.runtime.events import Events
 from afspm.units import Duration, Length, Speed, Voltage
 
 VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
+SETTLED_WITHIN_S = 2.0  # real time: a microscope that does not say that it is busy is taken to be ready then
 DONE_ACTION = "ActionMsg"
 _REGION_PARAMETERS = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
 
@@ -161,13 +162,23 @@ class TipCorrector(Component):
                 return False
             self.scope.move_probe(place)
             self._prepare(treatment)
-            self.scope.action(action)
+            self._act(action)
         except Refused as refused:
             self.log.warning("no %s, it was refused: %s", treatment, refused.reason)
             return False
         self.log.info("%s at (%.0f, %.0f) nm", treatment, place[0] * 1e9, place[1] * 1e9)
         self.publish(wire.message_type(DONE_ACTION)(action=action), f"{DONE_ACTION}_{self.name}")
         return True
+
+    def _act(self, action: str) -> None:
+        """Do it, and let it end: what is asked of a busy microscope it refuses."""
+        with self.scope.events("ScopeStateMsg", timeout_s=SETTLED_WITHIN_S) as states:
+            self.scope.action(action)
+            was_busy = False
+            for event in states:
+                if event.message.state is ScopeState.FREE and was_busy:
+                    return
+                was_busy = True
 
     def _prepare(self, treatment: Treatment) -> None:
         if isinstance(treatment, Pulse):
