@@ -135,6 +135,15 @@ def si(value: str | float, unit: str) -> float:
     return convert(number, given or unit, unit)
 
 
+def si_unit(unit: str) -> str:
+    """The SI unit of the same kind: "nm" -> "m", "um/s" -> "m/s", "deg" -> "rad".
+
+    Raises:
+        UnitError: an unknown unit.
+    """
+    return _base_and_factor(unit)[0]
+
+
 def same_kind(unit_a: str, unit_b: str) -> bool:
     """Whether one unit can be converted to the other; False for unknown ones."""
     try:

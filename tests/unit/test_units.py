@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.errors import UnitError
-from afspm.units import convert, parse_quantity, same_kind, si
+from afspm.units import convert, parse_quantity, same_kind, si, si_unit
 
 
 @pytest.mark.parametrize(
@@ -67,3 +67,10 @@ def test_kinds() -> None:
 def test_common_units_need_no_heavy_library() -> None:
     code = "import sys, afspm.units as u; u.si('2 um/s', 'm/s'); sys.exit('pint' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted"), [("nm", "m"), ("um/s", "m/s"), ("deg", "rad"), ("mV", "V"), ("", ""), ("px", "px")]
+)
+def test_the_si_unit_of_a_unit_is_the_one_of_its_kind(unit: str, wanted: str) -> None:
+    assert si_unit(unit) == wanted
