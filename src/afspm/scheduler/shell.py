@@ -181,6 +181,7 @@ class Shell:
                 case events.Log():
                     self._log.log(_LEVELS.get(effect.level, logging.INFO), "%s", effect.text)
                 case events.Kill():
+                    sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
                     sockets.publisher.kill()
                     self.ended = True
 

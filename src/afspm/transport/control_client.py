@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 
 import zmq
@@ -26,21 +27,21 @@ class ControlClient:
         self._complaints = complaints
         self._address = address
         self._scheduler_is_ours = False
+        self._connected = False
         self.touched = True
         self.socket = network.socket(zmq.DEALER)
         self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
-        # a request is for the scheduler that is there now, not for one that may come later
-        self.socket.setsockopt(zmq.IMMEDIATE, 1)
         self.monitor = Monitor(self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 
     def send(self, frames: Sequence[bytes]) -> None:
         """Ask; dropped while there is no scheduler."""
-        try:
-            self.touched = True
-            send(self.socket, [b"", *frames])
-        except zmq.Again:
+        if not self._connected:
             return
+        self.touched = True
+        # full: the scheduler has stood still for thousands of requests
+        with contextlib.suppress(zmq.Again):
+            send(self.socket, [b"", *frames])
 
     def receive(self) -> list[Incoming]:
         """The next answer."""
@@ -58,7 +59,8 @@ class ControlClient:
         """The scheduler's coming and going."""
         found: list[Incoming] = []
         for event in self.monitor.drain():
-            if event.kind == CONNECTED:
+            self._connected = event.kind == CONNECTED
+            if self._connected:
                 self._greet()
                 found.append(ControlConnected())
             else:

@@ -40,7 +40,8 @@ class TranslatorLink:
         self._address = address
         self.touched = True
         self.socket = network.socket(zmq.DEALER)
-        # nothing waits for a translator that is gone, to be carried out when it is back
+        # nothing waits for a translator that is gone, to be carried out when it is back. (With this an answer may be
+        # lost together with the connection: it is asked for again by its id.)
         self.socket.setsockopt(zmq.IMMEDIATE, 1)
         self.monitor = Monitor(self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)

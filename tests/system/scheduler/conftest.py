@@ -30,9 +30,7 @@ class Component:
 
     def __init__(self, rig: Rig, name: str, envelopes: list[str] | None) -> None:
         self._rig, self.name = rig, name
-        self.port = ZmqPort(
-            Network(), name, rig.clock, subscribe=[rig.publish], envelopes=envelopes, control=rig.serve
-        )
+        self.port = ZmqPort(Network(), name, rig.clock, subscribe=[rig.publish], envelopes=envelopes, control=rig.serve)
         self.found: list[Any] = []
         self._asked = 0
 

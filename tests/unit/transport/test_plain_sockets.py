@@ -20,16 +20,7 @@ ANY = "tcp://127.0.0.1:0"
 CLOCK = ExperimentClock.real()
 
 
-def golden() -> dict[str, Any]:
-    for folder in Path(__file__).resolve().parents:
-        for file in (folder / "tests/unit/wire/golden.json", folder / "shared/wire/golden.json"):
-            if file.exists():
-                found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-                return found
-    pytest.fail("golden.json is not to be found")
-
-
-GOLDEN = golden()
+GOLDEN = json.loads((Path(__file__).parents[3] / "proto" / "golden.json").read_text(encoding="utf-8"))
 REQUESTS = [[bytes.fromhex(frame) for frame in entry["frames"]] for entry in GOLDEN["requests"]]
 RESPONSES = [[bytes.fromhex(frame) for frame in entry["frames"]] for entry in GOLDEN["responses"]]
 PACKETS = [[bytes.fromhex(frame) for frame in entry["frames"]] for entry in GOLDEN["published"]]
