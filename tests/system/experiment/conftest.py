@@ -10,14 +10,16 @@ from experiment_lab import AFSPM, EXPERIMENT, WITNESS, AfspmRun, Run
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Run]:
-    """Starts `afspm run` of an experiment file that is EXPERIMENT and `more`; it is killed after the test."""
+    """Starts `afspm run` of EXPERIMENT, `more` and a second file laid over it; it is killed after the test."""
     runs: list[AfspmRun] = []
 
-    def start(*options: str, more: str = "", scans: int = 4, speed: float = 120.0) -> AfspmRun:
+    def start(*options: str, more: str = "", over: str = "", scans: int = 4, speed: float = 120.0) -> AfspmRun:
         (tmp_path / "witness.py").write_text(WITNESS, encoding="utf-8")
         file = tmp_path / "experiment.toml"
         file.write_text(EXPERIMENT.format(scans=scans, speed=speed) + more, encoding="utf-8")
-        command = (*AFSPM, "run", str(file), "--runs", str(tmp_path / "runs"), "--verbose", *options)
+        overlay = tmp_path / "overlay.toml"
+        overlay.write_text(over, encoding="utf-8")
+        command = (*AFSPM, "run", str(file), str(overlay), "--runs", str(tmp_path / "runs"), "--verbose", *options)
         # in a group of its own, so that a Ctrl-C for it is not one for the tests
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=tmp_path

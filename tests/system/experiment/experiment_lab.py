@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -144,6 +145,14 @@ class AfspmRun:
         """Each (channel, time, file) that the witness got, with how often."""
         text = (self.folder / "witnessed.txt").read_text(encoding="utf-8")
         return Counter(tuple(line.split("|")) for line in text.splitlines())
+
+
+def require_each_row_once(run: AfspmRun, scans: int) -> None:
+    """The table of measurements has one row for each channel of each scan."""
+    with (run.folder / "metadata.csv").open(encoding="utf-8", newline="") as file:
+        rows = Counter((row["channel"], row["time"]) for row in csv.DictReader(file))
+    assert set(rows.values()) == {1}, rows
+    assert set(Counter(channel for channel, _ in rows).values()) == {scans}, rows
 
 
 def require_each_once(run: AfspmRun, scans: int) -> None:

@@ -6,7 +6,7 @@ import signal
 import sys
 
 import pytest
-from experiment_lab import AfspmRun, Run, require_each_once
+from experiment_lab import AfspmRun, Run, require_each_once, require_each_row_once
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
@@ -42,6 +42,7 @@ def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, w
         one.wait_up(name, times=2)
     assert one.end() == 0, one.output
     require_each_once(one, 10)
+    require_each_row_once(one, 10)
     for name in EACH:
         one.wait_for(f"{name} was restarted once")
 
@@ -55,6 +56,17 @@ def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run, nam
     one.wait_for(f" {name} ", "no heartbeat")
     assert one.end() == 0, one.output
     require_each_once(one, 6)
+
+
+def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Run) -> None:
+    one = run(more=MORE, scans=5)
+    one.wait_for("scan 2 of 5")
+    one.wait_for_next(" witness ", "state SCANNING")
+    for name in EACH:
+        one.signal(name, signal.SIGKILL)
+    assert one.end() == 0, one.output
+    require_each_once(one, 5)
+    require_each_row_once(one, 5)
 
 
 def test_a_component_that_always_crashes_does_not_keep_the_rest_from_ending(run: Run) -> None:

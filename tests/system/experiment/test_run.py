@@ -12,6 +12,7 @@ import pytest
 from experiment_lab import Run, require_each_once
 
 from afspm.clock import ExperimentClock
+from afspm.supervisor.ports import FreePorts
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
@@ -56,6 +57,30 @@ def test_part_of_an_experiment_can_be_left_out(run: Run) -> None:
     one = run("--without", "witness")
     assert one.end() == 0
     one.wait_for("ran: microscope, scheduler, series$")
+
+
+def test_an_experiment_can_be_started_in_two_parts(run: Run) -> None:
+    """As on two computers: each part by a supervisor of its own, the addresses between them in the file."""
+    ports = FreePorts()
+    over = f"""
+        [scheduler]
+        pubsubcache = "{ports.address()}"
+        router = "{ports.address()}"
+        """
+    decides = run("--only", "series,witness", over=over)
+    acts = run("--without", "series,witness", over=over)
+    assert decides.end() == 0, decides.output + acts.output
+    assert acts.end() == 0, acts.output
+    decides.wait_for("ran: series, witness$")
+    acts.wait_for("ran: microscope, scheduler$")
+    assert len(list((acts.folder / "scans").iterdir())) == 4
+    assert set(decides.witnessed().values()) == {1}
+
+
+def test_the_second_file_wins(run: Run) -> None:
+    one = run(over="[series]\nscans = 1\n")
+    assert one.end() == 0, one.output
+    require_each_once(one, 1)
 
 
 @posix_only
