@@ -65,9 +65,11 @@ class ParameterSpec:
 
     @property
     def si_unit(self) -> str:
-        """The unit of the value inside: SI for a base parameter, else the controller's own."""
-        si = names.BASE_PARAMETERS.get(self.name)
-        return self.unit if si is None else si
+        """The unit of the value inside: SI, but where it depends on the operating mode (the setpoint), the row's."""
+        if self.name in names.BASE_PARAMETERS:
+            si = names.BASE_PARAMETERS[self.name]
+            return self.unit if si is None else si
+        return units.si_unit(self.unit)
 
     @property
     def wire_unit(self) -> str:

@@ -144,6 +144,9 @@ def test_tip_treatment_is_in_the_truth_and_not_on_the_wire(run: Any) -> None:
     running = run({"tip": {"condition": "blunt"}})
     peer = running.peer().ready()
     assert peer.set("x-pulse-voltage", "8", "V")[0] == bytes([OK])
+    assert peer.set("x-pulse-duration", "50", "ms")[0] == bytes([OK])
+    assert peer.set("x-crash-speed", "20", "nm/s")[0] == bytes([OK])
+    assert peer.set("x-crash-depth", "0.01", "um")[0] == bytes([OK])
     for action in ("x-pulse", "x-crash", "x-retract"):
         assert peer.act(action) == OK
         heard = peer.until(FREE)
@@ -155,6 +158,8 @@ def test_tip_treatment_is_in_the_truth_and_not_on_the_wire(run: Any) -> None:
     peer.until(FREE)
     events = running.truth()
     assert [event["event"] for event in events] == ["start", "pulse", "crash", "scan starts", "scan"]
+    assert (events[1]["voltage_v"], events[1]["duration_s"]) == (8.0, pytest.approx(0.05))
+    assert (events[2]["speed_m_per_s"], events[2]["depth_m"]) == (pytest.approx(2e-8), pytest.approx(1e-8))
     assert events[1]["outcome"] in ("cured", "worsened", "unchanged")
     assert "drift_m" in events[-1]["truth"]
     assert events[0]["truth"]["tip"]["flaws"] == ["blunt"]

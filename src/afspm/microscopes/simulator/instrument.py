@@ -211,7 +211,7 @@ class Instrument:
         position_m = (float(values[names.PROBE_POS_X]), float(values[names.PROBE_POS_Y]))
         voltage_v, duration_s = float(values[names.PULSE_VOLTAGE]), float(values[names.PULSE_DURATION])
         outcome = self._world.pulse(voltage_v, duration_s, now_s, position_m)
-        facts = {"voltage_v": voltage_v, "position_m": position_m, "outcome": outcome}
+        facts = {"voltage_v": voltage_v, "duration_s": duration_s, "position_m": position_m, "outcome": outcome}
         self._treated("pulse", now_s, duration_s, facts)
 
     def crash(self, now_s: float) -> None:
