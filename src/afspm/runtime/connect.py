@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError, FileError
+from afspm.errors import ConfigError, FileError, NoResponse
 from afspm.model import ProblemNames
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
@@ -22,13 +22,14 @@ from afspm.transport.launching import open_port
 RUN_FILE = "run.json"
 LATEST_FILE = "latest"
 GUEST = "guest"
+JOINED_WITHIN_S = 5.0
 
 
 def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     """Join a running experiment; what is returned can be used like `self.scope` in a component.
 
-        scope = afspm.connect("runs/my_experiment-20261120-040000")
-        scope.scan(Region((0, 0), (2e-6, 2e-6)))
+        with afspm.connect("runs/my_experiment-20261120-040000") as scope:
+            scope.scan(afspm.Region((0, 0), (2e-6, 2e-6)))
 
     Args:
         where: the folder of the run, the folder of all runs (its newest is meant), or the experiment file (its newest
@@ -38,6 +39,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     Raises:
         FileError: there is no such run.
         ConfigError: it has nobody to connect to.
+        NoResponse: its scheduler is not running.
     """
     folder = find_run(Path(where))
     launch = guest_of(folder, name)
@@ -53,6 +55,9 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         request_retries=launch.request_retries,
         log=logging.getLogger(f"afspm.{name}"),
     )
+    if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
+        port.close()
+        raise NoResponse("nobody is there", where=str(folder), hint="is the experiment still running?")
     scope = Scope(link, ProblemNames(launch.problems), folder / "state")
     weakref.finalize(scope, port.close)
     return scope

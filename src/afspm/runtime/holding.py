@@ -115,6 +115,11 @@ class Holding:
         if state is not None and state.holder == self._link.name and not self._wanted and not self.held:
             self._link.send_only(ControlRequest.RELEASE_CTRL)
 
+    def leave(self) -> None:
+        """Give back control, if we have it, without waiting for the answer."""
+        if self.held:
+            self._give_up()
+
     def lost(self, why: str) -> None:
         """The scheduler says that we are not in control."""
         self.held = False

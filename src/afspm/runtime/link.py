@@ -160,8 +160,7 @@ class Link:
         sent = 0
         try:
             while sent < self._tries(kind):
-                if not self.wait(lambda: self.connected, until_s):
-                    raise NoResponse("the scheduler is not there", where=self.name, hint="is the experiment running?")
+                self._wait_connected(until_s)
                 connection = self.connections
                 self.port.send(frames)
                 answer = self._await_answer(connection, self._earlier(self.request_timeout_s, until_s))
@@ -187,6 +186,13 @@ class Link:
     def until(self, timeout_s: float | None) -> float | None:
         """A timeout as the moment, in monotonic time, when it is over."""
         return None if timeout_s is None else self.clock.monotonic_s() + timeout_s
+
+    def _wait_connected(self, until_s: float | None) -> None:
+        if self.wait(lambda: self.connected, self._earlier(self.request_timeout_s, until_s)):
+            return
+        self.log.warning("the scheduler is not there; waiting for it")
+        if not self.wait(lambda: self.connected, until_s):
+            raise NoResponse("the scheduler is not there", where=self.name, hint="is the experiment running?")
 
     def _earlier(self, timeout_s: float, until_s: float | None) -> float:
         soon_s = self.clock.monotonic_s() + timeout_s

@@ -285,6 +285,22 @@ class Scope:
             while (left_s := end_s - clock.now_s()) > 0.0:
                 self._link.wait(lambda: False, self._link.until(clock.real_s(left_s)))
 
+    # --- leaving ---
+
+    def close(self) -> None:
+        """Leave the experiment; control that is held is given back. `with afspm.connect() as scope:` does it by itself.
+
+        In a component this is done for you.
+        """
+        self._holding.leave()
+        self._link.port.close()
+
+    def __enter__(self) -> Scope:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     # --- within ---
 
     def give_back_inherited(self) -> None:

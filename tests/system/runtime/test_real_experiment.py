@@ -11,7 +11,7 @@ import pytest
 
 import afspm
 from afspm.clock import ExperimentClock
-from afspm.errors import ControlLost, ExperimentEnded, FileError, Refused
+from afspm.errors import ControlLost, ExperimentEnded, FileError, NoResponse, Refused
 from afspm.model import ControlMode, Region, ScopeState
 from afspm.runtime.connect import guest_facts
 from afspm.runtime.exit_codes import ExitCode
@@ -118,23 +118,25 @@ def test_the_end_of_the_experiment_ends_every_process(experiment: Experiment) ->
     assert experiment.scheduler.exit_code() == ExitCode.ENDED
 
 
-def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment) -> None:
     facts = {"name": "x", "guest": guest_facts(experiment.component_launch("some"))}
     (experiment.folder / "run.json").write_text(json.dumps(facts))
-    scope = afspm.connect(experiment.folder)
-    scans = scope.scan(Region((0.0, 0.0), (1e-6, 1e-6)), shape=(8, 8), timeout_s=60.0)
-    assert scans.first.shape == (8, 8)
-    assert scope.state is ScopeState.FREE
-    assert scope.set("tip-bias-voltage", 250.0, "mV") == pytest.approx(250.0)
-    assert scope.get("tip-bias-voltage", "V") == pytest.approx(0.25)
-    with pytest.raises(Refused):
-        scope.set("no-such-parameter", 1.0)
-    scope.set_mode(ControlMode.MANUAL)
-    with pytest.raises(ControlLost, match="manual"):
-        scope.scan(timeout_s=0.5)
-    scope.end_experiment()
-    with pytest.raises(ExperimentEnded):
-        scope.wait_until(lambda: False, timeout_s=20.0)
+    with afspm.connect(experiment.folder) as scope:
+        scans = scope.scan(Region((0.0, 0.0), (1e-6, 1e-6)), shape=(8, 8), timeout_s=60.0)
+        assert scans.first.shape == (8, 8)
+        assert scope.state is ScopeState.FREE
+        assert scope.set("tip-bias-voltage", 250.0, "mV") == pytest.approx(250.0)
+        assert scope.get("tip-bias-voltage", "V") == pytest.approx(0.25)
+        with pytest.raises(Refused):
+            scope.set("no-such-parameter", 1.0)
+        scope.set_mode(ControlMode.MANUAL)
+        with pytest.raises(ControlLost, match="manual"):
+            scope.scan(timeout_s=0.5)
+        scope.end_experiment()
+        with pytest.raises(ExperimentEnded):
+            scope.wait_until(lambda: False, timeout_s=20.0)
+    with pytest.raises(NoResponse, match="still running"):
+        afspm.connect(experiment.folder)
 
 
 def test_a_run_is_found_by_its_experiment_file_or_the_folder_of_runs(

@@ -21,6 +21,7 @@ from afspm.model import (
     Packet,
     Parameter,
     ProbePosition,
+    ProblemNames,
     Region,
     Request,
     Response,
@@ -46,6 +47,7 @@ from afspm.transport.port import (
 
 T = TypeVar("T")
 SOURCE = "memory://scheduler"
+PROBLEMS = ProblemNames({f"other-{number}": number for number in range(11, 20)})
 EPOCH_S = 1_700_000_000.0
 SCAN_S = 100.0
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
@@ -170,7 +172,7 @@ class Lab:
     def does(self, event: a.Event, who: str, number: int = 0) -> Response:
         """Somebody asks the scheduler."""
         ask = a.Ask(event, who, number)
-        rules = a.Rules(known_problems=range(1, 256))
+        rules = a.Rules(problems=PROBLEMS)
         row = a.row_for(self.control, ask, rules)
         reason = a.reason(row, self.control, ask, rules)
         before, self.control = self.control, a.apply(row, self.control, ask)
