@@ -1,6 +1,6 @@
 """afspm automates scanning probe microscopes, whoever made them.
 
-What one writes components and scripts with is here; it is loaded when it is first used, so that every process starts fast.
+What one writes components and scripts with is here, loaded when it is first used, so that every process starts fast.
 """
 
 from __future__ import annotations

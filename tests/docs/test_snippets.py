@@ -5,7 +5,7 @@ On each page, in the order of the page and in one empty folder:
 - ```python and ```toml blocks whose first line is a comment with a file name (`# sharpness.py`) become that file;
 - other ```python blocks are executed, sharing their names;
 - other ```toml blocks must be TOML;
-- ```console blocks: each line after `$ ` is run by the shell and must succeed; the lines below it must come in its output,
+- ```console blocks: each line after `$ ` is run by the shell and must succeed; the lines below must come in its output,
   in this order, where … stands for anything.
 
 Blocks of other kinds (```text, ```sh …) are only shown.
