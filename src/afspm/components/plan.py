@@ -75,8 +75,8 @@ class ScanPlan:
 class Rhythm:
     """When the rounds of a plan are due: multiples of a period after the beginning, in experiment time.
 
-    A round that comes late, after a repair of the tip, say, is taken at once; those whose time went by meanwhile are
-    not made up for in a burst, the next one is due on the old beat.
+    Rounds whose time goes by while one is taken, or waits for the repair of a tip, are not made up for in a burst: the
+    next is due on the old beat.
 
     Attributes:
         start_s: when the first is due.
@@ -90,18 +90,16 @@ class Rhythm:
         if not (self.period_s >= 0.0 and math.isfinite(self.period_s)):
             raise InvalidValue(f"a period of {self.period_s} s")
 
-    def next_due_s(self, last_s: float | None) -> float:
-        """When the round after the one begun at `last_s` is due; None: none was begun."""
-        if last_s is None or self.period_s == 0.0:
+    def next_due_s(self, done_s: float | None) -> float:
+        """When the round after the one that was done at `done_s` is due; None: none was."""
+        if done_s is None or self.period_s == 0.0:
             return self.start_s
-        beats = math.floor((last_s - self.start_s) / self.period_s) + 1
+        beats = math.floor((done_s - self.start_s) / self.period_s) + 1
         return self.start_s + max(beats, 0) * self.period_s
 
-    def missed(self, last_s: float | None, now_s: float) -> int:
-        """How many rounds were due after the one that is overdue now: they will not be taken."""
-        if self.period_s == 0.0:
-            return 0
-        return max(0, math.floor((now_s - self.next_due_s(last_s)) / self.period_s))
+    def left_out(self, due_s: float, next_due_s: float) -> int:
+        """How many rounds lie between two that were due one after the other."""
+        return max(0, round((next_due_s - due_s) / self.period_s) - 1) if self.period_s else 0
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:

@@ -70,19 +70,17 @@ class PlannedScans(Component):
     def _await(self, step: Step, rhythm: Rhythm) -> None:
         if not step.starts_round or self.memory.get("begun") == step.index:
             return
-        last_s = self.memory.get("round_s")
-        wait_s = rhythm.next_due_s(last_s) - self.clock.now_s()
-        if wait_s > 0:
-            self.scope.sleep(wait_s)
-        elif missed := rhythm.missed(last_s, self.clock.now_s()):
-            self.log.warning("%s comes late: %d that were due meanwhile are not made up for", step.key, missed)
+        due_s = rhythm.next_due_s(self.memory.get("done_s"))
+        if left_out := rhythm.left_out(self.memory.get("due_s", due_s), due_s):
+            self.log.warning("%d scans were due meanwhile; they are not made up for", left_out * len(self.plan.regions))
+        self.scope.sleep(max(0.0, due_s - self.clock.now_s()))
         # before it is asked for: a scan that a kill interrupts belongs to the beat that it was begun on
-        self.memory["begun"], self.memory["round_s"] = step.index, self.clock.now_s()
+        self.memory["begun"], self.memory["due_s"] = step.index, due_s
         self.memory.save()
 
     def _take(self, step: Step) -> None:
         scans = self.scope.scan(step.region, shape=step.shape, key=step.key)
-        self.memory["done"] = step.index + 1
+        self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
         self.memory.save()
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted and taken again: %s", step.key, interruption)

@@ -1,0 +1,115 @@
+"""Scans by plan in the laboratory in memory: exactly once, whatever happens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from runtime_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
+
+from afspm.components.planned_scans import ScanList, ScanSeries
+from afspm.components.spectroscopy_grid import SpectroscopyGrid
+from afspm.model import ControlRequest, Problem
+from afspm.runtime.component import Component
+from afspm.runtime.exit_codes import ExitCode
+
+
+def series(scans: int = 3, *, keep_control: bool = False, end_when_done: bool = True) -> ScanSeries:
+    return ScanSeries(
+        size=(1e-6, 1e-6),
+        pixels=(8, 8),
+        every=900.0,
+        scans=scans,
+        keep_control=keep_control,
+        end_when_done=end_when_done,
+    )
+
+
+def test_a_series_is_taken_on_its_beat_and_ends_the_experiment() -> None:
+    lab = Lab("series")
+    assert run(series(), lab) == ExitCode.ENDED
+    assert len(lab.finished) == 3
+    assert lab.control.ended
+    assert 1800.0 < lab.clock.passed_s < 1800.0 + 2 * SCAN_S
+
+
+def test_a_series_that_need_not_end_the_experiment_leaves_it_running() -> None:
+    lab = Lab("series")
+    assert run(series(end_when_done=False), lab) == ExitCode.DONE
+    assert not lab.control.ended
+
+
+def test_control_is_given_back_between_scans_unless_it_is_to_be_kept() -> None:
+    given_back, kept = Lab("series"), Lab("series")
+    run(series(), given_back)
+    run(series(keep_control=True), kept)
+    assert given_back.count(ControlRequest.RELEASE_CTRL) >= 3
+    assert kept.count(ControlRequest.RELEASE_CTRL) <= 2  # after setting parameters, and at the end
+
+
+def test_a_scan_that_a_problem_interrupts_is_taken_again_and_said(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("series")
+    lab.at(40.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    with caplog.at_level("WARNING"):
+        assert run(series(keep_control=True), lab) == ExitCode.ENDED
+    assert len(lab.finished) == 3
+    assert "was interrupted and taken again" in caplog.text
+
+
+def test_rounds_missed_while_control_was_lost_are_not_made_up_for(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("series")
+    lab.at(150.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(3000.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    with caplog.at_level("WARNING"):
+        run(series(), lab)
+    assert len(lab.finished) == 3
+    # the second was due at 900 s and is taken at 3000 s, the third on the old beat
+    assert 3600.0 < lab.clock.passed_s < 3600.0 + 2 * SCAN_S
+    assert "2 scans were due meanwhile" in caplog.text
+
+
+def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool) -> Lab:
+    """Run a component that is killed -9 at a call to the network, start it again, and let it end."""
+    lab = Lab("series")
+    context = context_of(lab, state_dir)
+    context.open_port = lambda: LabPort(lab, call, is_late=is_late)  # type: ignore[assignment,return-value]
+    try:
+        make().run_process(context)  # type: ignore[operator]
+    except Kill9:
+        lab.restart_component()
+        run(make(), lab, state_dir)  # type: ignore[operator]
+    return lab
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+@pytest.mark.parametrize("keep_control", [False, True])
+def test_killed_anywhere_no_scan_is_missing_or_there_twice(tmp_path: Path, is_late: bool, keep_control: bool) -> None:
+    for call in range(1, 150, 7):
+        folder = tmp_path / str(call)
+        lab = _killed_at(call, lambda: series(keep_control=keep_control), folder, is_late=is_late)
+        assert len(lab.finished) == 3, f"killed at call {call}"
+
+
+def test_a_list_is_gone_through_in_its_order_round_after_round() -> None:
+    lab = Lab("list")
+    places = [{"center": [x, 0.0], "size": [1e-6, 1e-6]} for x in (1e-6, 2e-6)]
+    run(ScanList(regions=places, pixels=(8, 8), rounds=2), lab)  # type: ignore[arg-type]
+    assert [region.center_m[0] for region in lab.finished] == [1e-6, 2e-6, 1e-6, 2e-6]
+
+
+def test_parameters_are_set_before_the_first_scan() -> None:
+    lab = Lab("series")
+    plan = ScanSeries(size=(1e-6, 1e-6), pixels=(8, 8), scans=1, parameters={"tip-bias-voltage": "250 mV"})
+    run(plan, lab)
+    (asked,) = (request.subject for request in lab.requests if request.kind == ControlRequest.PARAM)
+    assert (asked.name, float(asked.value), asked.unit) == ("tip-bias-voltage", 250.0, "mV")
+    kinds = [request.kind for request in lab.requests]
+    assert kinds.index(ControlRequest.PARAM) < kinds.index(ControlRequest.ACTION)
+
+
+def test_a_spectrum_is_taken_at_each_point_of_a_grid() -> None:
+    lab = Lab("grid")
+    run(SpectroscopyGrid(counts=(2, 2), spacing=(1e-7, 1e-7), repeats=2, end_when_done=True), lab)
+    assert lab.begun_scans == 8
+    assert lab.control.ended

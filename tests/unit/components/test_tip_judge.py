@@ -1,0 +1,153 @@
+"""Judging tips by their scans, against a simulation whose tips are known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from tip_scans_lab import ELSEWHERE, HOME, PIXELS, channels
+
+from afspm.components.tip_judge import Counter, Opinion, TipJudge, Tolerance, Verdict
+from afspm.components.tip_metrics import autocorrelation, ghost, slopes
+from afspm.errors import ConfigError, InvalidValue
+from afspm.model import Scan
+
+LEARN = 3
+FLAWS = ("double", "blunt", "contaminated")
+
+
+def judged(judge: TipJudge, pair: tuple[Scan, Scan]) -> Verdict:
+    return judge.judge(pair[0].values, pair[1].values, pair[0].region)
+
+
+def learnt(
+    seed: int, condition: str, number: int = 5
+) -> tuple[TipJudge, list[tuple[Scan, Scan]], list[tuple[Scan, Scan]]]:
+    """A judge that has learnt, the scans of the good tip that are left, and those of the changed one."""
+    pairs = channels(seed, condition, number)
+    judge = TipJudge(LEARN)
+    for pair in pairs[:LEARN]:
+        assert judged(judge, pair).opinion is Opinion.LEARNING
+    return judge, list(pairs[LEARN:number]), list(pairs[number:])
+
+
+def at_home(pairs: list[tuple[Scan, Scan]]) -> list[tuple[Scan, Scan]]:
+    found = [pair for pair in pairs if pair[0].region == HOME]
+    assert found
+    return found
+
+
+@pytest.mark.parametrize("condition", FLAWS)
+@pytest.mark.parametrize("seed", range(2))
+def test_a_good_tip_is_good_and_a_changed_one_bad_where_the_sample_is_known(seed: int, condition: str) -> None:
+    judge, good, bad = learnt(seed, condition)
+    for pair in at_home(good):
+        assert judged(judge, pair).opinion is Opinion.GOOD
+    for pair in at_home(bad):
+        assert judged(judge, pair).opinion is Opinion.BAD
+
+
+@pytest.mark.parametrize(
+    ("condition", "word"), [("double", "double"), ("blunt", "blunt"), ("contaminated", "blunt|unsteady")]
+)
+def test_a_verdict_says_what_is_wrong(condition: str, word: str) -> None:
+    judge, _, bad = learnt(1, condition)
+    assert any(part in judged(judge, bad[0]).why for part in word.split("|"))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_an_unknown_place_does_not_make_a_good_tip_bad(seed: int) -> None:
+    judge, good, _ = learnt(seed, "double")
+    elsewhere = [pair for pair in good if pair[0].region == ELSEWHERE]
+    assert elsewhere
+    assert all(judged(judge, pair).opinion is not Opinion.BAD for pair in elsewhere)
+
+
+@pytest.mark.parametrize("condition", FLAWS)
+@pytest.mark.parametrize("seed", range(2))
+def test_a_fault_found_where_the_sample_is_known_is_not_called_over_elsewhere(seed: int, condition: str) -> None:
+    judge, _, bad = learnt(seed, condition)
+    assert judged(judge, bad[0]).opinion is Opinion.BAD
+    assert bad[-1][0].region == ELSEWHERE
+    assert judged(judge, bad[-1]).opinion is not Opinion.GOOD
+
+
+def test_what_was_learnt_survives_a_restart() -> None:
+    judge, good, bad = learnt(2, "double")
+    again = TipJudge(LEARN)
+    again.restore(json.loads(json.dumps(judge.state())))
+    for pair in (good[0], bad[0], bad[-1]):
+        before, after = judged(judge, pair), judged(again, pair)
+        assert (before.opinion, before.why) == (after.opinion, after.why)
+
+
+def test_without_a_retrace_a_double_tip_is_still_seen() -> None:
+    pairs = channels(1, "double", 5)
+    judge = TipJudge(LEARN)
+    opinions = [judge.judge(trace.values, None, trace.region).opinion for trace, _ in pairs[:4] + pairs[5:7]]
+    assert opinions[LEARN:] == [Opinion.GOOD, Opinion.BAD, Opinion.BAD]
+
+
+def test_nothing_but_noise_says_nothing_of_the_tip() -> None:
+    random = np.random.default_rng(1)
+    noise = random.normal(size=(2, PIXELS, PIXELS)) * 1e-10
+    assert TipJudge(LEARN).judge(noise[0], noise[1], HOME).opinion is Opinion.UNCLEAR
+
+
+def test_a_scan_of_another_size_or_with_too_many_holes_is_not_judged() -> None:
+    judge, good, _ = learnt(0, "double")
+    trace, retrace = good[0]
+    other = judge.judge(trace.values[:64, :64], retrace.values[:64, :64], HOME)
+    holes = trace.values.copy()
+    holes[: PIXELS // 2] = np.nan
+    assert other.opinion is Opinion.UNCLEAR
+    assert judge.judge(holes, retrace.values, HOME).opinion is Opinion.UNCLEAR
+
+
+def test_a_few_missing_lines_do_no_harm() -> None:
+    judge, good, _ = learnt(0, "double")
+    trace, retrace = (scan.values.copy() for scan in good[0])
+    trace[10:14] = retrace[10:14] = np.nan
+    assert judge.judge(trace, retrace, HOME).opinion is not Opinion.BAD
+
+
+def test_two_scans_of_different_shape_are_no_pair() -> None:
+    with pytest.raises(InvalidValue):
+        slopes(np.zeros((64, 64)), np.zeros((64, 63)))
+
+
+def test_a_ghost_is_found_where_it_is() -> None:
+    random = np.random.default_rng(3)
+    rows, columns = np.mgrid[0:96, 0:120]
+    heights = np.zeros((96, 120))
+    for y, x in zip(random.integers(5, 90, 40), random.integers(5, 100, 40), strict=True):
+        heights = np.maximum(heights, np.exp(-((rows - y) ** 2 + (columns - x) ** 2) / 18.0))
+    doubled = np.maximum(heights, np.roll(heights, (0, 15), axis=(0, 1)))
+    alone, double = (autocorrelation(slopes(values + 1e-6), 32) for values in (heights, doubled))
+    assert ghost(double, alone) > 0.2
+    row, column = np.unravel_index(np.argmax((double - alone)[:, 32 + 7 :]), (33, 33 - 7))
+    assert (row, column + 7) == (0, 15)
+
+
+def test_opinions_in_a_row_set_and_clear_a_flag_and_unclear_ones_do_not_count() -> None:
+    counter = Counter(flag_after=2, clear_after=1)
+    for opinion in (Opinion.BAD, Opinion.GOOD, Opinion.BAD, Opinion.UNCLEAR):
+        counter.count(opinion)
+        assert not counter.wants_flag
+    counter.count(Opinion.BAD)
+    assert counter.wants_flag
+    counter.count(Opinion.GOOD)
+    assert counter.wants_clear
+    assert not counter.wants_flag
+
+
+@pytest.mark.parametrize("wrong", [{"detail": 1.5}, {"ghost": 0.0}, {"unrest": 1.0}, {"sigmas": -1.0}, {"margin": 0.0}])
+def test_tolerances_without_sense_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError):
+        Tolerance(**wrong)
+
+
+def test_one_reference_scan_is_too_few() -> None:
+    with pytest.raises(ConfigError):
+        TipJudge(1)
