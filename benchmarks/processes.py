@@ -21,11 +21,16 @@ PORTS = FreePorts()
 class Roles(ExitStack):
     """Starts processes, and ends them when the block is left."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.processes: list[subprocess.Popen[Any]] = []
+
     def start(self, role: str, **arguments: Any) -> str:
         """A process of `benchmarks.roles`; returns the line that it prints when it is ready."""
         process = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.roles", role, json.dumps(arguments)], stdout=subprocess.PIPE, text=True
         )
+        self.processes.append(process)
         self.callback(_end, process)
         assert process.stdout is not None
         return process.stdout.readline().strip()
@@ -43,6 +48,7 @@ class Roles(ExitStack):
             log_level="ERROR",
         )
         process = subprocess.Popen([sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE)
+        self.processes.append(process)
         self.callback(_end, process)
         assert process.stdin is not None
         process.stdin.write(launch.to_json().encode() + b"\n")

@@ -10,6 +10,7 @@ import zmq
 
 from afspm import wire
 from afspm.clock import ExperimentClock
+from afspm.errors import WireError
 from afspm.model import Response
 from afspm.transport.network import Network
 from afspm.transport.port import PacketReceived, RequestReceived
@@ -55,8 +56,11 @@ def translator() -> None:
     while True:
         for received in port.poll(None):
             if isinstance(received, RequestReceived):
-                request = wire.decode_request(received.frames)
-                port.reply(wire.encode_response(Response(0, id=request.id)))
+                try:
+                    response = Response(0, id=wire.decode_request(received.frames).id)
+                except WireError as error:
+                    response = Response(error.response, reason=str(error))
+                port.reply(wire.encode_response(response))
 
 
 def bare_packet_proxy(publisher: str, queue: int) -> None:
@@ -123,6 +127,16 @@ def bare_replayer(count: int, size: int) -> None:
                 socket.send(b"Scan2d", zmq.SNDMORE)
                 socket.send(payload, zmq.SNDMORE, copy=False)
                 socket.send(stamp)
+
+
+def soaked_component(source: str, noise: str) -> None:
+    """Hears a scheduler and a publisher of nonsense, and passes on what is published as "Mark"."""
+    port = ZmqPort(Network(), "Soaked", ExperimentClock.real(), subscribe=[source, noise], publish=ANY)
+    ready(str(port.publish_address))
+    while True:
+        for incoming in port.poll(None):
+            if isinstance(incoming, PacketReceived) and incoming.packet.envelope == "Mark":
+                port.publish("Mark", bytes(incoming.packet.payload))
 
 
 if __name__ == "__main__":

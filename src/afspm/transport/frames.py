@@ -21,6 +21,7 @@ _send: Any = _Library.send
 _receive: Any = _Library.recv
 _get: Any = _Library.get
 _NOBLOCK, _SNDMORE, _EVENTS, _POLLIN = int(zmq.NOBLOCK), int(zmq.SNDMORE), int(zmq.EVENTS), int(zmq.POLLIN)
+_SRCFD = int(zmq.SRCFD)
 
 
 def readable(socket: Socket) -> bool:
@@ -71,10 +72,23 @@ def send_packet(socket: Socket, head: Sequence[bytes], payload: bytes | memoryvi
         _send(socket, tail, 0)
 
 
-def user_of(frame: zmq.Frame) -> str | None:
-    """Whose key the connection was made with; None without keys."""
+def descriptor_of(frame: zmq.Frame) -> int | None:
+    """The descriptor of the connection that a message came by; None: a peer of a protocol older than ZMTP 3."""
     try:
-        user = frame.get("User-Id")
+        return int(frame.get(_SRCFD))
     except zmq.ZMQError:
         return None
-    return user if isinstance(user, str) and user else None
+
+
+def property_of(frame: zmq.Frame, name: str) -> str | None:
+    """What is known of the peer, e.g. "Socket-Type"; None if it is not."""
+    try:
+        value = frame.get(name)
+    except zmq.ZMQError:
+        return None
+    return value if isinstance(value, str) and value else None
+
+
+def user_of(frame: zmq.Frame) -> str | None:
+    """Whose key the connection was made with; None without keys."""
+    return property_of(frame, "User-Id")

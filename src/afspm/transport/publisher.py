@@ -8,7 +8,7 @@ import zmq
 
 from afspm import wire
 from afspm.model import Packet
-from afspm.transport.frames import readable, send_packet
+from afspm.transport.frames import descriptor_of, property_of, readable, send_packet
 from afspm.transport.network import Network
 from afspm.transport.replay import Marker, is_reserved, spelled_out
 
@@ -72,10 +72,10 @@ class Publisher:
             return 1
         # our own subscribers repeat their prefixes by themselves when a connection is made again, before they can say
         # what they have: they are subscribed by the marker, and only by it, so that they miss nothing
-        if not is_reserved(subscription) and frame.get("Socket-Type") != "XSUB":
+        if not is_reserved(subscription) and property_of(frame, "Socket-Type") != "XSUB":
             for prefix in spelled_out([subscription]):
                 self.socket.setsockopt(zmq.SUBSCRIBE, prefix)
-            plain.setdefault(frame.get(zmq.SRCFD), []).append(subscription)
+            plain.setdefault(descriptor_of(frame), []).append(subscription)
         return 0
 
     def _replay(self, marker: Marker) -> None:

@@ -8,11 +8,9 @@ from typing import NamedTuple
 import zmq
 
 from afspm.transport.complaints import Complaints
-from afspm.transport.frames import readable, receive, send, user_of
+from afspm.transport.frames import descriptor_of, readable, receive, send, user_of
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import QUEUE_LENGTH, Network
-
-_DESCRIPTOR = int(zmq.SRCFD)
 
 
 class PeerConnected(NamedTuple):
@@ -77,7 +75,9 @@ class Router:
         frames = receive(self.socket)
         if not frames:
             return []
-        identity, descriptor = frames[0].bytes, int(frames[0].get(_DESCRIPTOR))
+        identity, descriptor = frames[0].bytes, descriptor_of(frames[0])
+        if descriptor is None:
+            return []
         peer = self._by_descriptor.get(descriptor)
         if peer is not None and peer.identity == identity and not readable(self.monitor.socket):
             return self._interpret(peer, frames)

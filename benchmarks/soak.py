@@ -1,0 +1,213 @@
+"""`python -m benchmarks.soak [COUNT]`: malformed requests and packets (default: a million) against real processes.
+
+A scheduler, a translator's server and a component, each in a process of its own, are sent what no well-meaning peer
+would: truncated and overlong messages, wrong numbers of frames, unknown numbers, random bytes, bytes that are not even
+ZeroMQ, under known and unknown names. After every batch each must answer as before, and in the end none may have grown.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from afspm import wire
+from afspm.model import ControlRequest, Region, Request, Scan
+from afspm.transport.network import Network
+from afspm.transport.port import PacketReceived, ReplyReceived
+from afspm.transport.zmq_port import ZmqPort
+from benchmarks.processes import CLOCK, Roles, roles
+
+BATCH = 2_000
+GROWTH_MB = 64.0
+"""How much a process may grow from the first tenth to the end."""
+NAMES = (b"Experiment", b"Tip Corrector", b"", b"\xff\xfe", b"x" * 255, b"scheduler")
+
+
+class Malice:
+    """Makes messages that are nearly right, and others that are not, from a seed."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+        import numpy as np
+
+        scan = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.zeros((16, 16)), 1_800_000_000_000_000_000)
+        self._packets = [[b"Scan2d", wire.encode(scan)[1], wire.encode_time(1_800_000_000_000_000_000)]]
+        self._requests = [
+            wire.encode_request(Request(ControlRequest.ACTION, "start-scan", id="Experiment/soak/1")),
+            [b"\3", bytes.fromhex("0a3c0a310a1209"), b""],
+            [bytes([ControlRequest.REQUEST_CTRL]), b"\0"],
+            [bytes([ControlRequest.ADD_EXP_PRBLM]), b"\1"],
+            [bytes([ControlRequest.SET_CONTROL_MODE]), b"\2"],
+        ]
+
+    def request(self) -> list[bytes]:
+        frames = self._spoilt(self._requests)
+        # whoever may end the experiment is asked not to
+        return [b"\6" if frame == bytes([ControlRequest.END_EXPERIMENT]) else frame for frame in frames]
+
+    def packet(self) -> list[bytes]:
+        frames = self._spoilt(self._packets)
+        return [b"NOKILL"] if frames == [wire.KILL] else frames
+
+    def _spoilt(self, good: list[list[bytes]]) -> list[bytes]:
+        chance, frames = self._random, [*self._random.choice(good)]
+        at = chance.randrange(len(frames))
+        match chance.randrange(8):
+            case 0:
+                frames[at] = frames[at][: chance.randrange(len(frames[at]) + 1)]
+            case 1:
+                frames = frames[: chance.randrange(len(frames) + 1)] or [b""]
+            case 2:
+                frames += [b"more"] * chance.choice((1, 2, 5, 50))
+            case 3:
+                frames[0] = bytes([chance.randrange(256)])
+            case 4:
+                frames = [chance.randbytes(chance.randrange(60)) for _ in range(chance.randrange(1, 6))]
+            case 5:
+                flipped = bytearray(frames[at] or b"\0")
+                flipped[chance.randrange(len(flipped))] ^= 1 << chance.randrange(8)
+                frames[at] = bytes(flipped)
+            case 6:
+                frames[at] = frames[at] + chance.randbytes(chance.choice((1, 10, 1000)))
+            case 7:
+                frames[-1] = chance.randbytes(chance.randrange(300))
+        return frames
+
+
+class Soak:
+    """One run. `processes` are started and ended by the caller."""
+
+    def __init__(self, processes: Roles, seed: int) -> None:
+        self.malice = Malice(seed)
+        self._random = random.Random(seed)
+        self._context: Any = processes.enter_context(zmq.Context())
+        self._context.setsockopt(zmq.LINGER, 0)
+        serve = processes.start("translator").split()[1]
+        self._noise = self._context.socket(zmq.PUB)
+        self._noise.setsockopt(zmq.SNDHWM, 0)
+        noise = f"tcp://127.0.0.1:{self._noise.bind_to_random_port('tcp://127.0.0.1')}"
+        self._scheduler_publish, self._scheduler = processes.scheduler(noise, serve)
+        self._translator = serve
+        self._heard = processes.start("soaked_component", source=self._scheduler_publish, noise=noise)
+        self._friend = ZmqPort(
+            Network(), "Friend", CLOCK, subscribe=[self._scheduler_publish, self._heard], control=self._scheduler
+        )
+        self._translators_friend = ZmqPort(Network(), "Friend", CLOCK, control=serve)
+        processes.callback(self._friend.close)
+        processes.callback(self._translators_friend.close)
+        self._pids = [process.pid for process in processes.processes]
+        self._asked = 0
+
+    def batch(self, count: int) -> None:
+        """So many messages to each of the three, in a third each; then all must still serve."""
+        targets = []
+        for target in (self._scheduler, self._translator):
+            dealer = self._context.socket(zmq.DEALER)
+            dealer.setsockopt(zmq.SNDHWM, 0)
+            if name := self._random.choice(NAMES):
+                dealer.setsockopt(zmq.ROUTING_ID, name)
+            dealer.connect(target)
+            targets.append(dealer)
+        for n in range(count):
+            if n % 3 == 2:
+                self._noise.send_multipart(self.malice.packet())
+            else:
+                delimiter = [b""] if self._random.random() < 0.9 else []
+                targets[n % 3].send_multipart(delimiter + self.malice.request())
+        self._strangers()
+        self.check()
+        for dealer in targets:
+            dealer.close(linger=10_000)
+
+    def _strangers(self) -> None:
+        """Peers that speak no ZeroMQ, send what is too large, or subscribe to nonsense."""
+        for address in (self._scheduler, self._translator, self._scheduler_publish):
+            with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as raw:
+                raw.sendall(self._random.randbytes(200))
+        large = self._context.socket(zmq.DEALER)
+        large.connect(self._random.choice((self._scheduler, self._translator)))
+        large.send_multipart([b"", b"\1", bytes(3_000_000)])
+        subscriber = self._context.socket(zmq.XSUB)
+        subscriber.connect(self._scheduler_publish)
+        for _ in range(20):
+            subscriber.send(b"\1\0replay/" + self._random.randbytes(30))
+            subscriber.send(self._random.randbytes(10) or b"\1")
+        large.close(linger=100)
+        subscriber.close(linger=100)
+
+    def check(self) -> None:
+        """Scheduler, translator and component must answer as before. Raises TimeoutError."""
+        for port in (self._friend, self._translators_friend):
+            self._asked += 1
+            request = Request(ControlRequest.ACTION_SUPPORT, "start-scan", id=f"Friend/soak/{self._asked}")
+            _until(port, wire.encode_request(request), request.id)
+        mark = f"mark {self._asked}".encode()
+        deadline_s = CLOCK.monotonic_s() + 60.0
+        while CLOCK.monotonic_s() < deadline_s:
+            stamp = wire.encode_time(CLOCK.now_ns())
+            self._noise.send_multipart([b"FeedbackAnalysis", b"", stamp])
+            self._noise.send_multipart([b"Mark", mark, stamp])
+            found = self._friend.poll(0.05)
+            if any(isinstance(i, PacketReceived) and bytes(i.packet.payload) == mark for i in found):
+                return
+        raise TimeoutError("the component no longer passes on what it hears")
+
+    def memory_mb(self) -> list[float]:
+        """The resident memory of each process (on Linux; elsewhere nothing is measured)."""
+        return [_resident_mb(pid) for pid in self._pids]
+
+
+def _is_answer(incoming: Any, request_id: str) -> bool:
+    return isinstance(incoming, ReplyReceived) and incoming.response.id == request_id
+
+
+def _until(port: ZmqPort, frames: list[bytes], request_id: str) -> None:
+    """Ask until the answer comes."""
+    deadline_s = CLOCK.monotonic_s() + 60.0
+    while CLOCK.monotonic_s() < deadline_s:
+        port.send(frames)
+        if any(_is_answer(incoming, request_id) for incoming in port.poll(0.5)):
+            return
+    raise TimeoutError("no answer within a minute")
+
+
+def _resident_mb(pid: int) -> float:
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except OSError:
+        return 0.0
+    return pages * 4096 / 2**20
+
+
+def soak(count: int, seed: int = 1) -> Iterator[dict[str, Any]]:
+    """Yields, ten times, how many were sent and how large the processes are.
+
+    Raises:
+        TimeoutError, MemoryError: somebody no longer serves, or has grown.
+    """
+    with roles() as processes:
+        run = Soak(processes, seed)
+        run.check()
+        sent, early = 0, [0.0]
+        while sent < count:
+            before = 10 * sent // count
+            run.batch(min(BATCH, count - sent))
+            sent += min(BATCH, count - sent)
+            if 10 * sent // count > before:
+                now = run.memory_mb()
+                early = now if early == [0.0] else early
+                yield {"sent": sent, "memory_mb": [round(mb, 1) for mb in now]}
+                if any(b - a > GROWTH_MB for a, b in zip(early, now, strict=True)):
+                    raise MemoryError(f"from {early} MB to {now} MB")
+
+
+if __name__ == "__main__":
+    for progress in soak(int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000):
+        print(json.dumps(progress), flush=True)

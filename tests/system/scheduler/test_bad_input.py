@@ -1,0 +1,21 @@
+"""A part of the soak: malformed messages leave scheduler, translator and component serving, and no larger."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_twenty_thousand_malformed_messages_change_nothing() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.soak", "20000"],
+        cwd=Path(__file__).parents[3],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout.splitlines()[-1])["sent"] == 20_000
