@@ -1,0 +1,112 @@
+"""The classifier in the laboratory in memory: what it flags, clears, tells and remembers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from runtime_lab import Lab, run
+from tip_scans_lab import channels
+
+from afspm import wire
+from afspm.components.tip_classifier import TipClassifier
+from afspm.components.verdicts import BAD, GOOD, MESSAGE, read_verdict
+from afspm.model import ControlRequest, Problem, Scan
+from afspm.runtime.exit_codes import ExitCode
+
+TIP = Problem.TIP_SHAPE_CHANGED
+
+
+def publish_at(lab: Lab, at_s: float, pair: tuple[Scan, Scan]) -> None:
+    for scan in pair:
+        lab.at(at_s, lambda scan=scan: lab.publish(scan))
+
+
+def night(lab: Lab) -> tuple[tuple[Scan, Scan], ...]:
+    """Three scans to learn from, two of a double tip, one of a good tip again."""
+    pairs = channels(1, "double", 5)
+    good_again = tuple(Scan(s.region, s.channel, s.unit, s.values, pairs[6][0].time_ns + 1) for s in pairs[3])
+    story = (*pairs[:3], *pairs[5:7], good_again)
+    for number, pair in enumerate(story):
+        publish_at(lab, 100.0 * (number + 1), pair)
+    return story  # type: ignore[return-value]
+
+
+def classifier(**settings: int) -> TipClassifier:
+    return TipClassifier(reference_scans=3, **settings)  # type: ignore[arg-type]
+
+
+def asked(lab: Lab, kind: ControlRequest) -> int:
+    return sum(request.kind == kind for request in lab.requests)
+
+
+def verdicts_of(lab: Lab) -> list[tuple[int, float]]:
+    found = [read_verdict(wire.decode(MESSAGE, p)) for e, p in lab.published if e == f"{MESSAGE}_{lab.name}"]
+    return [verdict for verdict in found if verdict is not None]
+
+
+def test_a_changed_tip_is_flagged_once_and_a_good_one_clears_it() -> None:
+    lab = Lab("tip_classifier")
+    night(lab)
+    lab.at(450.0, lambda: flagged.append(lab.control.published().problems))
+    lab.at(700.0, lab.kill)
+    flagged: list[tuple[int, ...]] = []
+    assert run(classifier(), lab) == ExitCode.ENDED
+    assert flagged == [(TIP,)]
+    assert lab.control.published().problems == ()
+    assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 1
+    assert asked(lab, ControlRequest.RMV_EXP_PRBLM) == 1
+
+
+def test_each_scan_judged_is_told_with_its_time() -> None:
+    lab = Lab("tip_classifier")
+    story = night(lab)
+    lab.at(700.0, lab.kill)
+    run(classifier(), lab)
+    assert verdicts_of(lab) == [(story[3][0].time_ns, BAD), (story[4][0].time_ns, BAD), (story[5][0].time_ns, GOOD)]
+
+
+def test_one_bad_scan_is_not_enough_if_two_are_asked_for() -> None:
+    lab = Lab("tip_classifier")
+    pairs = channels(1, "double", 5)
+    for number, pair in enumerate((*pairs[:3], pairs[5])):
+        publish_at(lab, 100.0 * (number + 1), pair)
+    lab.at(500.0, lab.kill)
+    run(classifier(flag_after=2), lab)
+    assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 0
+
+
+def test_what_was_learnt_and_judged_survives_a_kill(tmp_path: Path) -> None:
+    lab = Lab("tip_classifier")
+    pairs = channels(1, "double", 5)
+    for number, pair in enumerate(pairs[:3]):
+        publish_at(lab, 100.0 * (number + 1), pair)
+    lab.at(350.0, lab.parent_goes)
+    assert run(classifier(), lab, tmp_path) == ExitCode.ORPHAN
+    lab.restart_component()  # the last scan is sent again, and must not be learnt from twice
+    publish_at(lab, 100.0, pairs[5])
+    lab.at(200.0, lab.kill)
+    again = classifier()
+    run(again, lab, tmp_path)
+    assert again.judge.reference is not None
+    assert len(again.judge.reference.first) == 3
+    assert lab.control.published().problems == (TIP,)
+
+
+def test_nothing_is_learnt_while_a_problem_is_flagged() -> None:
+    lab = Lab("tip_classifier")
+    lab.flag(Problem.THERMAL_DRIFT)
+    publish_at(lab, 100.0, channels(1, "double", 5)[0])
+    lab.at(200.0, lab.kill)
+    component = classifier()
+    run(component, lab)
+    assert component.judge.reference is None
+
+
+def test_channels_of_two_scans_are_not_taken_for_one() -> None:
+    lab = Lab("tip_classifier")
+    (first, _), (_, second) = channels(1, "double", 5)[:2]
+    publish_at(lab, 100.0, (first, second))
+    lab.at(200.0, lab.kill)
+    component = classifier()
+    run(component, lab)
+    assert component.judge.reference is None
