@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
-OWN_PACE_S = 1.0  # after the end of the experiment: everybody has heard it, and may finish a file
+OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and may finish a file
+AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
+FAREWELL_S = 60.0  # but not for ever
 KILL_AFTER_S = 1.5  # after being asked
 LEAVE_AFTER_S = 3.0  # after being killed
 
@@ -41,6 +43,7 @@ class Ending:
 
     Attributes:
         ask_s, kill_s: when, in real monotonic time.
+        latest_s: until when those who are busy may be waited for before they are asked.
         last: what has been done already.
     """
 
@@ -48,17 +51,24 @@ class Ending:
     text: str
     ask_s: float
     kill_s: float
+    latest_s: float
     last: Do | None = None
 
     @classmethod
     def begin(cls, why: Why, text: str, now_s: float) -> Ending:
         """Begin to end. Where the experiment itself ended, all know and close by themselves: not disturbed at first."""
-        ask_s = now_s + OWN_PACE_S if why is Why.EXPERIMENT_ENDED else now_s
-        return cls(why, text, ask_s, ask_s + KILL_AFTER_S)
+        if why is not Why.EXPERIMENT_ENDED:
+            return cls(why, text, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s)
+        ask_s = now_s + OWN_PACE_S
+        return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S)
 
     def hurried(self, now_s: float) -> Ending:
-        """Somebody asked again: no more waiting."""
-        return self if self.last in (Do.KILL, Do.LEAVE) else replace(self, kill_s=now_s, last=Do.ASK)
+        """Somebody wants it to be over: those not asked yet are, those that were are killed."""
+        if self.last in (Do.KILL, Do.LEAVE):
+            return self
+        if self.last is None and self.why is not Why.STOPPED:
+            return replace(self, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s)
+        return replace(self, kill_s=now_s, last=Do.ASK)
 
     def deadline_s(self) -> float | None:
         """When `step` has something to do next; None: never again."""
@@ -72,10 +82,17 @@ class Ending:
             case Do.LEAVE:
                 return None
 
-    def step(self, now_s: float) -> tuple[Ending, Do | None]:
-        """What the time has come for, if anything, and the ending after it."""
+    def step(self, now_s: float, *, busy: bool = False) -> tuple[Ending, Do | None]:
+        """What the time has come for, if anything, and the ending after it.
+
+        Args:
+            busy: somebody still works on a step, within what it declared (a picture of the night, say).
+        """
         deadline_s = self.deadline_s()
         if deadline_s is None or now_s < deadline_s:
             return self, None
+        if self.last is None and busy and now_s < self.latest_s:
+            ask_s = min(now_s + AGAIN_S, self.latest_s)
+            return replace(self, ask_s=ask_s, kill_s=ask_s + KILL_AFTER_S), None
         do = {None: Do.ASK, Do.ASK: Do.KILL, Do.KILL: Do.LEAVE}[self.last]
         return replace(self, last=do), do

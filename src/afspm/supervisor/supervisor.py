@@ -14,13 +14,14 @@ from afspm.clock import Clock
 from afspm.errors import AfspmError
 from afspm.experiment import Role
 from afspm.logic import supervision
+from afspm.logic.liveness import LivenessPolicy
 from afspm.runtime.exit_codes import ExitCode
 from afspm.supervisor import signals
 from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import SUPERVISOR, LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed, describe_exit
 from afspm.supervisor.task import Task
-from afspm.transport.heartbeat import HeartbeatListener
+from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 from afspm.transport.wakeup import WakeUp
 
 
@@ -58,12 +59,21 @@ class _Child:
     lines: LineReader = field(default_factory=LineReader)
     starts: int = 0
     up: bool = False
+    beat: Heartbeat | None = None
+    beat_s: float = 0.0
     given_up: bool = False
     last_exit: str = ""
 
     @property
     def name(self) -> str:
         return self.task.name
+
+    def is_busy(self, now_s: float, liveness: LivenessPolicy) -> bool:
+        """Whether it works on a step, as its last beat says, and for no longer than it declared."""
+        if self.process is None or self.beat is None or self.beat.closing or not self.beat.step_age_s:
+            return False
+        longest_s = self.beat.longest_step_s or liveness.longest_step_s
+        return now_s - self.beat_s < liveness.silence_s and self.beat.step_age_s <= longest_s
 
     @property
     def over(self) -> bool:
@@ -76,6 +86,7 @@ class Supervisor:
     def __init__(self, tasks: Sequence[Task], log: RunLog, clock: Clock, policy: supervision.Policy) -> None:
         self._log = log
         self._clock = clock
+        self._policy = policy
         self._wakeup: WakeUp[ChildEvent | signals.Signalled] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
         self._children = {
@@ -116,6 +127,7 @@ class Supervisor:
         now_s = self._clock.monotonic_s()
         for beat in beats:
             child = self._children[beat.name]
+            child.beat, child.beat_s = beat, now_s
             if not child.up:
                 child.up = True
                 self._log.write(child.name, logging.DEBUG, "is up")
@@ -199,7 +211,7 @@ class Supervisor:
         if self._ending is not None:
             return
         launch = replace(task.launch, sockets=replace(task.launch.sockets, heartbeat=child.heartbeat))
-        child.lines, child.up = LineReader(), False
+        child.lines, child.up, child.beat = LineReader(), False, None
         child.starts += 1
         try:
             child.process = ChildProcess(
@@ -229,7 +241,8 @@ class Supervisor:
             self._log.write(SUPERVISOR, logging.INFO if why is not Why.LOST else logging.CRITICAL, text)
 
     def _go_on_ending(self, ending: Ending, now_s: float) -> None:
-        self._ending, do = ending.step(now_s)
+        busy = any(child.is_busy(now_s, self._policy.liveness) for child in self._children.values())
+        self._ending, do = ending.step(now_s, busy=busy)
         for child in self._children.values():
             if child.process is None:
                 continue

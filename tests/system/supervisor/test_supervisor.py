@@ -110,6 +110,13 @@ def test_the_end_of_the_experiment_ends_all_even_the_deaf(run_tasks: RunTasks) -
     running.terminal.wait_for(" deaf ", "does not end: killed")
 
 
+def test_at_the_end_of_the_experiment_one_that_is_busy_may_finish(run_tasks: RunTasks, tmp_path: Path) -> None:
+    busy = peer("busy", first="busy", busy_s=4.0, longest_step_s=60.0)
+    running = run_tasks(busy, peer("ends", first="exit", code=80))
+    running.outcome()
+    running.terminal.wait_for(" busy ", "no longer busy")
+
+
 def test_a_scheduler_that_is_done_ends_the_experiment(run_tasks: RunTasks) -> None:
     outcome = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=0), peer("waits")).outcome()
     assert outcome.why is Why.EXPERIMENT_ENDED

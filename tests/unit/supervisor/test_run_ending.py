@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from afspm.supervisor.ending import KILL_AFTER_S, LEAVE_AFTER_S, OWN_PACE_S, Do, Ending, Why
+from afspm.supervisor.ending import FAREWELL_S, KILL_AFTER_S, LEAVE_AFTER_S, OWN_PACE_S, Do, Ending, Why
 
 
 def test_ctrl_c_asks_at_once_and_kills_within_two_seconds() -> None:
@@ -16,13 +16,40 @@ def test_at_the_end_of_the_experiment_all_may_finish_first() -> None:
 
 
 def test_a_second_ctrl_c_kills_at_once() -> None:
+    ending, _ = Ending.begin(Why.STOPPED, "", 100.0).step(100.0)
+    assert ending.hurried(100.2).step(100.2)[1] is Do.KILL
+
+
+def test_so_does_one_that_comes_before_anything_was_done_about_the_first() -> None:
+    assert Ending.begin(Why.STOPPED, "", 100.0).hurried(100.0).step(100.0)[1] is Do.KILL
+
+
+def test_ctrl_c_at_the_end_of_the_experiment_asks_first() -> None:
     ending = Ending.begin(Why.EXPERIMENT_ENDED, "", 100.0).hurried(100.2)
-    assert ending.step(100.2)[1] is Do.KILL
+    assert ending.step(100.2, busy=True)[1] is Do.ASK
 
 
-def test_a_third_ctrl_c_changes_nothing_about_what_is_killed_already() -> None:
-    ending, _ = Ending.begin(Why.STOPPED, "", 100.0).hurried(100.2).step(100.2)
+def test_a_further_ctrl_c_changes_nothing_about_what_is_killed_already() -> None:
+    ending, _ = Ending.begin(Why.STOPPED, "", 100.0).step(100.0)
+    ending, _ = ending.hurried(100.2).step(100.2)
     assert ending.hurried(100.3) == ending
+
+
+def test_who_is_busy_at_the_end_of_the_experiment_is_waited_for_but_not_for_ever() -> None:
+    ending = Ending.begin(Why.EXPERIMENT_ENDED, "", 100.0)
+    now_s, do = 100.0, None
+    while do is None:
+        assert now_s <= 100.0 + FAREWELL_S
+        deadline_s = ending.deadline_s()
+        assert deadline_s is not None
+        now_s = deadline_s
+        ending, do = ending.step(now_s, busy=True)
+    assert do is Do.ASK
+    assert now_s == 100.0 + FAREWELL_S
+
+
+def test_nobody_is_waited_for_after_ctrl_c() -> None:
+    assert Ending.begin(Why.STOPPED, "", 100.0).step(100.0, busy=True)[1] is Do.ASK
 
 
 def test_each_stage_comes_once_and_in_its_time() -> None:
