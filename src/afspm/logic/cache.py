@@ -88,7 +88,7 @@ class Cache:
 
     def recent(self) -> list[tuple[int, int]]:
         """(translator's time, ours) of the packets published last, for a restarted scheduler's `remember`."""
-        return list(self._recent)
+        return [*self._first_times.items(), *self._recent]
 
     def remember(self, recent: Iterable[tuple[int, int]]) -> None:
         """These have been published already, before we were killed. Should they come again since they could not be
@@ -134,6 +134,8 @@ class Cache:
         )
 
     def _again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, bool]:
+        assert packet.time_ns is not None
+        self._recent.append((source_ns, packet.time_ns))
         kept = self._keep(packet, source_ns, history)
         self._kept = dict(sorted(self._kept.items()))
         for envelope, times in self._times.items():

@@ -130,7 +130,7 @@ class Crasher(Experiment):
         if (yield from self.regain(Problem.NONE)):
             yield from self.ask(ControlRequest.ACTION, names.START_SPEC)
             yield from self.sleep(self.some(20.0))
-            self.kill(0 if self.timeline.chance(0.1) else -11)
+            self.kill(0 if self.timeline.chance(0.3) else -11)
 
 
 class Impostor(Client):

@@ -31,6 +31,7 @@ from afspm.model import (
     Request,
     Response,
     ScopeState,
+    names,
 )
 from afspm.testing.deterministic.client import Client
 from afspm.testing.deterministic.microscope import FakeMicroscope
@@ -39,6 +40,8 @@ from afspm.testing.deterministic.timeline import Timeline
 
 _SUCCESS, _NO_RESPONSE = int(ControlResponse.SUCCESS), int(ControlResponse.NO_RESPONSE)
 _FORWARDED = range(int(ControlRequest.ACTION), int(ControlRequest.SET_PROBE_POS) + 1)
+_NOT_FREE = int(ControlResponse.NOT_FREE)
+_COUNTED = frozenset({names.START_SCAN, names.START_SPEC, names.PULSE})
 _TRACE = 60
 _SLACK_S = 1.0
 NAME_TAKEN = "each needs a name of its own"
@@ -79,6 +82,9 @@ class Invariants:
         self._used_ns = 0
         self._last_ns = -1
         self._published: dict[int, tuple[str, bytes | memoryview]] = {}
+        self._by_source: dict[int, int] = {}
+        self._actions: dict[tuple[str, str], str] = {}
+        self.clocks_are_right = True
         self._open: dict[tuple[str, str], tuple[float, int]] = {}
         self._definite: dict[tuple[str, str], int] = {}
         self._life = 0
@@ -99,7 +105,7 @@ class Invariants:
         if isinstance(effect, Reply):
             self._reply(host, effect)
         elif isinstance(effect, Publish):
-            self._publish(effect.packet)
+            self._publish(effect)
         elif isinstance(effect, Forward):
             self._forward(host, effect)
         if isinstance(effect, Reply | Publish):
@@ -112,6 +118,8 @@ class Invariants:
         self._note(event, effects)
         if isinstance(event, RequestIn):
             self._asked(event, effects)
+            if event.name == self._holder and event.request.kind in _FORWARDED:
+                self._used_ns = self._timeline.now_ns()
         elif isinstance(event, Disconnected):
             for key in [k for k, (_, connection) in self._open.items() if connection == event.connection]:
                 del self._open[key]
@@ -193,6 +201,8 @@ class Invariants:
 
     def _asked(self, event: RequestIn, effects: Sequence[Effect]) -> None:
         key = (event.name, event.request.id)
+        if event.request.kind == ControlRequest.ACTION:
+            self._actions[key] = str(event.request.subject)
         replied = any(isinstance(e, Reply) and e.response.id == event.request.id for e in effects)
         if event.request.id and not replied:
             self._open.setdefault(key, (self._timeline.monotonic_s(), event.connection))
@@ -207,6 +217,11 @@ class Invariants:
         if response.id and response.code != _NO_RESPONSE and NAME_TAKEN not in response.reason:
             before = self._definite.setdefault(key, response.code)
             self._must(before == response.code, f"{key} was answered {before}, and now {response.code}")
+            action = self._actions.get(key)
+            if action in _COUNTED and response.code in (_SUCCESS, _NOT_FREE):
+                times = self._microscope.executed[response.id, int(ControlRequest.ACTION)]
+                told = "done" if response.code == _SUCCESS else "refused"
+                self._must(times == (response.code == _SUCCESS), f"{key} was {told}, it was executed {times} times")
 
     def _answered_in_time(self, host: SchedulerHost) -> None:
         now_s = self._timeline.monotonic_s()
@@ -237,8 +252,13 @@ class Invariants:
 
     # --- packets ---
 
-    def _publish(self, packet: Packet) -> None:
+    def _publish(self, effect: Publish) -> None:
+        """In order, and nothing under two times, so that nobody takes it for two."""
+        packet, source_ns = effect.packet, effect.source_ns
         assert packet.time_ns is not None
+        if source_ns is not None and self.clocks_are_right:
+            first_ns = self._by_source.setdefault(source_ns, packet.time_ns)
+            self._must(first_ns == packet.time_ns, f"{packet.envelope} is published at {first_ns} and {packet.time_ns}")
         before = self._published.get(packet.time_ns)
         if before is not None:
             self._must(before == (packet.envelope, packet.payload), f"two packets at {packet.time_ns}")

@@ -21,7 +21,7 @@ from afspm.testing.deterministic.keeper import Keeper
 from afspm.testing.deterministic.microscope import FakeMicroscope, FakeScan, Habits
 from afspm.testing.deterministic.network import Weather
 from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import Timeline
+from afspm.testing.deterministic.timeline import GoesInCircles, Timeline
 
 _CALM = 0.15
 """The last part of a night, in which nothing bad happens any more and all must come right again."""
@@ -39,7 +39,7 @@ class Fault:
     for_s: float = 0.0
 
 
-FAULTS = ("kill", "freeze", "cut", "storm", "hang", "clock", "busy")
+FAULTS = ("kill", "outage", "freeze", "cut", "storm", "hang", "clock", "busy")
 CAST = {
     "experiment": behaviours.Experiment,
     "classifier": behaviours.Classifier,
@@ -52,6 +52,7 @@ CAST = {
     "listener": behaviours.Listener,
     "old": behaviours.Version1Experiment,
 }
+_TROUBLE = ("greedy", "crasher", "impostor", "operator", "stranger")
 _ALWAYS = ("experiment", "classifier", "corrector", "feedback")
 
 
@@ -200,6 +201,8 @@ class Night:
         """
         try:
             return self._run()
+        except GoesInCircles as error:
+            raise InvariantViolated(f"seed {self.plan.seed}, {self.plan}: {error}") from error
         except InvariantViolated as error:
             error.what = f"seed {self.plan.seed}, {self.plan}: {error.what}"
             raise
@@ -226,6 +229,10 @@ class Night:
         process = {"scheduler": self.scheduler, "translator": self.microscope, **self.components}[fault.whom]
         if fault.what == "kill":
             process.kill()
+        elif fault.what == "outage":
+            process.banned = True
+            process.kill()
+            self.timeline.after(fault.for_s, setattr, process, "banned", False)  # noqa: FBT003
         elif fault.what == "freeze":
             process.freeze(fault.for_s)
         elif fault.what == "busy":
@@ -238,6 +245,7 @@ class Night:
         elif fault.what == "hang":
             self._hang(fault.for_s)
         elif fault.what == "clock":
+            self.invariants.clocks_are_right = False
             self.microscope.habits.clock_error_s = self.timeline.random.choice((-100.0, 0.0, 100.0, 10_000.0))
 
     def _storm(self, for_s: float) -> None:
@@ -259,10 +267,11 @@ class Night:
         self.weather.doubles = habits.hangs = habits.loses_answer = 0.0
         self.scheduler.dies_in_step = 0.0
         self.dawn.start()
-        for name in ("greedy", "crasher", "impostor", "operator", "stranger"):
-            if name in self.components:
-                self.components[name].banned = True
-                self.components[name].kill()
+        for name, component in self.components.items():
+            component.banned = name in _TROUBLE
+            if component.banned:
+                component.kill()
+        self.scheduler.banned = self.microscope.banned = False
 
     def _come_right(self, scans: int) -> None:
         """In calm weather the experiment goes on, and everybody has what the cache holds."""

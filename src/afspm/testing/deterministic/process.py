@@ -19,7 +19,7 @@ class Process:
 
     Attributes:
         alive: there is a life.
-        banned: it is not started any more.
+        banned: it can't be started.
         frozen: it does nothing, and what comes waits.
         sockets: the connections that others have made to it, whether it has noticed or not.
         since_s: since when it has been at work: its start, or the end of its last freeze.
@@ -42,7 +42,10 @@ class Process:
     # --- for those who start and end it ---
 
     def start(self) -> None:
-        if self.alive or self.banned:
+        if self.alive:
+            return
+        if self.banned:
+            self.exited(1)
             return
         self.alive, self.frozen = True, False
         self.life += 1

@@ -10,6 +10,12 @@ from typing import Any
 START_S = 1_750_000_000.0
 """Experiment time at the beginning."""
 
+_STUCK = 10_000
+
+
+class GoesInCircles(Exception):
+    """Things happen, and time stands still."""
+
 
 class Timer:
     """Something that will happen, unless it is cancelled."""
@@ -39,6 +45,7 @@ class Timeline:
         self.happened = 0
         self._time_s = 0.0
         self._order = 0
+        self._moving = 0
         self._coming: list[tuple[float, int, Timer]] = []
 
     # --- the clock ---
@@ -74,6 +81,9 @@ class Timeline:
             time_s, _, timer = heapq.heappop(self._coming)
             if timer.cancelled:
                 continue
+            self._moving = 0 if time_s > self._time_s else self._moving + 1
+            if self._moving > _STUCK:
+                raise GoesInCircles(f"time stands still at {time_s} s: somebody goes round in circles")
             self._time_s = time_s
             self.happened += 1
             timer.do(*timer.args)

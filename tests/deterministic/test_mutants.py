@@ -1,0 +1,201 @@
+"""The invariants can fail: what is broken on purpose is found within a few nights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from afspm.logic import arbitration
+from afspm.logic.arbitration import Do, Event, Row
+from afspm.logic.cache import Cache
+from afspm.logic.forwarding import Forwarder
+from afspm.logic.lease import Lease
+from afspm.logic.once import OnceTable
+from afspm.logic.scheduling import SchedulerCore
+from afspm.logic.sessions import Hearing, Sessions
+from afspm.testing.deterministic.invariants import InvariantViolated
+from afspm.testing.deterministic.night import Fault, Night, Plan, plan
+
+NIGHTS = 60
+Patch = pytest.MonkeyPatch
+
+
+def _bad_night(seed: int) -> Plan:
+    """A night in which much goes wrong, half of them with a translator of version 1."""
+    hard = {"ids_known": seed % 2 == 0, "dies_in_step": 0.003, "doubles": 0.1, "hangs": 0.005}
+    outage = Fault("outage", "experiment", (seed % 10) / 10.0, 60.0)
+    drawn = plan(seed, hours=4.0)
+    return replace(drawn, faults=(*drawn.faults, outage), **hard)  # type: ignore[arg-type]
+
+
+def _rows(patch: Patch, event: Event, change: Callable[[tuple[Row, ...]], tuple[Row, ...]]) -> None:
+    patch.setitem(arbitration._ROWS, event, change(arbitration._ROWS[event]))
+
+
+def _without(condition: arbitration.Condition) -> Callable[[tuple[Row, ...]], tuple[Row, ...]]:
+    return lambda rows: tuple(row for row in rows if row.when is not condition)
+
+
+def _not_doing(do: Do) -> Callable[[tuple[Row, ...]], tuple[Row, ...]]:
+    return lambda rows: tuple(replace(row, do=tuple(d for d in row.do if d is not do)) for row in rows)
+
+
+def flag_leaves_control(patch: Patch) -> None:
+    _rows(patch, Event.FLAG, _not_doing(Do.TAKE))
+
+
+def two_in_control(patch: Patch) -> None:
+    _rows(patch, Event.REQUEST_CONTROL, _without(arbitration.OTHER_HOLDS))
+
+
+def anybody_while_flagged(patch: Patch) -> None:
+    _rows(patch, Event.REQUEST_CONTROL, _without(arbitration.SOLVES_NONE))
+
+
+def manual_lets_in(patch: Patch) -> None:
+    _rows(patch, Event.REQUEST_CONTROL, _without(arbitration.IS_MANUAL))
+
+
+def manual_leaves_control(patch: Patch) -> None:
+    _rows(patch, Event.SET_MODE, _not_doing(Do.TAKE))
+
+
+def solver_stays_when_solved(patch: Patch) -> None:
+    _rows(patch, Event.CLEAR, _not_doing(Do.TAKE))
+
+
+def anybody_commands(patch: Patch) -> None:
+    rows = arbitration._ROWS[Event.COMMAND]
+    _rows(patch, Event.COMMAND, lambda _: (replace(rows[0], when=arbitration.OTHERWISE),))
+
+
+def the_dead_keep_control(patch: Patch) -> None:
+    _rows(patch, Event.DEAD, _not_doing(Do.TAKE))
+
+
+def no_lease(patch: Patch) -> None:
+    patch.setattr(Lease, "deadline_ns", lambda self: None)
+
+
+def nobody_is_dead(patch: Patch) -> None:
+    patch.setattr(SchedulerCore, "_holder_dead_at_s", lambda self: None)
+
+
+def an_impostor_is_let_in(patch: Patch) -> None:
+    real = Sessions.hear
+
+    def hear(self: Sessions, *args: Any) -> Hearing:
+        hearing = real(self, *args)
+        if hearing is Hearing.TAKEN:
+            self._bind(args[1], None, args[0])
+            return Hearing.ACCEPTED
+        return hearing
+
+    patch.setattr(Sessions, "hear", hear)
+
+
+def ids_are_forgotten(patch: Patch) -> None:
+    patch.setattr(OnceTable, "look_up", lambda self, client, request: None)
+
+
+def sent_actions_are_not_saved(patch: Patch) -> None:
+    real = SchedulerCore.snapshot
+    patch.setattr(SchedulerCore, "snapshot", lambda self: {**real(self), "sent": []})
+
+
+def nothing_expires(patch: Patch) -> None:
+    patch.setattr(Forwarder, "expire", lambda self, now_s: [])
+
+
+def any_answer_will_do(patch: Patch) -> None:
+    real = Forwarder.answered
+
+    def answered(self: Forwarder, number: int, response: Any, now_s: float) -> Any:
+        return real(self, self.flight.number if self.flight else number, response, now_s)
+
+    patch.setattr(Forwarder, "answered", answered)
+
+
+def nothing_is_called_back(patch: Patch) -> None:
+    patch.setattr(SchedulerCore, "_call_back", lambda self, former, cause: None)
+
+
+def told_before_saved(patch: Patch) -> None:
+    real = SchedulerCore._control_changed
+
+    def changed(self: SchedulerCore, *args: Any) -> None:
+        real(self, *args)
+        self._effects.sort(key=lambda effect: type(effect).__name__ == "SaveState")
+
+    patch.setattr(SchedulerCore, "_control_changed", changed)
+
+
+def times_go_back(patch: Patch) -> None:
+    def next_ns(self: Cache, time_ns: int) -> int:
+        self._last_ns = time_ns
+        return time_ns
+
+    patch.setattr(Cache, "_next_ns", next_ns)
+
+
+def doubles_of_the_translator_pass(patch: Patch) -> None:
+    patch.setattr(Cache, "remember", lambda self, recent: None)
+    patch.setattr(Cache, "start", lambda self, now_ns: self.not_before(now_ns))
+
+
+def replay_by_one_newest_time(patch: Patch) -> None:
+    real = Cache.replay
+    patch.setattr(Cache, "replay", lambda self, prefixes, since_ns: real(self, prefixes, since_ns)[-3:])
+
+
+def replay_envelope_by_envelope(patch: Patch) -> None:
+    real = Cache.replay
+
+    def replay(self: Cache, prefixes: Any, since_ns: int) -> Any:
+        return tuple(sorted(real(self, prefixes, since_ns), key=lambda packet: packet.envelope))
+
+    patch.setattr(Cache, "replay", replay)
+
+
+MUTANTS = [
+    flag_leaves_control,
+    two_in_control,
+    anybody_while_flagged,
+    manual_lets_in,
+    manual_leaves_control,
+    solver_stays_when_solved,
+    anybody_commands,
+    the_dead_keep_control,
+    no_lease,
+    nobody_is_dead,
+    an_impostor_is_let_in,
+    ids_are_forgotten,
+    sent_actions_are_not_saved,
+    nothing_expires,
+    any_answer_will_do,
+    nothing_is_called_back,
+    told_before_saved,
+    times_go_back,
+    doubles_of_the_translator_pass,
+    replay_by_one_newest_time,
+    replay_envelope_by_envelope,
+]
+
+
+def _nights() -> None:
+    for seed in range(NIGHTS):
+        Night(_bad_night(seed)).run()
+
+
+def test_without_a_mutant_nothing_is_found() -> None:
+    _nights()
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)
+def test_a_broken_scheduler_is_found(mutant: Callable[[Patch], None], monkeypatch: Patch) -> None:
+    mutant(monkeypatch)
+    with pytest.raises(InvariantViolated):
+        _nights()

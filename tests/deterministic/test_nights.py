@@ -1,0 +1,72 @@
+"""Whole experiments in simulation, with everything that can go wrong going wrong; the invariants hold at every step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from afspm.testing import longrun
+from afspm.testing.deterministic.night import CAST, FAULTS, Fault, Night, Plan, plan
+
+# together a few thousand experiment hours; more: python -m afspm.testing.longrun
+CHUNKS = [range(first, first + 30) for first in range(0, 240, 30)]
+
+
+@pytest.mark.parametrize("seeds", CHUNKS, ids=lambda seeds: f"seeds-{seeds.start}-{seeds.stop - 1}")
+def test_every_invariant_holds_in_many_nights(seeds: range) -> None:
+    for seed in seeds:
+        Night(plan(seed)).run()
+
+
+def test_the_nights_are_a_few_thousand_hours() -> None:
+    assert sum(plan(seed).hours for seeds in CHUNKS for seed in seeds) >= 1900.0
+
+
+def test_a_night_replays_exactly() -> None:
+    first, second = Night(plan(7)), Night(plan(7))
+    assert first.run() == second.run()
+    assert first.timeline.happened == second.timeline.happened
+    assert first.scheduler.disk == second.scheduler.disk
+
+
+def test_a_quiet_night_is_full_of_scans() -> None:
+    night = Night(Plan(seed=3, hours=8.0))
+    outcome = night.run()
+    assert outcome.scans > 8.0 * 3600.0 / night.microscope.habits.scan_s / 2.0
+    assert outcome.given_up == []
+
+
+def test_the_long_run_tells_what_it_did(capsys: pytest.CaptureFixture[str]) -> None:
+    assert longrun.main(["--nights", "2", "--seed", "5"]) == 0
+    assert "every invariant held" in capsys.readouterr().out
+
+
+_targets = st.sampled_from(["scheduler", "translator", *CAST])
+_faults = st.builds(
+    Fault,
+    what=st.sampled_from(FAULTS),
+    whom=_targets,
+    when=st.floats(0.0, 1.0),
+    for_s=st.sampled_from([0.01, 1.0, 5.0, 11.0, 40.0]),
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    seed=st.integers(0, 2**32),
+    faults=st.lists(_faults, max_size=12),
+    impostor=st.booleans(),
+    ids_known=st.booleans(),
+    lease_s=st.sampled_from([None, 900.0]),
+    dies_in_step=st.sampled_from([0.0, 0.002]),
+)
+def test_no_schedule_of_faults_breaks_an_invariant(
+    seed: int, faults: list[Fault], impostor: bool, ids_known: bool, lease_s: float | None, dies_in_step: float
+) -> None:
+    cast = tuple(name for name in CAST if lease_s is not None or name != "greedy")
+    faults = [fault for fault in faults if fault.whom in ("scheduler", "translator", *cast)]
+    made = Plan(seed, hours=2.0, speed=200.0, cast=cast, impostor=impostor, ids_known=ids_known, lease_s=lease_s)
+    Night(replace(made, faults=tuple(faults), dies_in_step=dies_in_step, doubles=0.05)).run()
