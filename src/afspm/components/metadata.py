@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -95,10 +96,10 @@ class Metadata(Component):
 
     def on_scan(self, scan: Scan) -> None:
         if scan.values.size:
-            self._write(scan_row(scan, self._circumstances("scan", scan.time_ns)))
+            self._write("scan", scan.time_ns, lambda at: scan_row(scan, at))
 
     def on_spectrum(self, spectrum: Spectrum) -> None:
-        self._write(spectrum_row(spectrum, self._circumstances("spectrum", spectrum.time_ns)))
+        self._write("spectrum", spectrum.time_ns, lambda at: spectrum_row(spectrum, at))
 
     def _circumstances(self, what: str, time_ns: int | None) -> Circumstances:
         """Those noted when it began, if it is the measurement that they were noted for."""
@@ -112,13 +113,14 @@ class Metadata(Component):
             return Circumstances()  # a later one, that began while we were not running
         return Circumstances(*self.memory["circumstances"])
 
-    def _write(self, row: list[str]) -> None:
-        if _identity(row) in self._written:
-            return
+    def _write(self, what: str, time_ns: int | None, row_at: Callable[[Circumstances], list[str]]) -> None:
+        identity = _identity(row_at(Circumstances()))
+        if identity in self._written:
+            return  # replayed after a restart
         line = io.StringIO()
-        csv.writer(line, lineterminator="").writerow(row)
+        csv.writer(line, lineterminator="").writerow(row_at(self._circumstances(what, time_ns)))
         self._table.append([line.getvalue().replace("\n", " ")])
-        self._written.add(_identity(row))
+        self._written.add(identity)
 
 
 def scan_row(scan: Scan, circumstances: Circumstances) -> list[str]:

@@ -7,6 +7,7 @@ draws it again from what a run has left.
 
 from __future__ import annotations
 
+import io
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -43,8 +44,11 @@ PAPER = (255, 255, 255)
 
 
 def prepare() -> None:
-    """Load what takes long to load."""
-    _figure(1.0)
+    """Load what takes long to load: modules, fonts, colours."""
+    _palette()
+    figure = _figure(1.0)
+    figure.add_axes((0.0, 0.0, 1.0, 1.0)).text(0.5, 0.5, "a", weight="bold")
+    figure.savefig(io.BytesIO(), dpi=50)
 
 
 def draw(
@@ -167,7 +171,7 @@ def _bands(
     _actions(ax, record, {holder: lane for lane, holder in enumerate(record.holders)}, limits)
     ax.axhline(first - 0.5, color="black", linewidth=0.5)
     ax.set_xlim(*limits)
-    ax.set_ylim(len(labels) - 0.5, -0.5)
+    ax.set_ylim(max(len(labels), 1) - 0.5, -0.5)
     ax.set_yticks(range(len(labels)), labels if names_too else [""] * len(labels), size=5.5, linespacing=0.95)
     ax.tick_params(axis="y", length=0)
     ax.set_facecolor("#F4F4F4")

@@ -1,0 +1,134 @@
+"""The table of what was measured: right, complete, and nothing twice."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runtime_lab import REGION, Lab, Nothing, context_of, run
+
+from afspm.components.metadata import COLUMNS, Metadata, iso_utc
+from afspm.components.records import LineFile
+from afspm.logic import arbitration as a
+from afspm.model import ControlMode, Problem, ScopeState, Spectrum
+from afspm.runtime.exit_codes import ExitCode
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "metadata.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def scanned(lab: Lab, at_s: float) -> None:
+    """A scan that somebody else takes, 100 s long."""
+    lab.at(at_s, lambda: lab._go(ScopeState.SCANNING))
+    lab.at(at_s + 100.0, lambda: lab.publish_scan(REGION))
+    lab.at(at_s + 100.0, lambda: lab._go(ScopeState.FREE))
+
+
+def held_by(lab: Lab, name: str, at_s: float) -> None:
+    lab.at(at_s, lambda: lab.does(a.Event.REQUEST_CONTROL, name))
+
+
+def test_a_row_for_each_channel_says_where_and_who_was_in_control_when_the_scan_began(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    held_by(lab, "series", 5.0)
+    scanned(lab, 10.0)
+    lab.at(50.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))  # control is lost, which stops it in this laboratory
+    lab.at(50.0, lambda: lab.publish_scan(REGION))  # but not on every microscope
+    lab.at(300.0, lab.kill)
+    assert run(Metadata(), lab, run_dir=str(tmp_path)) == ExitCode.ENDED
+    found = rows(tmp_path)
+    assert [row["channel"] for row in found[:2]] == ["Height", "Phase"]
+    first = found[0]
+    assert (first["in_control"], first["mode"], first["problems"]) == ("series", "automated", "")
+    assert (first["center_x"], first["width"], first["length_units"]) == ("0", "1e-06", "m")
+    assert (first["columns"], first["rows"], first["units"]) == ("8", "8", "m")
+
+
+def test_mode_and_problems_are_those_of_the_beginning(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    lab.at(5.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(6.0, lambda: lab.set_mode(ControlMode.MANUAL))
+    scanned(lab, 10.0)
+    lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    lab.at(300.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    assert {(r["in_control"], r["mode"], r["problems"]) for r in rows(tmp_path)} == {
+        ("", "manual", "tip-shape-changed")
+    }
+
+
+def test_a_spectrum_has_a_row_with_its_position(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    spectrum = Spectrum(
+        (1e-7, -2e-7), "IV", ("U", "I"), ("V", "A"), np.zeros((5, 2)), 1_700_000_000_000_000_000, "a.dat"
+    )
+    lab.at(5.0, lambda: lab.publish(spectrum))
+    lab.at(10.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    (row,) = rows(tmp_path)
+    assert (row["measurement"], row["channel"], row["filename"]) == ("spectrum", "IV", "a.dat")
+    assert (row["center_x"], row["center_y"]) == ("1e-07", "-2e-07")
+    assert row["time"] == "2023-11-14T22:13:20.000000Z"
+
+
+@pytest.mark.parametrize("killed_at_s", [50.0, 105.0, 112.0, 160.0, 215.0])
+def test_killed_at_any_time_there_is_one_header_and_no_row_twice(tmp_path: Path, killed_at_s: float) -> None:
+    lab = Lab("metadata")
+    held_by(lab, "series", 5.0)
+    scanned(lab, 10.0)
+    scanned(lab, 200.0)
+    first_life = context_of(lab, tmp_path / "state", run_dir=str(tmp_path))
+    lab.at(killed_at_s, lab.parent_goes)
+    assert Metadata().run_process(first_life) == ExitCode.ORPHAN
+    lab.restart_component()
+    lab.at(500.0, lab.kill)
+    run(Metadata(), lab, tmp_path / "state", run_dir=str(tmp_path))
+    text = (tmp_path / "metadata.csv").read_text()
+    assert text.count("measurement") == 1
+    found = rows(tmp_path)
+    assert len(found) == len({(row["time"], row["channel"]) for row in found}) == 4
+    assert {row["in_control"] for row in found} == {"series"}
+
+
+def test_a_scan_whose_beginning_nobody_saw_says_nothing_of_who_took_it(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    held_by(lab, "series", 1.0)
+    lab.at(5.0, lambda: lab.publish_scan(REGION))
+    lab.at(10.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    assert {row["in_control"] for row in rows(tmp_path)} == {""}
+
+
+def test_a_row_that_a_kill_cut_in_two_is_taken_away(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    LineFile(path, "a,b").append(["1,2", "3,4"])
+    with path.open("a") as file:
+        file.write("5,")
+    again = LineFile(path, "a,b")
+    assert again.lines() == ["1,2", "3,4"]
+    again.append(["5,6"])
+    assert path.read_text() == "a,b\n1,2\n3,4\n5,6\n"
+
+
+def test_a_header_that_a_kill_cut_in_two_is_written_again(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("a,")
+    LineFile(path, "a,b").append(["1,2"])
+    assert path.read_text() == "a,b\n1,2\n"
+
+
+def test_nothing_measured_leaves_no_file(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    with pytest.raises(Nothing):
+        run(Metadata(), lab, run_dir=str(tmp_path))
+    assert not (tmp_path / "metadata.csv").exists()
+
+
+def test_times_keep_their_microseconds_and_columns_their_order() -> None:
+    assert iso_utc(1_700_000_000_123_456_789) == "2023-11-14T22:13:20.123456Z"
+    assert iso_utc(None) == ""
+    assert COLUMNS[:4] == ("time", "measurement", "filename", "channel")

@@ -1,0 +1,172 @@
+"""The picture of the night, and the record that it is drawn from."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runtime_lab import REGION, Lab, context_of, run
+
+from afspm import wire
+from afspm.components.night_picture import NightPicture
+from afspm.components.night_record import (
+    THUMBNAIL_PX,
+    NightRecord,
+    control_entry,
+    mark_entry,
+    scan_entry,
+    thumbnail,
+)
+from afspm.components.verdicts import BAD, MESSAGE, verdict_message
+from afspm.model import ControlMode, ControlState, Problem, Region, Scan, ScopeState
+from afspm.runtime.exit_codes import ExitCode
+
+pytest.importorskip("matplotlib")
+from afspm.components.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by, main
+
+MINUTE_NS = 60_000_000_000
+TIP = int(Problem.TIP_SHAPE_CHANGED)
+
+
+def scan(time_ns: int = 0) -> Scan:
+    return Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.random.default_rng(1).random((128, 128)), time_ns)
+
+
+def night(scans: int = 12) -> NightRecord:
+    """A series, a problem in the middle, its repair."""
+    record = NightRecord()
+    middle = scans * 10 * MINUTE_NS // 2
+    record.add(control_entry(ControlState(holder="series"), 0))
+    for number in range(scans):
+        end = (10 * number + 2) * MINUTE_NS
+        record.add(scan_entry(scan(end), end, end - MINUTE_NS, "series"))
+    record.add(mark_entry("tip_classifier", "verdict", middle, BAD, 12 * MINUTE_NS))
+    record.add(control_entry(ControlState(problems=(TIP,)), middle))
+    record.add(control_entry(ControlState(holder="tip_corrector", problems=(TIP,)), middle + MINUTE_NS))
+    record.add(mark_entry("tip_corrector", "x-pulse", middle + 2 * MINUTE_NS))
+    record.add(control_entry(ControlState(), middle + 5 * MINUTE_NS))
+    record.add(control_entry(ControlState(holder="series"), middle + 6 * MINUTE_NS))
+    return record
+
+
+def test_spans_of_control_and_problems_are_read_from_the_states() -> None:
+    record = night()
+    assert record.holders == ["series", "tip_corrector"]
+    (first, second) = record.control_spans("series")
+    assert (first.start_ns, first.end_ns) == (0, 60 * MINUTE_NS)
+    assert second.end_ns is None
+    (problem,) = record.problem_spans(TIP)
+    assert (problem.start_ns, problem.end_ns) == (60 * MINUTE_NS, 65 * MINUTE_NS)
+    assert flagged_by(record, problem) == "tip_classifier"
+
+
+def test_a_record_is_the_same_after_being_written_and_read_and_knows_what_it_has() -> None:
+    entries = [control_entry(ControlState(ControlMode.MANUAL, None, (TIP,)), 5), scan_entry(scan(7), 7, None, None)]
+    lines = [json.dumps(entry) for entry in entries]
+    record = NightRecord.from_lines([*lines, *lines, "{half a li", '{"kind": "unknown", "time_ns": 1}'])
+    assert len(record.control) == len(record.shots) == 1
+    assert record.control[0][1].mode is ControlMode.MANUAL
+    assert record.shots[0].picture.shape == (THUMBNAIL_PX, THUMBNAIL_PX)
+    assert not record.add(entries[1])
+
+
+def test_who_took_a_scan_whose_beginning_was_missed_is_who_was_in_control_at_its_end() -> None:
+    record = NightRecord()
+    record.add(control_entry(ControlState(holder="series"), 1))
+    record.add(scan_entry(scan(9), 9, None, None))
+    assert record.holder_of(record.shots[0]) == "series"
+
+
+def test_a_thumbnail_is_small_and_shows_scans_of_any_shape_and_with_holes() -> None:
+    values = np.arange(1000.0 * 300).reshape(1000, 300)
+    values[10:20] = np.nan
+    picture = thumbnail(values)
+    assert max(picture.shape) <= THUMBNAIL_PX
+    assert picture.dtype == np.uint8
+    assert np.ptp(picture) == 255
+    assert thumbnail(np.zeros((5, 5))).shape == (5, 5)
+
+
+def test_too_many_scans_are_thinned_but_not_those_that_something_happened_to() -> None:
+    record = night(scans=300)
+    record.add(scan_entry(scan(1), 1501 * MINUTE_NS, 1500 * MINUTE_NS, "tip_corrector"))
+    chosen = _chosen(record)
+    assert len(chosen) <= MOST_SHOTS
+    assert any(shot.holder == "tip_corrector" for shot in chosen)
+    assert any(record.verdict(shot) == BAD for shot in chosen)
+
+
+def test_problems_that_overlap_are_one_episode() -> None:
+    record = NightRecord()
+    for time_ns, problems in ((1, (1,)), (2, (1, 2)), (3, (2,)), (4, ()), (9, (1,))):
+        record.add(control_entry(ControlState(problems=problems), time_ns))
+    assert [(span.start_ns, span.end_ns) for span in _episodes(record)] == [(1, 4), (9, None)]
+
+
+@pytest.mark.parametrize("record", [night(), night(300), night(1)], ids=["usual", "long", "short"])
+def test_a_picture_is_drawn(tmp_path: Path, record: NightRecord) -> None:
+    draw(record, tmp_path / "night.png", {TIP: "tip-shape-changed"}, title="A night", simulated=True)
+    assert (tmp_path / "night.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "night.png").stat().st_size > 10_000
+
+
+def _lab() -> Lab:
+    lab = Lab("night_picture")
+    lab.channels = ("Height",)
+    for number in range(3):
+        at_s = 100.0 * (number + 1)
+        lab.at(at_s, lambda: lab._go(ScopeState.SCANNING))
+        lab.at(at_s + 50, lambda: lab.publish_scan(REGION, (64, 64)))
+    told = verdict_message(scan(4), BAD)
+    lab.at(320.0, lambda: lab.publish(told, f"{MESSAGE}_tip_classifier"))
+    lab.at(330.0, lambda: lab.publish(wire.message_type("ActionMsg")(action="x-pulse"), "ActionMsg_tip_corrector"))
+    return lab
+
+
+def test_the_component_draws_when_the_experiment_ends(tmp_path: Path) -> None:
+    lab = _lab()
+    lab.at(500.0, lab.kill)
+    component = NightPicture()
+    assert run(component, lab, tmp_path / "state", run_dir=str(tmp_path), simulated=True) == ExitCode.ENDED
+    assert len(component.record.shots) == 3
+    assert {(mark.by, mark.what) for mark in component.record.marks} == {
+        ("tip_classifier", "verdict"),
+        ("tip_corrector", "x-pulse"),
+    }
+    assert (tmp_path / "night.png").exists()
+
+
+def test_a_restart_loses_nothing_and_doubles_nothing(tmp_path: Path) -> None:
+    lab = _lab()
+    lab.at(225.0, lab.parent_goes)
+    NightPicture().run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
+    lab.restart_component()
+    lab.at(600.0, lab.kill)
+    component = NightPicture()
+    run(component, lab, tmp_path / "state", run_dir=str(tmp_path))
+    times = [shot.time_ns for shot in component.record.shots]
+    assert len(times) == len(set(times)) == 3
+
+
+def test_the_picture_can_be_drawn_again_from_the_run_folder(tmp_path: Path) -> None:
+    lab = _lab()
+    lab.at(500.0, lab.kill)
+    run(NightPicture(), lab, tmp_path / "state", run_dir=str(tmp_path))
+    (tmp_path / "night.png").unlink()
+    main(str(tmp_path))
+    assert (tmp_path / "night.png").exists()
+
+
+def test_simulated_is_written_on_the_picture_only_where_it_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    written: list[str] = []
+    text = Figure.text
+    monkeypatch.setattr(Figure, "text", lambda self, x, y, s, **k: written.append(s) or text(self, x, y, s, **k))
+    draw(night(), tmp_path / "measured.png", {})
+    assert not any(re.search("SIMULATED", s) for s in written)
+    draw(night(), tmp_path / "simulated.png", {}, simulated=True)
+    assert "SIMULATED" in written
