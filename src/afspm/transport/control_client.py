@@ -28,20 +28,35 @@ class ControlClient:
         self._address = address
         self._scheduler_is_ours = False
         self._connected = False
+        self._unanswered = b""
         self.touched = True
         self.socket = network.socket(zmq.DEALER)
         self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
-        self.monitor = Monitor(self.socket, CONNECTED | DISCONNECTED)
+        self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 
     def send(self, frames: Sequence[bytes]) -> None:
-        """Ask; dropped while there is no scheduler."""
+        """Ask; dropped while there is no scheduler.
+
+        Asked again what was asked last, with no answer in between, it makes the connection anew: a connection that
+        stands but leads nowhere (cut off, or its name was taken by another process) would never lead anywhere again.
+        """
         if not self._connected:
             return
+        asked = frames[2] if len(frames) > 2 else b""
+        if asked and asked == self._unanswered:
+            self._reconnect()
+            return
+        self._unanswered = asked
         self.touched = True
         # full: the scheduler has stood still for thousands of requests
         with contextlib.suppress(zmq.Again):
             send(self.socket, [b"", *frames])
+
+    def _reconnect(self) -> None:
+        self._connected, self._unanswered = False, b""
+        self.socket.disconnect(self._address)
+        self.socket.connect(self._address)
 
     def receive(self) -> list[Incoming]:
         """The next answer."""
@@ -59,7 +74,7 @@ class ControlClient:
         """The scheduler's coming and going."""
         found: list[Incoming] = []
         for event in self.monitor.drain():
-            self._connected = event.kind == CONNECTED
+            self._connected, self._unanswered = event.kind == CONNECTED, b""
             if self._connected:
                 self._greet()
                 found.append(ControlConnected())
@@ -71,6 +86,7 @@ class ControlClient:
         if len(frames) < 2 or frames[0]:
             raise WireError("there is no empty frame before it")
         response = wire.decode_response(frames[1:])
+        self._unanswered = b""
         self._scheduler_is_ours = self._scheduler_is_ours or bool(response.id)
         return ReplyReceived(response)
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import zmq
 
 from afspm.transport.frames import readable
+from afspm.transport.network import Network
 
 CONNECTED = int(zmq.EVENT_HANDSHAKE_SUCCEEDED)
 DISCONNECTED = int(zmq.EVENT_DISCONNECTED)
@@ -31,13 +32,12 @@ class Monitor:
     monitor knows every event that came before the message.
     """
 
-    def __init__(self, socket: zmq.Socket[bytes], events: int) -> None:
+    def __init__(self, network: Network, socket: zmq.Socket[bytes], events: int) -> None:
         self._watched = socket
         self.touched = True
         address = f"inproc://monitor-{next(_numbers)}"
         socket.monitor(address, events)
-        self.socket: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)
-        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket = network.socket(zmq.PAIR)
         self.socket.setsockopt(zmq.RCVHWM, 0)
         self.socket.connect(address)
 

@@ -12,6 +12,8 @@ from afspm.transport.frames import descriptor_of, readable, receive, send, user_
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import QUEUE_LENGTH, Network
 
+_MOST_ROUNDS = 100
+
 
 class PeerConnected(NamedTuple):
     connection: int
@@ -66,45 +68,72 @@ class Router:
         self._identities: dict[int, bytes] = {}
         self.socket = network.socket(zmq.ROUTER)
         self.socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
-        self.monitor = Monitor(self.socket, ACCEPTED | DISCONNECTED)
+        self.monitor = Monitor(network, self.socket, ACCEPTED | DISCONNECTED)
         self.address = network.bind(self.socket, address)
 
     def receive(self) -> list[RouterEvent]:
-        """The next request, and what happened to connections if it may have to do with it."""
+        """The next request; if it has to do with a change of connections, that change too and all that came with it."""
         self.touched = True
         frames = receive(self.socket)
         if not frames:
             return []
-        identity, descriptor = frames[0].bytes, descriptor_of(frames[0])
-        if descriptor is None:
-            return []
-        peer = self._by_descriptor.get(descriptor)
-        if peer is not None and peer.identity == identity and not readable(self.monitor.socket):
+        peer = self._by_descriptor.get(descriptor_of(frames[0]) or -1)
+        if peer is not None and peer.identity == frames[0].bytes and not readable(self.monitor.socket):
             return self._interpret(peer, frames)
-        # the monitor tells everything in order: it knows of every connection that anything has come by
-        changes = self._changes()
-        current = self._by_descriptor.get(descriptor)
-        gone = next(
-            (p for p, came in changes if not came and (p.descriptor, p.identity) == (descriptor, identity)), None
-        )
-        if current is None or (current.identity not in (identity, None) and gone is not None):
-            said = [] if gone is None else self._interpret(gone, frames)
-            return said + [self._tell(peer, came=came) for peer, came in changes]
-        if current.identity not in (identity, None):
-            # what was left of an earlier connection had been taken for the first words of this one
-            changes += [(current, False), (current := self._new(descriptor), True)]
-        found = [self._tell(peer, came=came) for peer, came in changes]
-        self._introduce(current, frames[0], identity)
-        return found + self._interpret(current, frames)
+        return self._settle([frames])
 
     def follow(self) -> list[RouterEvent]:
-        """Connections that came and went, in order, after what they said before."""
-        found: list[RouterEvent] = []
-        for _ in range(QUEUE_LENGTH):
-            if not readable(self.socket):
+        """Connections that came and went, and what came with them."""
+        return self._settle([])
+
+    def _settle(self, messages: list[list[zmq.Frame]]) -> list[RouterEvent]:
+        """Connections in the order in which they came and went, with what was said by each before it went."""
+        changes: list[tuple[_Peer, bool]] = []
+        for _ in range(_MOST_ROUNDS):
+            while len(messages) < QUEUE_LENGTH and readable(self.socket):
+                messages.append(receive(self.socket))
+            # The monitor tells everything in order: it knows of every connection that these came by, and once it has
+            # nothing new, they are all that was said by those that it said are gone.
+            news = self._changes()
+            if not news:
                 break
-            found += self.receive()
-        return found + [self._tell(peer, came=came) for peer, came in self._changes()]
+            changes += news
+        said: list[tuple[_Peer, list[RouterEvent]]] = []
+        for frames in messages:
+            sender = self._sender(frames[0], changes)
+            if sender is not None:
+                said.append((sender, self._interpret(sender, frames)))
+        told: list[RouterEvent] = []
+        for peer, came in changes:
+            if came:
+                told.append(PeerConnected(peer.connection))
+                continue
+            for sender, events in said:
+                if sender is peer:
+                    told += events
+            told.append(PeerDisconnected(peer.connection))
+            self._identities.pop(peer.connection, None)
+        gone = {peer.connection for peer, came in changes if not came}
+        for sender, events in said:
+            if sender.connection not in gone:
+                told += events
+        return told
+
+    def _sender(self, first: zmq.Frame, changes: list[tuple[_Peer, bool]]) -> _Peer | None:
+        """Whose message this is. A descriptor is given out again at once, so several may have had it."""
+        identity, descriptor = first.bytes, descriptor_of(first)
+        if descriptor is None:
+            return None
+        current = self._by_descriptor.get(descriptor)
+        gone = [peer for peer, came in changes if not came and peer.descriptor == descriptor]
+        if current is None or current.identity not in (identity, None):
+            former = next((peer for peer in gone if peer.identity in (identity, None)), None)
+            if former is not None or current is None:
+                return former and self._introduced(former, first, identity)
+            # what was left of an earlier connection had been taken for the first words of this one
+            changes += [(current, False), (current := self._new(descriptor), True)]
+        unheard = next((peer for peer in gone if peer.identity is None), None)
+        return self._introduced(unheard if current.identity is None and unheard else current, first, identity)
 
     def reply(self, connection: int, frames: Sequence[bytes]) -> None:
         """Answer by `connection`, if it is still there. Never blocks."""
@@ -135,17 +164,12 @@ class Router:
         peer = self._by_descriptor[descriptor] = _Peer(self._connections, descriptor)
         return peer
 
-    def _tell(self, peer: _Peer, *, came: bool) -> RouterEvent:
-        if came:
-            return PeerConnected(peer.connection)
-        self._identities.pop(peer.connection, None)
-        return PeerDisconnected(peer.connection)
-
-    def _introduce(self, peer: _Peer, first: zmq.Frame, identity: bytes) -> None:
+    def _introduced(self, peer: _Peer, first: zmq.Frame, identity: bytes) -> _Peer:
         if peer.identity is None:
             peer.identity = self._identities[peer.connection] = identity
             peer.name = _name(identity)
             peer.user = user_of(first) if self._with_keys else None
+        return peer
 
     def close(self) -> None:
         self.monitor.close()

@@ -57,7 +57,7 @@ class Subscriber:
         self.touched = True
         # unlike SUB, XSUB takes what is sent to it under any topic, and lets the marker through as it is
         self.socket = network.socket(zmq.XSUB, max_bytes=MAX_PACKET_BYTES)
-        self.monitor = Monitor(self.socket, CONNECTED)
+        self.monitor = Monitor(network, self.socket, CONNECTED)
         for prefix in self._prefixes:
             self.socket.send(b"\1" + prefix.encode())
         network.connect(self.socket, address)

@@ -43,7 +43,7 @@ class TranslatorLink:
         # nothing waits for a translator that is gone, to be carried out when it is back. (With this an answer may be
         # lost together with the connection: it is asked for again by its id.)
         self.socket.setsockopt(zmq.IMMEDIATE, 1)
-        self.monitor = Monitor(self.socket, CONNECTED | DISCONNECTED)
+        self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 
     def send(self, number: int, frames: Sequence[bytes]) -> bool:

@@ -1,0 +1,72 @@
+"""Heartbeats: they come while a process is busy, and say so."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+
+from afspm.transport.heartbeat import Heartbeat, HeartbeatListener, HeartbeatSender, read_beat
+from afspm.transport.wakeup import WakeUp
+
+
+def beats(listener: HeartbeatListener, count: int, timeout_s: float = 5.0) -> list[Heartbeat]:
+    found: list[Heartbeat] = []
+    deadline_s = time.monotonic() + timeout_s
+    while len(found) < count:
+        assert time.monotonic() < deadline_s, "no beats"
+        found += listener.poll(0.1)
+    return found
+
+
+def test_the_first_beat_comes_at_once_and_others_follow_with_the_age_of_the_step(open_: Any) -> None:
+    listener = open_(HeartbeatListener())
+    address = listener.listen("Component")
+    sender = open_(HeartbeatSender(address, 60.0, lambda: 1.5, lambda: 30.0))
+    assert beats(listener, 1) == [Heartbeat("Component", False, 1.5, 30.0)]
+    sender.close()
+    assert beats(listener, 1)[-1] == Heartbeat("Component", True, 1.5, 30.0)
+
+
+def test_beats_come_at_their_period_while_the_main_thread_does_nothing_of_the_kind(open_: Any) -> None:
+    listener = open_(HeartbeatListener())
+    open_(HeartbeatSender(listener.listen("Component"), 0.02, lambda: 0.0, lambda: 30.0))
+    assert len(beats(listener, 5)) >= 5
+
+
+def test_each_process_is_heard_under_its_own_name(open_: Any) -> None:
+    listener = open_(HeartbeatListener())
+    for name in ("One", "Two"):
+        open_(HeartbeatSender(listener.listen(name), 0.02, lambda: 0.0, lambda: 30.0))
+    names: set[str] = set()
+    deadline_s = time.monotonic() + 5.0
+    while names != {"One", "Two"}:
+        assert time.monotonic() < deadline_s
+        names |= {beat.name for beat in listener.poll(0.1)}
+
+
+def test_waiting_for_beats_ends_when_woken_up(open_: Any) -> None:
+    wake_up: WakeUp[str] = open_(WakeUp())
+    listener = open_(HeartbeatListener(wake_up))
+    listener.listen("Component")
+    wake_up.post("signal")
+    assert listener.poll(None) == []
+    assert wake_up.take() == ["signal"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "beat"),
+    [
+        ([b"\0"], Heartbeat("C", False)),
+        ([b"\1"], Heartbeat("C", True)),
+        ([b"\0", b"2.5"], Heartbeat("C", False, 2.5)),
+        ([b"\0", b"nan", b"-1"], Heartbeat("C", False)),
+        ([b"\0", b"x", b"3"], Heartbeat("C", False, None, 3.0)),
+        ([b"\2"], None),
+        ([b""], None),
+        ([], None),
+    ],
+)
+def test_beats_of_ours_and_of_version_1_are_read_and_nothing_else(frames: list[bytes], beat: Heartbeat | None) -> None:
+    assert read_beat("C", frames) == beat
