@@ -143,7 +143,6 @@ def times_go_back(patch: Patch) -> None:
 
 def doubles_of_the_translator_pass(patch: Patch) -> None:
     patch.setattr(Cache, "remember", lambda self, recent: None)
-    patch.setattr(Cache, "start", lambda self, now_ns: self.not_before(now_ns))
 
 
 def replay_by_one_newest_time(patch: Patch) -> None:

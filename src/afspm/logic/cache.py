@@ -15,7 +15,6 @@ TIME_STEP_NS = 1_000
 _OVERHEAD_BYTES = 300  # of a kept packet beside its payload, so that a flood of empty ones is bounded too
 _TIMES_REMEMBERED = 4096
 _RECENT = 64
-_SET_BACK_NS = 10**9
 _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than that is not believed
 
 
@@ -44,7 +43,6 @@ class Cache:
         self._several = 0  # envelopes with more than one packet
         self._bytes = 0
         self._last_ns = 0
-        self._started_ns = 0
         self._sources: OrderedDict[int, None] = OrderedDict()
         self._newest_source_ns = -1
         self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
@@ -116,10 +114,6 @@ class Cache:
                 self._saw(source_ns)
             self._keep(packet, source_ns, (history_of or {}).get(packet.envelope, _TIMES_REMEMBERED))
 
-    def start(self, now_ns: int) -> None:
-        """It is this time, and all that was published before a restart was published earlier."""
-        self._started_ns = now_ns
-
     def not_before(self, time_ns: int) -> None:
         """What is published from here on is after this time."""
         self._last_ns = max(self._last_ns, time_ns)
@@ -149,11 +143,7 @@ class Cache:
         return len(self._kept)
 
     def _next_ns(self, time_ns: int) -> int:
-        last_ns = self._last_ns
-        if time_ns < last_ns - _SET_BACK_NS:
-            # far behind: what a former life of the scheduler published with made-up times is not known for certain
-            time_ns = self._started_ns
-        self._last_ns = max(time_ns, last_ns + TIME_STEP_NS)
+        self._last_ns = max(time_ns, self._last_ns + TIME_STEP_NS)
         return self._last_ns
 
     def _saw(self, source_ns: int) -> None:

@@ -91,7 +91,7 @@ class SchedulerSettings:
         longest_queue: how many requests may wait for the translator.
         takeover_s: see `Sessions`.
         cache_bytes: how much is cached at most.
-        catch_up_s: how long (real) a restarted scheduler waits for the translator to send what it has missed.
+        catch_up_s: how long (real) a scheduler waits at its start for what the translator has published before.
     """
 
     rules: Rules = field(default_factory=Rules)
@@ -106,7 +106,7 @@ class SchedulerSettings:
     limits: Limits = field(default_factory=Limits)
     envelopes: Envelopes = field(default_factory=Envelopes)
     cache_bytes: int = 512 * 2**20
-    catch_up_s: float = 2.0
+    catch_up_s: float = 1.0
 
 
 class SchedulerCore:
@@ -161,17 +161,14 @@ class SchedulerCore:
     # --- life ---
 
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Begin: publishes the control state, after a restart as soon as the translator's packets are caught up."""
+        """Begin. The control state is published as soon as the translator's packets have been caught up with."""
         self._effects = []
         self._started_s = now_s
         self._lease.held_by(self._control.holder, now_ns)
-        self._cache.start(now_ns)
         self._cache.remember(self._recent)
         if self._control.ended:
             self._effects.append(Kill())
-        elif self._announce_at_s is None:
-            self._publish_control(now_ns)
-        else:  # first, in the order of time, what the translator published while we were dead
+        else:  # first, in the order of time, what the translator published before we were there
             self._announce_at_s = now_s + self._settings.catch_up_s
         return self._effects
 
@@ -217,7 +214,6 @@ class SchedulerCore:
         self._cache.not_before(int(state["last_ns"]))
         self._watchdog.restore(map(str, state["wanted"]))
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
-        self._announce_at_s = math.inf
         self._sessions.restore(state["sessions"])
         for client, request_id, print_ in state["sent"]:
             self._sent.append((client, request_id, print_))
@@ -226,8 +222,6 @@ class SchedulerCore:
     def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
         """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
         self._cache.restore(packets)
-        if len(self._cache):
-            self._announce_at_s = math.inf
 
     def cached(self) -> Iterable[tuple[Packet, int | None]]:
         """What is cached now (with `source_ns`), oldest first: for whoever tidies the journal."""

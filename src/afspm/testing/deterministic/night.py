@@ -245,12 +245,13 @@ class Night:
         elif fault.what == "hang":
             self._hang(fault.for_s)
         elif fault.what == "clock":
-            self.invariants.clocks_are_right = False
+            self.invariants.times_are_certain = False
             self.microscope.habits.clock_error_s = self.timeline.random.choice((-100.0, 0.0, 100.0, 10_000.0))
 
     def _storm(self, for_s: float) -> None:
         """Messages take long, and all connections break at its beginning."""
         self.weather.delay_s = 3.0
+        self.invariants.times_are_certain = False  # a restarted scheduler can't wait for what comes that late
         for client in self.components.values():
             client.cut()
             client.cut_s += for_s + 5.0
