@@ -184,7 +184,7 @@ def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], *
     bars = []
     for span in spans:
         start, end = _clipped(span, limits)
-        if end > start or limits[0] <= start <= limits[1]:
+        if end >= start:  # else it lies outside
             bars.append((start, max(end - start, least)))
     ax.broken_barh(bars, (lane - 0.36, 0.72), linewidth=0, **style)
 

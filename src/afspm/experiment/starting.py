@@ -95,6 +95,7 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
             subscribe=tuple(met(source) for source in links.subscribe),
             serve=bound(links.serve),
             control=met(links.control) if links.control else None,
+            log=_log(resolved)[0],
         ),
         envelopes=resolved.envelopes(part),
         problems=resolved.named_problems,
@@ -115,11 +116,14 @@ def _command(part: Part) -> tuple[str, ...]:
 
 
 def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str]) -> dict[str, str] | None:
-    """The folder of the keys, and whose key to expect at each address; see `afspm.transport.keys.from_launch`."""
+    """The folder of the keys, and whose key to expect at each address; see `transport.network.Network.from_launch`."""
     if resolved.keys_folder is None:
-        return None
+        return {"insecure": "true"} if resolved.security.insecure else None
     owners = {wiring.connectable(addresses[key]): slot.owner for key, slot in resolved.net.slots.items()}
     keys = {"folder": str(resolved.keys_folder)}
+    scheduler = next((name for name, role in resolved.roles.items() if role is Role.SCHEDULER), None)
+    if scheduler is not None:
+        keys["scheduler"] = scheduler  # whom alone a translator obeys
     for key in (links.control, *links.subscribe):
         if key is None:
             continue
@@ -127,7 +131,18 @@ def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str])
         owner = owners.get(target) or next((o for bind, o in owners.items() if wiring.reaches(target, bind)), None)
         if owner is not None:
             keys[target] = owner
+    log, collector = _log(resolved)
+    if log is not None:
+        keys[log] = collector
     return keys
+
+
+def _log(resolved: Resolved) -> tuple[str | None, str]:
+    """Where a component collects the log lines of all others, and its name."""
+    for name, component in resolved.classes.items():
+        if getattr(component, "collects_logs", False) is True:
+            return wiring.connectable(str(resolved.settings[name]["address"])), name
+    return None, ""
 
 
 def _first(a: int | None, b: int) -> int:

@@ -62,7 +62,7 @@ def main() -> int:
 def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
     clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
     activity = Activity(clock)
-    with _beating(launch, activity):
+    with _beating(launch, activity), _telling(launch, clock):
         with activity.step():  # importing may take its time
             register_all(launch.messages)
             process = load(launch)
@@ -89,6 +89,25 @@ def _beating(launch: Launch, activity: Activity) -> Iterator[None]:
     )
     yield
     sender.close()
+
+
+@contextmanager
+def _telling(launch: Launch, clock: Clock) -> Iterator[None]:
+    """While in the block, a log collector is told what is logged, too."""
+    if launch.sockets.log is None:
+        yield
+        return
+    from afspm.transport.log_link import LogSender
+    from afspm.transport.network import Network
+
+    sender = LogSender(Network.from_launch(launch.name, launch.keys), launch.sockets.log, launch.name)
+    handler = log.PublishingHandler(lambda level, text: sender.send(level, clock.now_ns(), text))
+    logging.getLogger().addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger().removeHandler(handler)
+        sender.close()
 
 
 def _open_port(launch: Launch, clock: Clock, parent: Parent) -> Port:

@@ -1,0 +1,80 @@
+"""Log lines on their way from processes, perhaps on other computers, to the one that collects them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import zmq
+
+from afspm.transport.frames import readable
+from afspm.transport.network import Network
+
+LONGEST_LINE_BYTES = 64 * 1024
+
+
+class LogLine(NamedTuple):
+    """What one process had to say.
+
+    Attributes:
+        name: of the process.
+        level: that of `logging`.
+        time_ns: in the experiment, by the sender's clock.
+        text: perhaps several lines (a traceback).
+    """
+
+    name: str
+    level: int
+    time_ns: int
+    text: str
+
+
+class LogSender:
+    """Sends lines to a collector; what is said while it is not there is lost, and nobody waits for it.
+
+    Called under the lock of a logging handler, so that one thread at a time uses the socket.
+    """
+
+    def __init__(self, network: Network, address: str, name: str) -> None:
+        self._network = network
+        self._name = name.encode()
+        self._socket = network.socket(zmq.PUB)
+        network.connect(self._socket, address)
+
+    def send(self, level: int, time_ns: int, text: str) -> None:
+        """One record."""
+        cut = text.encode()[:LONGEST_LINE_BYTES]
+        self._socket.send_multipart([self._name, str(level).encode(), str(time_ns).encode(), cut], zmq.NOBLOCK)
+
+    def close(self) -> None:
+        self._network.close()
+
+
+class LogReceiver:
+    """Binds an address that processes send their lines to."""
+
+    def __init__(self, network: Network, address: str) -> None:
+        self._network = network
+        self._socket = network.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.SUBSCRIBE, b"")
+        self.address = network.bind(self._socket, address)
+
+    def take(self) -> list[LogLine]:
+        """What has come; does not wait."""
+        lines = []
+        while readable(self._socket):
+            line = read_line(self._socket.recv_multipart(zmq.NOBLOCK))
+            if line is not None:
+                lines.append(line)
+        return lines
+
+    def close(self) -> None:
+        self._network.close()
+
+
+def read_line(frames: list[bytes]) -> LogLine | None:
+    """A line; None if the frames are none."""
+    try:
+        name, level, time_ns, text = frames
+        return LogLine(name.decode(), int(level), int(time_ns), text.decode(errors="replace"))
+    except ValueError:
+        return None
