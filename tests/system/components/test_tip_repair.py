@@ -1,0 +1,85 @@
+"""The sample of the paper's control transfer, shortened to one change of the tip, with real processes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from afspm.components.night_record import NightRecord
+from afspm.model import Problem
+
+SAMPLE = Path(__file__).parents[3] / "experiments" / "tip_repair" / "experiment.toml"
+SHORTER = """
+[microscope]
+tip_changes = { schedule = [[2700, "double"]], pulse_cures = 0.6 }
+
+[series]
+duration = "90 min"
+"""
+SCANS = 10
+
+pytest.importorskip("matplotlib")
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that has ended by itself."""
+    folder = tmp_path_factory.mktemp("night")
+    (folder / "shorter.toml").write_text(SHORTER, encoding="utf-8")
+    command = [sys.executable, "-m", "afspm", "run", str(SAMPLE), "shorter.toml", "--speed", "300"]
+    ended = subprocess.run(command, cwd=folder, capture_output=True, timeout=110, encoding="utf-8", check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return folder / "runs" / (folder / "runs" / "latest").read_text(encoding="utf-8").strip()
+
+
+def record_of(night: Path) -> NightRecord:
+    (file,) = (night / "state").glob("*.night.jsonl")
+    return NightRecord.from_lines(file.read_text(encoding="utf-8").splitlines())
+
+
+@pytest.mark.timeout(180)
+def test_control_goes_to_the_corrector_and_back(night: Path) -> None:
+    record = record_of(night)
+    (flagged,) = record.problem_spans(Problem.TIP_SHAPE_CHANGED)
+    (repair,) = record.control_spans("tip_corrector")
+    before, *_, after = record.control_spans("series")
+    assert before.end_ns is not None
+    assert flagged.end_ns is not None
+    assert before.end_ns <= flagged.start_ns <= repair.start_ns
+    # removing the flag takes control from the one who solved the problem
+    assert repair.end_ns == flagged.end_ns
+    assert flagged.end_ns <= after.start_ns
+    assert record.problems == [Problem.TIP_SHAPE_CHANGED]
+
+
+@pytest.mark.timeout(180)
+def test_the_flag_comes_with_the_change_and_goes_with_the_cure(night: Path) -> None:
+    truth = [json.loads(line) for line in (night / "truth.jsonl").read_text(encoding="utf-8").splitlines()]
+    start_s = truth[0]["time_s"]
+    cures = [e["time_s"] for e in truth if e.get("outcome") == "cured"]
+    (flagged,) = record_of(night).problem_spans(Problem.TIP_SHAPE_CHANGED)
+    assert flagged.end_ns is not None
+    assert 2700.0 < flagged.start_ns / 1e9 - start_s < 2700.0 + 1500.0
+    assert cures
+    assert 0.0 < flagged.end_ns / 1e9 - cures[-1] < 1500.0
+
+
+@pytest.mark.timeout(180)
+def test_every_scan_asked_for_is_in_the_table_once(night: Path) -> None:
+    with (night / "metadata.csv").open(newline="", encoding="utf-8") as file:
+        heights = [row for row in csv.DictReader(file) if row["channel"] == "Height"]
+    assert sum(row["in_control"] == "series" for row in heights) == SCANS
+    tests = [row for row in heights if row["in_control"] == "tip_corrector"]
+    assert tests
+    assert {row["problems"] for row in tests} == {"tip-shape-changed"}
+    assert all(Path(row["filename"]).exists() for row in heights)
+
+
+@pytest.mark.timeout(180)
+def test_the_night_is_drawn(night: Path) -> None:
+    assert (night / "night.png").read_bytes().startswith(b"\x89PNG")
