@@ -17,6 +17,7 @@ from afspm.clock import ExperimentClock
 from afspm.model import Request, Response
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
+from afspm.transport import keys
 from afspm.transport.network import Network
 from afspm.transport.port import ControlConnected, PacketReceived, ReplyReceived, RequestReceived
 from afspm.transport.zmq_port import ZmqPort
@@ -28,9 +29,10 @@ ANY = "tcp://127.0.0.1:0"
 class Component:
     """A component, by what it has received."""
 
-    def __init__(self, rig: Rig, name: str, envelopes: list[str] | None) -> None:
+    def __init__(self, rig: Rig, name: str, envelopes: list[str] | None, owner: str) -> None:
         self._rig, self.name = rig, name
-        self.port = ZmqPort(Network(), name, rig.clock, subscribe=[rig.publish], envelopes=envelopes, control=rig.serve)
+        network = rig.network(owner or name, {rig.publish: "scheduler", rig.serve: "scheduler"})
+        self.port = ZmqPort(network, name, rig.clock, subscribe=[rig.publish], envelopes=envelopes, control=rig.serve)
         self.found: list[Any] = []
         self._asked = 0
 
@@ -65,8 +67,9 @@ class Component:
 class Rig:
     """All of it. What is asked of the translator is in `asked`, and answered by `answer` (None: not at all)."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, keys_folder: Path | None = None) -> None:
         self._folder = folder
+        self._keys_folder = keys_folder
         self.clock = ExperimentClock.real()
         ports = FreePorts()
         self.publish, self.serve = ports.address(), ports.address()
@@ -80,7 +83,10 @@ class Rig:
         self.process: subprocess.Popen[bytes] | None = None
 
     def make_translator(self, publish: str, serve: str) -> ZmqServerPort:
-        return ZmqServerPort(Network(), self.clock, serve=serve, publish=publish)
+        return ZmqServerPort(self.network("translator"), self.clock, serve=serve, publish=publish, allowed="scheduler")
+
+    def network(self, owner: str, servers: dict[str, str] | None = None) -> Network:
+        return Network(None if self._keys_folder is None else keys.load(self._keys_folder, owner, servers))
 
     def launch(self) -> Launch:
         return Launch(
@@ -90,6 +96,9 @@ class Rig:
             Sockets(self.publish, (self.source[0],), self.serve, self.source[1]),
             state_dir=str(self._folder / "state"),
             request_timeout_s=self.request_timeout_s,
+            keys=None
+            if self._keys_folder is None
+            else {"folder": str(self._keys_folder), **dict.fromkeys(self.source, "translator")},
         )
 
     def start(self) -> None:
@@ -108,9 +117,9 @@ class Rig:
         assert self.process.stdin is not None
         self.process.stdin.close()
 
-    def component(self, name: str, envelopes: list[str] | None = None) -> Component:
-        """Connected, and caught up."""
-        component = Component(self, name, envelopes)
+    def component(self, name: str, envelopes: list[str] | None = None, owner: str = "") -> Component:
+        """Connected; with the key of `owner`, its own if none is named."""
+        component = Component(self, name, envelopes, owner)
         self.components.append(component)
         self.until(component.connected)
         return component
@@ -153,6 +162,15 @@ class Rig:
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
     made = Rig(tmp_path)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def locked_rig(tmp_path: Path) -> Iterator[Rig]:
+    """With a key for each: scheduler, translator, Experiment and Visitor."""
+    keys.generate(tmp_path / "keys", ["scheduler", "translator", "Experiment", "Visitor"])
+    made = Rig(tmp_path, tmp_path / "keys")
     yield made
     made.close()
 
