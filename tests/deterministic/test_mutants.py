@@ -11,6 +11,7 @@ import pytest
 from afspm.logic import arbitration
 from afspm.logic.arbitration import Do, Event, Row
 from afspm.logic.cache import Cache
+from afspm.logic.desk import Desk
 from afspm.logic.forwarding import Forwarder
 from afspm.logic.lease import Lease
 from afspm.logic.once import OnceTable
@@ -102,8 +103,8 @@ def ids_are_forgotten(patch: Patch) -> None:
 
 
 def sent_actions_are_not_saved(patch: Patch) -> None:
-    real = SchedulerCore.snapshot
-    patch.setattr(SchedulerCore, "snapshot", lambda self: {**real(self), "sent": []})
+    real = Desk.snapshot
+    patch.setattr(Desk, "snapshot", lambda self: {**real(self), "sent": []})
 
 
 def nothing_expires(patch: Patch) -> None:
@@ -120,7 +121,7 @@ def any_answer_will_do(patch: Patch) -> None:
 
 
 def nothing_is_called_back(patch: Patch) -> None:
-    patch.setattr(SchedulerCore, "_call_back", lambda self, former, cause: None)
+    patch.setattr(Desk, "call_back", lambda self, former, cause: None)
 
 
 def told_before_saved(patch: Patch) -> None:

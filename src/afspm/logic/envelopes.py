@@ -120,7 +120,7 @@ class Envelopes:
         if rule is not None and rule.history is not None:
             history = rule.history
         if self._mapping is not None:
-            envelope = self._mapping(header)
+            envelope = self._mapped(self._mapping, header)
             if not isinstance(envelope, str) or not envelope or "\0" in envelope or envelope == "KILL":
                 raise ConfigError(
                     f"the mapping of envelopes gave {envelope!r} for {header.message}",
@@ -129,3 +129,10 @@ class Envelopes:
                 )
             return envelope, history
         return (default_envelope(header) if rule is None else rule.name(header)), history
+
+    @staticmethod
+    def _mapped(mapping: EnvelopeMapping, header: PacketHeader) -> object:
+        try:
+            return mapping(header)
+        except Exception as error:  # it is the user's own
+            raise ConfigError(f"the mapping of envelopes fails: {error!r}", where="[cache]") from error

@@ -65,6 +65,11 @@ class Watchdog:
         self._refused_at = -1  # states seen when the microscope last was not free
 
     @property
+    def retract(self) -> str | None:
+        """The action that retracts the tip, if it may be used."""
+        return self._settings.retract
+
+    @property
     def wanted(self) -> tuple[str, ...]:
         """What is not done yet, to be kept over a restart of the scheduler."""
         return tuple(self._wanted)

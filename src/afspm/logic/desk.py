@@ -1,0 +1,230 @@
+"""Requests, from being heard to being answered: nothing is done twice, and everybody gets an answer."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from afspm.logic.arbitration import Cause
+from afspm.logic.errands import Errands
+from afspm.logic.events import Codec, Effect, Log, Reply, RequestIn, SaveState
+from afspm.logic.forwarding import UNKNOWN, End, Forwarder, Job, Settled
+from afspm.logic.lease import Lease
+from afspm.logic.limits import Guard
+from afspm.logic.once import Fate, OnceTable, fingerprint
+from afspm.logic.sessions import Hearing, Sessions
+from afspm.logic.settings import SchedulerSettings
+from afspm.logic.watchdog import Watchdog
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response
+
+_ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
+_ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
+_SENT_REMEMBERED = 100
+
+
+class Desk:
+    """Takes requests in, passes them on to the translator, and answers them.
+
+    Attributes:
+        effects: what is to be done is appended here; the owner gives a new list for every step.
+
+    Args:
+        holder: says who is in control.
+        save: says what is to be saved.
+    """
+
+    def __init__(
+        self,
+        settings: SchedulerSettings,
+        codec: Codec,
+        watchdog: Watchdog,
+        lease: Lease,
+        holder: Callable[[], str | None],
+        save: Callable[[], SaveState],
+    ) -> None:
+        self.effects: list[Effect] = []
+        self.sessions = Sessions(settings.takeover_s)
+        self.forwarder = Forwarder(settings.request_timeout_s, settings.patience_s, settings.longest_queue)
+        self.guard = Guard(settings.limits)
+        self.errands = Errands(self.forwarder, watchdog, codec)
+        self._once = OnceTable()
+        self._codec = codec
+        self._watchdog = watchdog
+        self._lease = lease
+        self._holder = holder
+        self._save = save
+        self._ids_known: bool | None = None
+        # actions that only we know of: a translator of version 1 would do them again
+        self._sent: deque[tuple[str, str, int]] = deque(maxlen=_SENT_REMEMBERED)
+        self._refused: set[int] = set()
+
+    def snapshot(self) -> dict[str, Any]:
+        """What must survive a kill, as plain JSON."""
+        return {"sent": list(self._sent), "sessions": self.sessions.tokens()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take up what `snapshot` wrote."""
+        self.sessions.restore(state["sessions"])
+        for client, request_id, print_ in state["sent"]:
+            self._sent.append((client, request_id, print_))
+            self._once.restore(client, request_id, print_, Fate.UNKNOWN)
+
+    def disconnected(self, connection: int, now_s: float) -> str | None:
+        """A connection is gone; returns the name that lost its connection by that."""
+        self._refused.discard(connection)
+        return self.sessions.disconnected(connection, now_s)
+
+    def take(self, event: RequestIn, now_s: float) -> bool:
+        """Hear a request. True: it is new and to be decided; False: it is seen to."""
+        if self._hear(event, now_s) is not Hearing.ACCEPTED:
+            return False
+        outcome = self._once.look_up(event.name, event.request) if event.request.id else None
+        return outcome is None or not self._repeated(event, outcome, now_s)
+
+    def _hear(self, event: RequestIn, now_s: float) -> Hearing:
+        """Whether the peer may speak for the name that it gives; if not, it is told so."""
+        name = event.name
+        if not name:
+            why = "say who you are: set the socket's identity to the component's name"
+        elif event.user is not None and event.user != name:
+            why = f"the key is that of {event.user}, not of {name}"
+        else:
+            hearing = self.sessions.hear(event.connection, name, event.request.id, now_s)
+            if hearing is not Hearing.TAKEN:
+                return hearing
+            why = f"another component is connected as {name}; each needs a name of its own"
+        if event.connection not in self._refused:
+            self._refused.add(event.connection)
+            self._log("WARNING", f"refused a request of {name or 'a nameless peer'}: {why}")
+        response = Response(int(ControlResponse.FAILURE), b"", why, event.request.id)
+        self.effects.append(Reply(event.connection, name, response))
+        return Hearing.TAKEN
+
+    def _repeated(self, event: RequestIn, outcome: Fate | Response, now_s: float) -> bool:
+        """A request comes again with its id: answer it without doing it again. False: it may be done."""
+        name, request = event.name, event.request
+        if isinstance(outcome, Response):
+            self.effects.append(Reply(event.connection, name, outcome))
+            return True
+        if outcome is Fate.PENDING:
+            return True  # its answer will go to the newest connection
+        if self.forwarder.ask_again(name, request.id, now_s):
+            self._once.note(name, request, Fate.PENDING)
+            return True
+        # A translator that knows ids answers what became of it. Setting something twice does no harm either; an
+        # action does, so what nobody knows stays unknown.
+        may_send = self._ids_known or request.kind != _ACTION
+        if may_send and (self._holder() == name or reads(request)):
+            return False
+        reason = f"{UNKNOWN}it was sent once, and is not sent again"
+        response = Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id)
+        self.effects.append(Reply(event.connection, name, response))
+        return True
+
+    def answer(self, event: RequestIn, code: ControlResponse, reason: str = "") -> None:
+        """Answer a request by ourselves, once and for all."""
+        response = Response(int(code), b"", reason, event.request.id)
+        self._once.note(event.name, event.request, response)
+        self.effects.append(Reply(event.connection, event.name, response))
+
+    def call_back(self, former: str, cause: Cause | None) -> None:
+        """Commands of a former holder that have not been sent are not sent any more."""
+        for job in self.forwarder.call_back(lambda job: job.command and job.client == former):
+            reason = f"control was taken before this was sent: {cause.value if cause else ''}"
+            self._finish(job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))
+
+    def action_in_flight(self) -> str | None:
+        """The action that is with the translator."""
+        flight = self.forwarder.flight
+        return str(flight.request.subject) if flight is not None and flight.request.kind == _ACTION else None
+
+    def forward(self, event: RequestIn, now_s: float, now_ns: int, *, command: bool) -> None:
+        """Pass a request on to the translator, unless a limit, or the watchdog, stands in the way."""
+        name, request = event.name, event.request
+        if command:
+            if self._watchdog.wants_retract and self.forwarder.up:
+                self.answer(event, ControlResponse.NOT_FREE, "the tip is being retracted, since a holder died")
+                return
+            refusal = self.guard.check(name, request, now_ns)
+            if refusal is not None:
+                self._log("WARNING", f"refused {name}: {refusal.reason}")
+                self._once.note(name, request, refusal)
+                self.effects.append(Reply(event.connection, name, refusal))
+                return
+            self._lease.used(now_ns)
+        job = Job(name, request, command, connection=event.connection, states_seen=self._watchdog.states_seen)
+        refused = self.forwarder.ask(job, now_s)
+        if refused is not None:
+            self.effects.append(Reply(event.connection, name, refused.response))
+        elif request.id:
+            self._once.note(name, request, Fate.PENDING)
+            if request.kind == _ACTION and not self._ids_known:
+                self._sent.append((name, request.id, fingerprint(request)))
+                self.effects.append(self._save())
+
+    def settle_all(self, settled: Iterable[Settled], now_s: float, now_ns: int) -> None:
+        """Requests have come to their ends."""
+        for one in settled:
+            self.settle(one, now_s, now_ns)
+
+    def settle(self, settled: Settled, now_s: float, now_ns: int) -> None:
+        """A request has come to its end: tell, and remember, what became of it."""
+        job, end, response = settled.job, settled.end, settled.response
+        if end is End.ANSWERED or end is End.LATE:
+            if job.request.id:
+                self._ids_known = response.id == job.request.id
+            response.id = job.request.id
+            if response.code == _SUCCESS and job.command:
+                self._learn(job, response, now_ns)
+        if not job.client:
+            self._errand_ended(job, end, response, now_s)
+        elif end is End.ANSWERED:
+            self._finish(job, response)
+        elif end is End.LATE:
+            self._once.note(job.client, job.request, response)
+            self._log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
+        elif end is End.UNKNOWN:
+            self._finish(job, response, Fate.UNKNOWN)
+        else:
+            self._once.forget(job.client, job.request)
+            self._sent = deque((s for s in self._sent if s[:2] != (job.client, job.request.id)), _SENT_REMEMBERED)
+            self._reply_to(job, response)
+
+    def _finish(self, job: Job, response: Response, fate: Fate | None = None) -> None:
+        self._once.note(job.client, job.request, response if fate is None else fate)
+        self._reply_to(job, response)
+
+    def _reply_to(self, job: Job, response: Response) -> None:
+        """Answer over the newest connection of the client; without an id only over the one that it asked by."""
+        connection = self.sessions.connection_of(job.client)
+        if connection is not None and (job.request.id or connection == job.connection):
+            self.effects.append(Reply(connection, job.client, response))
+
+    def _learn(self, job: Job, response: Response, now_ns: int) -> None:
+        """What a command that succeeded changed."""
+        request = job.request
+        told = self._codec.decode_parameter(response.payload) if request.kind == _PARAM and response.payload else None
+        self.guard.carried_out(request, now_ns, told)
+        if request.kind == _ACTION:
+            self._watchdog.started(str(request.subject), job.states_seen)
+        if job.client == self._holder():
+            self._lease.used(now_ns)
+
+    def _errand_ended(self, job: Job, end: End, response: Response, now_s: float) -> None:
+        told = self.errands.ended(job, end, response, now_s)
+        if told is not None:
+            self.effects += [told, self._save()]
+
+    def _log(self, level: str, text: str) -> None:
+        self.effects.append(Log(level, text))
+
+
+def is_get(request: Request) -> bool:
+    """Whether a parameter is asked for, not set."""
+    return isinstance(request.subject, Parameter) and request.subject.value is None
+
+
+def reads(request: Request) -> bool:
+    """Whether a request disturbs nothing."""
+    return request.kind == _ACTION_SUPPORT or (request.kind == _PARAM and is_get(request))

@@ -1,0 +1,52 @@
+"""What the scheduler asks of the translator by itself: what the watchdog wants, and what kind of translator it is."""
+
+from __future__ import annotations
+
+from afspm.logic.events import Codec, Log
+from afspm.logic.forwarding import End, Forwarder, Job
+from afspm.logic.watchdog import Result, Watchdog
+from afspm.model import ControlRequest, ControlResponse, Request, Response, names
+
+_ID = "scheduler/are-ids-known"
+
+
+class Errands:
+    """The scheduler's own requests, which go before all others."""
+
+    def __init__(self, forwarder: Forwarder, watchdog: Watchdog, codec: Codec) -> None:
+        self._forwarder = forwarder
+        self._watchdog = watchdog
+        self._codec = codec
+        self._question: Job | None = None
+
+    def begin(self, now_s: float) -> None:
+        """The translator can be asked: does it retract, and does it know ids (ours do, those of version 1 do not)?"""
+        action = self._watchdog.retract or names.STOP_SCAN
+        request = Request(int(ControlRequest.ACTION_SUPPORT), action, self._codec.encode_action(action), _ID)
+        self._question = self._forwarder.ask_own(request, now_s)
+        self.send(now_s)
+
+    def send(self, now_s: float) -> None:
+        """Send what the watchdog wants."""
+        while (action := self._watchdog.next_action()) is not None:
+            request = Request(int(ControlRequest.ACTION), action, self._codec.encode_action(action))
+            if self._forwarder.ask_own(request, now_s) is None:
+                self._watchdog.unsent()
+                return
+
+    def ended(self, job: Job, end: End, response: Response, now_s: float) -> Log | None:
+        """One of these came to its end. Returns what people are to be told if it is not wanted any more."""
+        if end is End.LATE:
+            return None
+        if job is self._question:
+            if response.code == ControlResponse.ACTION_NOT_SUPPORTED:
+                self._watchdog.cannot(str(job.request.subject))
+            return None
+        if not self._forwarder.up:
+            self._watchdog.unsent()
+            return None
+        result = self._watchdog.answered(response.code)
+        self.send(now_s)
+        if result is Result.FAILED:
+            return Log("ERROR", f"the microscope does not {job.request.subject}: {response.reason or response.code}")
+        return Log("INFO", f"{job.request.subject}: done") if result is Result.DONE else None

@@ -1,0 +1,42 @@
+"""What the experiment file says of a scheduler."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from afspm.logic.arbitration import Rules
+from afspm.logic.envelopes import Envelopes
+from afspm.logic.limits import Limits
+from afspm.logic.watchdog import WatchdogSettings
+
+
+@dataclass(frozen=True)
+class SchedulerSettings:
+    """How a scheduler decides.
+
+    Attributes:
+        rules: roles and problems.
+        grace_s: how long (real) a holder that is gone stays in control.
+        restart_grace_s: the same for one that has not been heard of since the scheduler itself was restarted.
+        lease_s: how long (experiment) a holder may do nothing while the microscope is free; None: as it likes.
+        request_timeout_s: within which (real) a request to the translator is answered, by us if it must be.
+        patience_s: how much longer the line to the translator is kept for an answer that is overdue.
+        longest_queue: how many requests may wait for the translator.
+        takeover_s: see `Sessions`.
+        cache_bytes: how much is cached at most.
+        catch_up_s: how long (real) a scheduler waits at its start for what the translator has published before.
+    """
+
+    rules: Rules = field(default_factory=Rules)
+    grace_s: float = 10.0
+    restart_grace_s: float = 30.0
+    lease_s: float | None = None
+    request_timeout_s: float = 5.0
+    patience_s: float = 5.0
+    longest_queue: int = 64
+    takeover_s: float = 3.0
+    watchdog: WatchdogSettings = field(default_factory=WatchdogSettings)
+    limits: Limits = field(default_factory=Limits)
+    envelopes: Envelopes = field(default_factory=Envelopes)
+    cache_bytes: int = 512 * 2**20
+    catch_up_s: float = 1.0
