@@ -29,12 +29,13 @@ class = "Metadata"
 beat_period = 0.25
 missed_beats = 6
 """
-EACH = ("microscope", "scheduler", "series", "tip_classifier", "tip_corrector", "metadata")
+# the series last: what else is still being restarted has caught up when it has taken its last scan
+EACH = ("metadata", "tip_classifier", "tip_corrector", "microscope", "scheduler", "series")
 
 
 @pytest.mark.parametrize("when", ["while scanning", "between scans"])
 def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, when: str) -> None:
-    one = run(more=MORE, scans=10, speed=60.0)
+    one = run(more=MORE, scans=10)
     one.wait_for("scan 1 of 10")
     for name in EACH:
         one.wait_for_next(" witness ", "state SCANNING" if when == "while scanning" else "state FREE")
@@ -49,13 +50,13 @@ def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, w
 
 @pytest.mark.parametrize("name", ["microscope", "scheduler", "series"])
 def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run, name: str) -> None:
-    one = run(more=MORE, scans=6)
-    one.wait_for("scan 2 of 6")
+    one = run(more=MORE, scans=4)
+    one.wait_for("scan 2 of 4")
     one.wait_for_next(" witness ", "state SCANNING")
     one.signal(name, signal.SIGSTOP)
     one.wait_for(f" {name} ", "no heartbeat")
     assert one.end() == 0, one.output
-    require_each_once(one, 6)
+    require_each_once(one, 4)
 
 
 def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Run) -> None:
