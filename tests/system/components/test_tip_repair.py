@@ -24,6 +24,7 @@ duration = "90 min"
 SCANS = 10
 
 pytest.importorskip("matplotlib")
+pytestmark = [pytest.mark.timeout(180), pytest.mark.xdist_group("tip repair")]  # one night for all
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,6 @@ def record_of(night: Path) -> NightRecord:
     return NightRecord.from_lines(file.read_text(encoding="utf-8").splitlines())
 
 
-@pytest.mark.timeout(180)
 def test_control_goes_to_the_corrector_and_back(night: Path) -> None:
     record = record_of(night)
     (flagged,) = record.problem_spans(Problem.TIP_SHAPE_CHANGED)
@@ -57,7 +57,6 @@ def test_control_goes_to_the_corrector_and_back(night: Path) -> None:
     assert record.problems == [Problem.TIP_SHAPE_CHANGED]
 
 
-@pytest.mark.timeout(180)
 def test_the_flag_comes_with_the_change_and_goes_with_the_cure(night: Path) -> None:
     truth = [json.loads(line) for line in (night / "truth.jsonl").read_text(encoding="utf-8").splitlines()]
     start_s = truth[0]["time_s"]
@@ -69,7 +68,6 @@ def test_the_flag_comes_with_the_change_and_goes_with_the_cure(night: Path) -> N
     assert 0.0 < flagged.end_ns / 1e9 - cures[-1] < 1500.0
 
 
-@pytest.mark.timeout(180)
 def test_every_scan_asked_for_is_in_the_table_once(night: Path) -> None:
     with (night / "metadata.csv").open(newline="", encoding="utf-8") as file:
         heights = [row for row in csv.DictReader(file) if row["channel"] == "Height"]
@@ -80,6 +78,5 @@ def test_every_scan_asked_for_is_in_the_table_once(night: Path) -> None:
     assert all(Path(row["filename"]).exists() for row in heights)
 
 
-@pytest.mark.timeout(180)
 def test_the_night_is_drawn(night: Path) -> None:
     assert (night / "night.png").read_bytes().startswith(b"\x89PNG")
