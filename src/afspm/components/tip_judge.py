@@ -3,6 +3,14 @@
 At a place that it knows the judge compares like with like, and sees small changes. What it knows follows the good
 scans there, since the sample drifts; the first scans stay as the measure of slow wear. Elsewhere it can tell only what
 no place explains: a large loss of detail, or debris. A ghost image it cannot tell there from the sample's own order.
+
+Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan judged by itself, known places):
+
+    sample      good called bad    double / blunt / with debris called good
+    particles        0 of 80             0 / 0 / 0 of 16
+    stamper          0 of 80             0 / 0 / 0 of 16
+    rough            0 of 80             2 / 16 / 0 of 16      a blunt tip hardly changes gentle slopes
+    steps            3 of 80            10 / 10 / 0 of 16      0.4 nm high, 0.05 nm of noise: ask for two in a row
 """
 
 from __future__ import annotations
