@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from afspm.runtime.scope import Scope
 from afspm.runtime.stopping import StopRequested
 
 NS_PER_S = 1_000_000_000
+AFTER_THE_END_S = 30.0  # to handle what came before it
+AFTER_A_STOP_S = 0.5  # whoever stops us kills us soon
 AT_ONCE = 16  # packets handled before the port is looked at again: a KILL must not wait for a long backlog
 
 
@@ -33,6 +36,7 @@ class ComponentLoop:
         self._activity.longest_step_s = component.longest_step_s
         self._is_script = overrides(component, Component, "run")
         self._backlog = Backlog()
+        self._has_begun = False
         launch = context.launch
         state_dir = Path(launch.state_dir) if launch.state_dir else None
         self._dispatcher = Dispatcher(component, Component, launch.envelopes, context.log)
@@ -74,8 +78,10 @@ class ComponentLoop:
             code = ExitCode.ENDED if self._link.ended else ExitCode.DONE
         except ExperimentEnded:
             code = ExitCode.ENDED
+            self._handle_the_rest(AFTER_THE_END_S)
         except StopRequested:
             code = ExitCode.ORPHAN
+            self._handle_the_rest(AFTER_A_STOP_S)
         self._end()
         return code
 
@@ -84,6 +90,7 @@ class ComponentLoop:
             self._component.on_start()
         if not self._is_script:  # a script may go on with what it held control for
             self._scope.give_back_inherited()
+        self._has_begun = True
 
     def _serve(self) -> None:
         """Handle what comes, and tick, until something ends it."""
@@ -102,6 +109,15 @@ class ComponentLoop:
             with self._activity.step():
                 self._dispatcher.give(packet)
             at_most = None if at_most is None else at_most - 1
+
+    def _handle_the_rest(self, within_s: float) -> None:
+        """What was measured before the end is not to be lost: a table must not lack the last scan."""
+        if not self._has_begun:
+            return
+        until_s = self._context.clock.monotonic_s() + within_s
+        while len(self._backlog) and self._context.clock.monotonic_s() < until_s:
+            with contextlib.suppress(ExperimentEnded, StopRequested):  # nothing can be asked for any more
+                self._handle_what_came(1)
 
     def _end(self) -> None:
         """Say good-bye to the component. What it can't do any more must not hide why we ended."""

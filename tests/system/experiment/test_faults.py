@@ -35,15 +35,15 @@ EACH = ("metadata", "tip_classifier", "tip_corrector", "microscope", "scheduler"
 
 @pytest.mark.parametrize("when", ["while scanning", "between scans"])
 def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, when: str) -> None:
-    one = run(more=MORE, scans=10)
-    one.wait_for("scan 1 of 10")
+    one = run(more=MORE, scans=20)
+    one.wait_for("scan 1 of 20")
     for name in EACH:
         one.wait_for_next(" witness ", "state SCANNING" if when == "while scanning" else "state FREE")
         one.signal(name, signal.SIGKILL)
         one.wait_up(name, times=2)
     assert one.end() == 0, one.output
-    require_each_once(one, 10)
-    require_each_row_once(one, 10)
+    require_each_once(one, 20)
+    require_each_row_once(one, 20)
     for name in EACH:
         one.wait_for(f"{name} was restarted once")
 

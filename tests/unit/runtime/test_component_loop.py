@@ -432,3 +432,26 @@ def _zeros() -> Any:
     import numpy as np
 
     return np.zeros((4, 4))
+
+
+@pytest.mark.parametrize("who", ["kill", "parent"])
+def test_what_was_measured_before_the_end_is_handled(who: str) -> None:
+    class Table(Component):
+        def __init__(self) -> None:
+            self.rows: list[str] = []
+
+        def on_scan(self, scan: Scan) -> None:
+            self.rows.append(scan.channel)
+
+    def measured_and_ended() -> None:
+        lab.publish_scan(REGION)
+        if who == "kill":
+            lab.kill()
+        else:
+            lab.parent_goes()
+
+    lab = Lab()
+    lab.at(5.0, measured_and_ended)
+    component = Table()
+    run(component, lab)
+    assert component.rows == ["Height", "Phase"]
