@@ -56,28 +56,33 @@ def component_pages() -> str:
 
 
 def _class_page(name: str, cls: type) -> str:
-    lines = [f"## {name}", "", _docstring(cls), ""]
+    text, meanings = _docstring(cls)
+    lines = [f"## {name}", "", text, ""]
     for attribute, says in (("solves", "Solves"), ("flags", "Flags"), ("publishes", "Publishes")):
         if told := getattr(cls, attribute, ()):
             lines += [f"{says}: {', '.join(f'`{one}`' for one in told)}.", ""]
     hints = typing.get_type_hints(cls.__init__, include_extras=True)  # type: ignore[misc]
     parameters = [p for p in inspect.signature(cls).parameters.values() if p.kind is not p.VAR_KEYWORD]
     if parameters:
-        lines += ["| setting | value | default |", "| --- | --- | --- |"]
+        lines += ["| setting | value | default | meaning |", "| --- | --- | --- | --- |"]
         for parameter in parameters:
             hint = hints.get(parameter.name, Any)
             needed = parameter.default is parameter.empty
             default = "(needed)" if needed else _value(parameter.default, hint, ())
-            lines.append(f"| `{parameter.name}` | {_kind(hint, ())} | {default} |")
+            meaning = meanings.get(parameter.name, "")
+            lines.append(f"| `{parameter.name}` | {_kind(hint, ())} | {default} | {meaning} |")
         lines.append("")
     return "\n".join(lines)
 
 
-def _docstring(cls: type) -> str:
-    """The docstring as text; the list of settings in it as a list."""
-    text = inspect.getdoc(cls) or ""
-    text = re.sub(r"^(Settings|Args|Attributes):$", r"\1:\n", text, flags=re.MULTILINE)
-    return re.sub(r"^    (\w[\w, ]*):", r"- `\1`:", text, flags=re.MULTILINE)
+def _docstring(cls: type) -> tuple[str, dict[str, str]]:
+    """The docstring without its list of settings, and what that says of each."""
+    text, _, listed = (inspect.getdoc(cls) or "").partition("\nArgs:\n")
+    meanings = {}
+    for entry in re.split(r"\n(?=    \w)", f"\n{listed}"):
+        names, _, meaning = entry.strip().partition(":")
+        meanings.update(dict.fromkeys(re.split(r",\s*", names), " ".join(meaning.split())))
+    return text.strip(), meanings
 
 
 _UNITS = {"m": "length", "s": "duration", "rad": "angle", "V": "voltage", "A": "current", "m/s": "speed"}
