@@ -1,0 +1,12 @@
+from __future__ import annotations
+
+import pytest
+from logic_lab import Lab
+
+
+@pytest.fixture
+def lab() -> Lab:
+    """A core whose translator is there."""
+    made = Lab()
+    made.translator()
+    return made

@@ -1,0 +1,123 @@
+"""A scheduler's core to talk to, without sockets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from afspm.logic.events import (
+    Connected,
+    Effect,
+    Forward,
+    Input,
+    PacketIn,
+    Publish,
+    Reply,
+    RequestIn,
+    TranslatorCaughtUp,
+    TranslatorReply,
+    TranslatorUp,
+)
+from afspm.logic.scheduling import SchedulerCore
+from afspm.logic.settings import SchedulerSettings
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    PacketHeader,
+    Request,
+    Response,
+    ScopeState,
+    ScopeStatus,
+)
+from afspm.testing.deterministic.codec import TableCodec
+
+NS = 10**9
+
+
+class Lab:
+    """A core, what it has done, and short ways to make things happen. Names get a connection when they first speak."""
+
+    def __init__(self, settings: SchedulerSettings | None = None, *, state: dict[str, Any] | None = None) -> None:
+        self.codec = TableCodec()
+        self.core = SchedulerCore(settings or SchedulerSettings(), self.codec)
+        self.now_s = 100.0
+        self.now_ns = 1_750_000_000 * NS
+        self.connections: dict[str, int] = {}
+        self.effects: list[Effect] = []
+        self.forwarded: list[Forward] = []
+        self.newest = 0
+        if state is not None:
+            self.core.restore(state)
+        self.effects += self.core.start(self.now_s, self.now_ns)
+
+    def step(self, event: Input) -> list[Effect]:
+        effects = self.core.step(event, self.now_s, self.now_ns)
+        self.effects += effects
+        self.forwarded += [effect for effect in effects if isinstance(effect, Forward)]
+        return effects
+
+    def later(self, real_s: float = 0.0, experiment_s: float = 0.0) -> None:
+        self.now_s += real_s
+        self.now_ns += round(experiment_s * NS)
+
+    def connect(self, name: str) -> int:
+        self.newest += 1
+        self.connections[name] = self.newest
+        self.step(Connected(self.newest))
+        return self.newest
+
+    def translator(self) -> None:
+        """The translator is there, ours, and has answered the scheduler's question."""
+        self.step(TranslatorUp())
+        self.step(TranslatorCaughtUp())
+        question = self.forwarded.pop()
+        self.answer(question)
+
+    def answer(
+        self, forward: Forward, code: ControlResponse = ControlResponse.SUCCESS, payload: bytes = b""
+    ) -> list[Effect]:
+        return self.step(TranslatorReply(forward.number, Response(int(code), payload, "", forward.request.id)))
+
+    def ask(
+        self, name: str, kind: ControlRequest, subject: Any = None, id_: str = "", user: str | None = None
+    ) -> list[Effect]:
+        connection = self.connections.get(name) or self.connect(name)
+        payload = b"" if subject is None else self.codec.encode(subject)
+        return self.step(RequestIn(connection, name, Request(int(kind), subject, payload, id_), user))
+
+    def says(self, name: str, kind: ControlRequest, subject: Any = None, id_: str = "") -> ControlResponse:
+        """Ask, and return the code of the answer that comes at once."""
+        return ControlResponse(replies(self.ask(name, kind, subject, id_))[-1].response.code)
+
+    def take_control(self, name: str, problem: int = 0) -> ControlResponse:
+        return self.says(name, ControlRequest.REQUEST_CTRL, problem)
+
+    def flag(self, name: str, problem: int) -> ControlResponse:
+        return self.says(name, ControlRequest.ADD_EXP_PRBLM, problem)
+
+    def clear(self, name: str, problem: int) -> ControlResponse:
+        return self.says(name, ControlRequest.RMV_EXP_PRBLM, problem)
+
+    def mode(self, name: str, mode: ControlMode) -> ControlResponse:
+        return self.says(name, ControlRequest.SET_CONTROL_MODE, int(mode))
+
+    def publish(self, message: str, thing: Any, time_ns: int | None = None) -> list[Effect]:
+        self.now_ns += 1000
+        packet = Packet(message, self.codec.encode(thing), self.now_ns if time_ns is None else time_ns)
+        return self.step(PacketIn(packet, PacketHeader(message)))
+
+    def scope_is(self, state: ScopeState) -> list[Effect]:
+        return self.publish("ScopeStateMsg", ScopeStatus(state))
+
+    @property
+    def holder(self) -> str | None:
+        return self.core.control.holder
+
+
+def replies(effects: list[Effect]) -> list[Reply]:
+    return [effect for effect in effects if isinstance(effect, Reply)]
+
+
+def published(effects: list[Effect]) -> list[Packet]:
+    return [effect.packet for effect in effects if isinstance(effect, Publish)]

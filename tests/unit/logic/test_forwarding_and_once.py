@@ -1,0 +1,158 @@
+"""Requests on their way: one in flight, everybody answered, late answers told apart."""
+
+from __future__ import annotations
+
+from afspm.logic.forwarding import NOT_SENT, UNKNOWN, End, Forwarder, Job, Settled
+from afspm.logic.once import Fate, OnceTable
+from afspm.model import ControlResponse, Request, Response
+
+OK = Response(int(ControlResponse.SUCCESS))
+
+
+def job(client: str, id_: str = "", command: bool = True) -> Job:
+    return Job(client, Request(1, "start-scan", b"x", id_), command)
+
+
+def sent(forwarder: Forwarder) -> list[int]:
+    numbers = [forward.number for forward in forwarder.outbox]
+    forwarder.outbox.clear()
+    return numbers
+
+
+def up(**settings: float) -> Forwarder:
+    forwarder = Forwarder(**settings)  # type: ignore[arg-type]
+    forwarder.connected()
+    return forwarder
+
+
+def test_one_is_in_flight_and_the_others_wait_their_turn() -> None:
+    forwarder = up()
+    for name in "abc":
+        assert forwarder.ask(job(name), 0.0) is None
+    assert sent(forwarder) == [1]
+    settled = forwarder.answered(1, OK, 0.1)
+    assert settled is not None
+    assert (settled.job.client, settled.end, sent(forwarder)) == ("a", End.ANSWERED, [2])
+
+
+def test_without_a_translator_everybody_is_answered_at_once() -> None:
+    refused = Forwarder().ask(job("a"), 0.0)
+    assert refused is not None
+    assert (refused.end, refused.response.code) == (End.NOT_SENT, ControlResponse.NO_RESPONSE)
+    assert refused.response.reason.startswith(NOT_SENT)
+
+
+def test_a_loss_says_what_may_have_been_done_and_what_was_not() -> None:
+    forwarder = up()
+    forwarder.ask(job("a"), 0.0)
+    forwarder.ask(job("b"), 0.0)
+    ends = {settled.job.client: settled for settled in forwarder.lost()}
+    assert ends["a"].end is End.UNKNOWN
+    assert ends["a"].response.reason.startswith(UNKNOWN)
+    assert ends["b"].end is End.NOT_SENT
+
+
+def test_after_its_timeout_everybody_is_told_there_was_no_response() -> None:
+    forwarder = up(timeout_s=5.0, patience_s=5.0)
+    forwarder.ask(job("a"), 0.0)
+    forwarder.ask(job("b"), 1.0)
+    assert forwarder.deadline_s() == 5.0
+    assert [(s.job.client, s.end) for s in forwarder.expire(5.0)] == [("a", End.UNKNOWN)]
+    assert [(s.job.client, s.end) for s in forwarder.expire(6.0)] == [("b", End.NOT_SENT)]
+    assert sent(forwarder) == [1]
+
+
+def test_a_late_answer_is_never_another_s() -> None:
+    forwarder = up(timeout_s=5.0, patience_s=5.0)
+    forwarder.ask(job("a"), 0.0)
+    forwarder.expire(5.0)
+    forwarder.ask(job("b"), 6.0)
+    assert sent(forwarder) == [1]
+    forwarder.expire(10.0)
+    assert sent(forwarder) == [2]
+    late = forwarder.answered(1, OK, 10.5)
+    assert late is not None
+    assert (late.job.client, late.end) == ("a", End.LATE)
+    assert forwarder.flight is not None
+    assert forwarder.flight.client == "b"
+    assert forwarder.answered(1, OK, 10.6) is None
+    assert forwarder.answered(999, OK, 10.6) is None
+
+
+def test_an_overdue_request_that_is_repeated_is_waited_for_again() -> None:
+    forwarder = up(timeout_s=5.0, patience_s=5.0)
+    forwarder.ask(job("a", "k"), 0.0)
+    forwarder.expire(5.0)
+    assert forwarder.ask_again("a", "k", 5.5)
+    settled = forwarder.answered(1, OK, 6.0)
+    assert settled is not None
+    assert settled.end is End.ANSWERED
+
+
+def test_who_repeats_for_ever_does_not_keep_the_line() -> None:
+    forwarder = up(timeout_s=5.0, patience_s=5.0)
+    forwarder.ask(job("a", "k"), 0.0)
+    forwarder.expire(5.0)
+    assert forwarder.ask_again("a", "k", 9.9)
+    forwarder.ask(job("b"), 11.0)
+    assert [s.job.client for s in forwarder.expire(14.9)] == ["a"]
+    assert not forwarder.ask_again("a", "k", 15.0)
+    assert sent(forwarder) == [1, 2]
+
+
+def test_our_own_requests_go_before_those_that_wait() -> None:
+    forwarder = up()
+    forwarder.ask(job("a"), 0.0)
+    forwarder.ask(job("b"), 0.0)
+    own = forwarder.ask_own(Request(1, "stop-scan"), 0.0)
+    sent(forwarder)
+    forwarder.answered(1, OK, 0.1)
+    assert own is not None
+    assert sent(forwarder) == [own.number]
+
+
+def test_the_queue_is_bounded() -> None:
+    forwarder = up(longest_queue=3)
+    results = [forwarder.ask(job(str(n)), 0.0) for n in range(10)]
+    refused = [result for result in results if isinstance(result, Settled)]
+    assert len(refused) == 6
+    assert all(r.response.reason.startswith(NOT_SENT) for r in refused)
+
+
+def test_what_waits_can_be_called_back_and_what_was_sent_not() -> None:
+    forwarder = up()
+    for name in ("a", "a", "b"):
+        forwarder.ask(job(name), 0.0)
+    assert [j.number for j in forwarder.call_back(lambda j: j.client == "a")] == [2]
+    assert forwarder.flight is not None
+
+
+def test_a_repeated_id_has_the_fate_of_the_first() -> None:
+    once = OnceTable()
+    request = Request(1, "start-scan", b"x", "exp/a/1")
+    assert once.look_up("exp", request) is None
+    once.note("exp", request, Fate.PENDING)
+    assert once.look_up("exp", request) is Fate.PENDING
+    once.note("exp", request, OK)
+    assert once.look_up("exp", request) is OK
+    assert once.look_up("other", request) is None
+    once.forget("exp", request)
+    assert once.look_up("exp", request) is None
+
+
+def test_an_id_used_for_another_request_is_refused() -> None:
+    once = OnceTable()
+    once.note("exp", Request(1, "start-scan", b"x", "key"), OK)
+    other = once.look_up("exp", Request(1, "x-pulse", b"y", "key"))
+    assert isinstance(other, Response)
+    assert other.code == ControlResponse.FAILURE
+
+
+def test_the_table_is_bounded_and_forgets_the_oldest() -> None:
+    once = OnceTable(per_client=5, clients=3)
+    for n in range(100):
+        once.note("exp", Request(1, id=str(n)), OK)
+        once.note(f"other-{n}", Request(1, id="1"), OK)
+    assert once.look_up("exp", Request(1, id="99")) is OK
+    assert once.look_up("exp", Request(1, id="94")) is None
+    assert once.look_up("other-50", Request(1, id="1")) is None

@@ -1,0 +1,199 @@
+"""Limits: what is refused, with which words."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from afspm.logic.limits import Guard, Limit, Limits
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Parameter,
+    ProbePosition,
+    Region,
+    RegionChange,
+    Request,
+    ScanParameters,
+)
+
+NS = 10**9
+BIAS = "tip-bias-voltage"
+STAGE = Region((0.0, 0.0), (10e-6, 10e-6))
+
+
+def guard(**parameters: Limit) -> Guard:
+    return Guard(Limits({name.replace("_", "-"): limit for name, limit in parameters.items()}))
+
+
+def set_(value: str, unit: str | None = None, name: str = BIAS) -> Request:
+    return Request(int(ControlRequest.PARAM), Parameter(name, value, unit), id="i")
+
+
+def scan(region: Region | RegionChange | None = None, shape: tuple[int, int] | None = None) -> Request:
+    return Request(int(ControlRequest.SET_SCAN_PARAMS), ScanParameters(region, shape))
+
+
+def probe(x: float, y: float) -> Request:
+    return Request(int(ControlRequest.SET_PROBE_POS), ProbePosition((x, y)))
+
+
+def why(guard: Guard, request: Request, who: str = "experiment", now_ns: int = 0) -> str:
+    """The reason of the refusal; empty if there is none."""
+    refusal = guard.check(who, request, now_ns)
+    if refusal is None:
+        return ""
+    assert refusal.code in (ControlResponse.PARAM_ERROR, ControlResponse.ACTION_ERROR)
+    assert refusal.id == request.id
+    return refusal.reason
+
+
+def test_a_refusal_names_parameter_value_limit_and_where_it_was_set() -> None:
+    reason = why(guard(tip_bias_voltage=Limit(-5.0, 5.0, source="experiment.toml:42")), set_("7.5", "V"))
+    for part in (BIAS, "7.5", "5 V", "experiment.toml:42"):
+        assert part in reason
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "fits"), [("5", "V", True), ("5000", "mV", True), ("5001", "mV", False), ("-5.1", None, False)]
+)
+def test_a_range_is_checked_in_any_unit(value: str, unit: str | None, fits: bool) -> None:
+    assert (why(guard(tip_bias_voltage=Limit(-5.0, 5.0)), set_(value, unit)) == "") is fits
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "NaN", "abc", "", "0x10"])
+def test_base_parameters_are_finite_numbers_with_or_without_a_limit(value: str) -> None:
+    assert why(Guard(), set_(value, "V"))
+
+
+def test_a_unit_of_the_wrong_kind_is_refused() -> None:
+    assert why(Guard(), set_("1", "nm"))
+
+
+def test_a_parameter_of_one_s_own_may_be_text_unless_it_is_limited() -> None:
+    assert not why(Guard(), set_("fast", None, "x-mode"))
+    assert why(guard(x_mode=Limit(0.0, 1.0)), set_("fast", None, "x-mode"))
+
+
+def test_getting_is_never_limited() -> None:
+    request = Request(int(ControlRequest.PARAM), Parameter(BIAS))
+    assert not why(guard(tip_bias_voltage=Limit(only={"nobody"})), request)
+
+
+def test_a_step_is_measured_from_what_is_in_force() -> None:
+    g = guard(tip_bias_voltage=Limit(step=0.5))
+    assert "not known" in why(g, set_("0.1", "V"))
+    g.carried_out(Request(int(ControlRequest.PARAM), Parameter(BIAS)), 0, Parameter(BIAS, "1000", "mV"))
+    assert not why(g, set_("1.5", "V"))
+    assert "step" in why(g, set_("1.6", "V"))
+    g.carried_out(set_("1.5", "V"), NS)
+    assert not why(g, set_("2.0", "V"))
+
+
+def test_a_refused_value_is_not_what_the_next_step_is_measured_from() -> None:
+    g = guard(tip_bias_voltage=Limit(step=0.5))
+    g.carried_out(set_("1", "V"), 0)
+    for _ in range(5):
+        assert why(g, set_("3", "V"))
+
+
+def test_a_rate_allows_more_with_time() -> None:
+    g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
+    g.carried_out(set_("0", "V"), 0)
+    assert "per second" in why(g, set_("1", "V"), now_ns=5 * NS)
+    assert not why(g, set_("1", "V"), now_ns=10 * NS)
+
+
+def test_an_interval_lies_between_two_uses() -> None:
+    g = Guard(Limits(actions={"x-pulse": Limit(interval_s=60.0, source="toml:3")}))
+    pulse = Request(int(ControlRequest.ACTION), "x-pulse")
+    assert not why(g, pulse)
+    g.carried_out(pulse, 0)
+    assert "toml:3" in why(g, pulse, now_ns=59 * NS)
+    assert not why(g, pulse, now_ns=60 * NS)
+
+
+def test_only_those_named_may() -> None:
+    g = Guard(Limits({BIAS: Limit(only={"corrector"})}, {"x-crash": Limit(only={"corrector"})}))
+    crash = Request(int(ControlRequest.ACTION), "x-crash")
+    for request in (crash, set_("1", "V")):
+        assert "corrector" in why(g, request, "experiment")
+        assert not why(g, request, "corrector")
+
+
+def test_the_fields_of_messages_are_limited_like_the_parameters_of_their_names() -> None:
+    g = guard(
+        zctrl_setpoint=Limit(0.0, 1.0),
+        scan_size_x=Limit(high=5e-6),
+        scan_resolution_x=Limit(high=512),
+        probe_pos_x=Limit(high=1e-6),
+    )
+    feedback = Request(int(ControlRequest.SET_ZCTRL_PARAMS), Feedback(setpoint=2.0))
+    assert "zctrl-setpoint" in why(g, feedback)
+    assert not why(g, Request(int(ControlRequest.SET_ZCTRL_PARAMS), Feedback(on=False, integral_gain=9.0)))
+    assert "scan-size-x" in why(g, scan(Region((0, 0), (6e-6, 1e-6))))
+    assert "scan-resolution-x" in why(g, scan(shape=(10, 513)))
+    assert "probe-pos-x" in why(g, probe(2e-6, 0.0))
+
+
+def test_scans_stay_in_the_region_with_all_their_corners() -> None:
+    g = Guard(Limits(region=STAGE, region_source="toml:9"))
+    assert not why(g, scan(Region((0, 0), (10e-6, 10e-6))))
+    assert "toml:9" in why(g, scan(Region((0, 0), (9e-6, 9e-6), math.pi / 4)))
+    assert why(g, scan(Region((4e-6, 0), (3e-6, 1e-6))))
+    assert not why(g, scan(Region((0, 0), (6e-6, 6e-6), math.pi / 4)))
+
+
+def test_a_turned_region_is_respected() -> None:
+    g = Guard(Limits(region=Region((0, 0), (10e-6, 2e-6), math.pi / 2)))
+    assert not why(g, probe(0.5e-6, 4.5e-6))
+    assert why(g, probe(4.5e-6, 0.5e-6))
+
+
+def test_the_probe_stays_in_the_region_and_goes_to_real_places() -> None:
+    g = Guard(Limits(region=STAGE))
+    assert not why(g, probe(5e-6, -5e-6))
+    assert why(g, probe(5.1e-6, 0.0))
+    assert why(g, probe(math.nan, 0.0))
+
+
+def test_a_scan_moved_by_single_parameters_stays_in_the_region_too() -> None:
+    g = Guard(Limits(region=STAGE))
+    move = set_("4", "um", "scan-top-left-x")
+    assert "not known" in why(g, move)
+    g.published(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
+    assert why(g, move)
+    assert not why(g, set_("3", "um", "scan-top-left-x"))
+    assert why(g, set_("90", "deg", "scan-angle")) == ""
+    assert why(g, set_("20", "um", "scan-size-y"))
+
+
+def test_a_part_of_a_region_is_checked_with_the_rest_of_it() -> None:
+    g = Guard(Limits(region=STAGE))
+    assert "not known" in why(g, scan(RegionChange(left_m=0.0)))
+    g.published(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
+    assert not why(g, scan(RegionChange(left_m=3e-6)))
+    assert why(g, scan(RegionChange(left_m=3.5e-6)))
+
+
+@pytest.mark.parametrize("size", [0.0, -1e-6, math.nan, math.inf])
+def test_a_scan_of_no_size_is_refused(size: float) -> None:
+    assert why(Guard(), scan(RegionChange(width_m=size)))
+    assert why(Guard(), set_(str(size), "m", "scan-size-x"))
+
+
+def test_absurd_numbers_of_pixels_are_refused() -> None:
+    assert why(Guard(), scan(shape=(10**5, 10**4)))
+    g = Guard()
+    g.published(ScanParameters(shape=(10**5, 10)), 0)
+    assert why(g, set_("10000", None, "scan-resolution-x"))
+    for value in ("0", "-4", "1.5"):
+        assert why(g, set_(value, None, "scan-resolution-x"))
+
+
+def test_an_angle_without_a_unit_is_in_degrees() -> None:
+    g = guard(scan_angle=Limit(-math.pi / 2, math.pi / 2))
+    assert not why(g, set_("89", None, "scan-angle"))
+    assert why(g, set_("91", None, "scan-angle"))
