@@ -76,6 +76,8 @@ class Asker:
         if until_s is not None:
             give_up_s = min(give_up_s, until_s)
         told = False
+        # a microscope that has not said a word yet is still starting: a request to it would only come back
+        self._link.wait(lambda: self._link.view.status is not None, give_up_s)
         while True:
             response = self._link.request(kind, subject, request_id=request_id, until_s=until_s)
             if response.code != ControlResponse.NO_RESPONSE or self._holding.was_lost:
