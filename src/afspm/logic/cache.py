@@ -96,8 +96,7 @@ class Cache:
     def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, bool]:
         """A packet of the scheduler's own, kept under its envelope."""
         out = Packet(envelope, payload, self._next_ns(now_ns))
-        _, history = self._envelopes.of(PacketHeader(envelope))
-        return out, self._keep(out, None, history)
+        return out, self._keep(out, None, self._envelopes.history(envelope))
 
     def restore(self, packets: Iterable[tuple[Packet, int | None]], history_of: dict[str, int] | None = None) -> None:
         """Take up what was kept before a restart, oldest first.

@@ -175,7 +175,7 @@ class Desk:
             if job.request.id:
                 self._ids_known = response.id == job.request.id
             response.id = job.request.id
-            if response.code == _SUCCESS and job.command:
+            if response.code == _SUCCESS and (job.command or job.request.kind == _PARAM):
                 self._learn(job, response, now_ns)
         if not job.client:
             self._errand_ended(job, end, response, now_s)
@@ -202,13 +202,13 @@ class Desk:
             self.effects.append(Reply(connection, job.client, response))
 
     def _learn(self, job: Job, response: Response, now_ns: int) -> None:
-        """What a command that succeeded changed."""
+        """What a success changed, or told."""
         request = job.request
         told = self._codec.decode_parameter(response.payload) if request.kind == _PARAM and response.payload else None
         self.guard.carried_out(request, now_ns, told)
         if request.kind == _ACTION:
             self._watchdog.started(str(request.subject), job.states_seen)
-        if job.client == self._holder():
+        if job.command and job.client == self._holder():
             self._lease.used(now_ns)
 
     def _errand_ended(self, job: Job, end: End, response: Response, now_s: float) -> None:

@@ -116,7 +116,7 @@ class Envelopes:
     def of(self, header: PacketHeader) -> tuple[str, int]:
         """The envelope of a packet, and how many of that envelope are kept."""
         rule = next((rule for rule in self._rules if rule.fits(header)), None)
-        history = self._history.get(header.message, 1)
+        history = self.history(header.message)
         if rule is not None and rule.history is not None:
             history = rule.history
         if self._mapping is not None:
@@ -129,6 +129,10 @@ class Envelopes:
                 )
             return envelope, history
         return (default_envelope(header) if rule is None else rule.name(header)), history
+
+    def history(self, message: str) -> int:
+        """How many of a message are kept where no rule says otherwise."""
+        return self._history.get(message, 1)
 
     @staticmethod
     def _mapped(mapping: EnvelopeMapping, header: PacketHeader) -> object:

@@ -1,0 +1,211 @@
+"""What the supervisor decides: busy is not dead, restarts back off and have a budget."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afspm.logic.liveness import Liveness, LivenessPolicy, Vital
+from afspm.logic.restart import RestartPolicy, Restarts
+from afspm.logic.supervision import ChildWatch, GiveUp, Kill, Log, Phase, Policy, Start
+
+
+@dataclass(frozen=True)
+class Beat:
+    closing: bool = False
+    step_age_s: float | None = 0.0
+    longest_step_s: float | None = None
+
+
+QUICK = LivenessPolicy(beat_period_s=1.0, missed_beats=3, start_s=10.0, longest_step_s=30.0, closing_s=5.0)
+
+
+def checked(life: Liveness, until_s: float, from_s: float = 0.0) -> Vital:
+    """Its health at `until_s`, looked at every half second until then."""
+    now_s = from_s
+    while now_s < until_s:
+        life.check(now_s)
+        now_s += 0.5
+    return life.check(until_s)
+
+
+def test_three_missed_beats_are_silence() -> None:
+    life = Liveness(QUICK, 0.0)
+    life.beat(0.0)
+    assert checked(life, 2.9) is Vital.ALIVE
+    assert checked(life, 3.0, 2.9) is Vital.SILENT
+
+
+def test_a_long_step_is_busy_as_long_as_it_was_said_to_take() -> None:
+    life = Liveness(QUICK, 0.0)
+    life.beat(1.0, step_age_s=29.0)
+    assert life.check(1.0) is Vital.ALIVE
+    life.beat(2.0, step_age_s=299.0, longest_step_s=300.0)
+    assert life.check(2.0) is Vital.ALIVE
+    life.beat(3.0, step_age_s=301.0, longest_step_s=300.0)
+    assert life.check(3.0) is Vital.FROZEN
+
+
+def test_a_start_may_take_longer_than_a_beat() -> None:
+    life = Liveness(QUICK, 0.0)
+    assert checked(life, 9.9) is Vital.STARTING
+    assert checked(life, 10.0, 9.9) is Vital.SLOW_START
+
+
+def test_after_its_last_beat_it_has_to_be_gone_soon() -> None:
+    life = Liveness(QUICK, 0.0)
+    life.beat(1.0)
+    life.closing(2.0)
+    assert checked(life, 6.9, 2.0) is Vital.ALIVE
+    assert checked(life, 7.0, 6.9) is Vital.NOT_CLOSING
+
+
+def test_while_we_slept_ourselves_nobody_is_judged() -> None:
+    """The computer was suspended for an hour."""
+    life = Liveness(QUICK, 0.0)
+    life.beat(1.0)
+    assert life.check(1.5) is Vital.ALIVE
+    assert life.check(3601.5) is Vital.ALIVE
+    assert checked(life, 3606.0, 3601.5) is Vital.SILENT
+
+
+def test_a_process_without_beats_is_only_known_by_its_exit() -> None:
+    assert checked(Liveness(QUICK, 0.0, beats=False), 1000.0) is Vital.ALIVE
+
+
+def test_the_first_restart_is_at_once_and_later_ones_wait_longer_and_longer() -> None:
+    restarts = Restarts(RestartPolicy(budget=20, first_delay_s=0.25, factor=2.0, longest_delay_s=2.0))
+    delays = [restarts.failed(float(n), lived_s=0.1) for n in range(7)]
+    assert delays == [0.0, 0.25, 0.5, 1.0, 2.0, 2.0, 2.0]
+
+
+def test_a_healthy_life_ends_the_row() -> None:
+    restarts = Restarts(RestartPolicy(healthy_s=30.0))
+    for n in range(4):
+        restarts.failed(float(n), lived_s=0.1)
+    assert restarts.failed(100.0, lived_s=31.0) == 0.0
+
+
+def test_the_budget_is_spent_within_its_window() -> None:
+    restarts = Restarts(RestartPolicy(budget=3, window_s=100.0))
+    assert all(restarts.failed(float(n), 1.0) is not None for n in range(3))
+    assert restarts.failed(50.0, 1.0) is None
+    assert restarts.failed(100.0, 1.0) is not None
+
+
+def test_a_child_is_started_watched_killed_when_frozen_and_started_again() -> None:
+    watch = ChildWatch(Policy(QUICK))
+    assert watch.begin(0.0) == [Start()]
+    assert watch.beat(Beat(), 1.0) == []
+    effects = watch.beat(Beat(step_age_s=31.0), 2.0)
+    assert [type(e) for e in effects] == [Log, Kill]
+    assert watch.tick(2.5) == []
+    effects = watch.exited(-9, 3.0)
+    assert Start() in effects
+    assert watch.phase is Phase.RUNNING
+
+
+@pytest.mark.parametrize("code", [0, 78, 80, 81])
+def test_one_that_meant_to_end_is_not_started_again(code: int) -> None:
+    watch = ChildWatch(Policy(QUICK))
+    watch.begin(0.0)
+    effects = watch.exited(code, 1.0)
+    assert Start() not in effects
+    assert watch.over
+    assert watch.deadline_s() is None
+
+
+@pytest.mark.parametrize("code", [1, -9, -11, 137, 3])
+def test_one_that_crashed_is(code: int) -> None:
+    watch = ChildWatch(Policy(QUICK))
+    watch.begin(0.0)
+    assert Start() in watch.exited(code, 1.0)
+
+
+def test_one_that_crashes_again_and_again_is_given_up_loudly() -> None:
+    watch = ChildWatch(Policy(QUICK, RestartPolicy(budget=3)))
+    watch.begin(0.0)
+    now_s, effects = 0.0, []
+    for _ in range(50):
+        effects = watch.exited(1, now_s) if watch.phase is Phase.RUNNING else watch.tick(now_s)
+        if watch.over:
+            break
+        now_s += 0.5
+    assert watch.phase is Phase.GIVEN_UP
+    assert [type(e) for e in effects] == [Log, GiveUp]
+    assert isinstance(effects[0], Log)
+    assert effects[0].level == "ERROR"
+
+
+def test_a_restart_that_waits_is_not_early() -> None:
+    watch = ChildWatch(Policy(QUICK, RestartPolicy(first_delay_s=4.0)))
+    watch.begin(0.0)
+    watch.exited(1, 1.0)
+    watch.exited(1, 2.0)
+    assert watch.deadline_s() == 6.0
+    assert watch.tick(5.9) == []
+    assert watch.tick(6.0) == [Start()]
+
+
+def test_one_that_we_stop_is_over_however_it_ends() -> None:
+    watch = ChildWatch(Policy(QUICK))
+    watch.begin(0.0)
+    watch.stop(1.0)
+    assert watch.exited(-9, 2.0) == []
+    assert watch.over
+
+
+def test_one_that_waits_for_its_restart_is_not_started_after_a_stop() -> None:
+    watch = ChildWatch(Policy(QUICK, RestartPolicy(first_delay_s=4.0)))
+    watch.begin(0.0)
+    watch.exited(1, 1.0)
+    watch.exited(1, 1.5)
+    watch.stop(2.0)
+    assert watch.tick(100.0) == []
+
+
+def test_a_command_that_can_not_be_started_counts_as_a_crash() -> None:
+    watch = ChildWatch(Policy(QUICK, RestartPolicy(budget=2)))
+    watch.begin(0.0)
+    for now_s in (1.0, 2.0, 3.0):
+        watch.start_failed("no such file", now_s)
+        watch.tick(now_s + 0.9)
+    assert watch.phase is Phase.GIVEN_UP
+
+
+calls = st.sampled_from(["beat", "old", "frozen", "closing", "crash", "done", "tick", "stop", "unstartable"])
+
+
+@given(st.lists(st.tuples(calls, st.floats(0.0, 20.0)), max_size=60))
+def test_there_is_never_a_second_process_and_nothing_after_the_end(story: list[tuple[str, float]]) -> None:
+    watch = ChildWatch(Policy(QUICK, RestartPolicy(budget=4)))
+    running, stopped, now_s = 0, False, 0.0
+
+    def count(effects: list[object]) -> None:
+        nonlocal running
+        for effect in effects:
+            if isinstance(effect, Start):
+                assert not stopped
+                running += 1
+            assert running <= 1
+
+    count([*watch.begin(now_s)])
+    for call, wait_s in story:
+        now_s += wait_s
+        if call == "stop":
+            watch.stop(now_s)
+            stopped = True
+        elif call in ("crash", "done") and running:
+            running -= 1
+            count([*watch.exited(1 if call == "crash" else 0, now_s)])
+        elif call == "unstartable" and running and not stopped:
+            running -= 1
+            count([*watch.start_failed("no", now_s)])
+        elif call in ("beat", "old", "frozen", "closing"):
+            age_s = {"beat": 0.0, "old": None, "frozen": 99.0, "closing": 0.0}[call]
+            count([*watch.beat(Beat(call == "closing", age_s), now_s)])
+        else:
+            count([*watch.tick(now_s)])

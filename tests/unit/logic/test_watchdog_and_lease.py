@@ -1,0 +1,141 @@
+"""What the scheduler does to the microscope by itself."""
+
+from __future__ import annotations
+
+import pytest
+
+from afspm.logic.arbitration import Cause
+from afspm.logic.lease import Lease
+from afspm.logic.watchdog import Result, Watchdog, WatchdogSettings
+from afspm.model import ControlResponse, Feedback, ScopeState
+
+OK, NOT_FREE, SILENCE = (
+    int(c) for c in (ControlResponse.SUCCESS, ControlResponse.NOT_FREE, ControlResponse.NO_RESPONSE)
+)
+SCANNING, SPEC, FREE = ScopeState.SCANNING, ScopeState.SPEC, ScopeState.FREE
+
+
+def watchdog(*states: ScopeState, **settings: object) -> Watchdog:
+    made = Watchdog(WatchdogSettings(**settings))  # type: ignore[arg-type]
+    for state in states:
+        made.scope_is(state)
+    return made
+
+
+@pytest.mark.parametrize(("state", "stop"), [(SCANNING, ["stop-scan"]), (SPEC, ["stop-spec"]), (FREE, [])])
+def test_what_runs_is_stopped_when_control_is_taken(state: ScopeState, stop: list[str]) -> None:
+    assert watchdog(FREE, state).control_taken(Cause.PROBLEM, None) == stop
+
+
+@pytest.mark.parametrize("cause", [Cause.RELEASED, Cause.SOLVED])
+def test_what_runs_goes_on_when_control_was_given_back(cause: Cause) -> None:
+    assert watchdog(SCANNING).control_taken(cause, None) == []
+
+
+def test_the_experiment_file_may_say_to_let_it_run() -> None:
+    assert watchdog(SCANNING, stop_when={Cause.MANUAL}).control_taken(Cause.PROBLEM, None) == []
+
+
+def test_a_scan_that_is_just_being_started_is_stopped_too() -> None:
+    assert watchdog(FREE).control_taken(Cause.PROBLEM, "start-scan") == ["stop-scan"]
+    begun = watchdog(FREE)
+    begun.started("start-scan", begun.states_seen)
+    assert begun.control_taken(Cause.PROBLEM, None) == ["stop-scan"]
+
+
+def test_a_start_whose_states_have_come_already_is_not_taken_for_running() -> None:
+    done = watchdog(FREE)
+    seen = done.states_seen
+    done.scope_is(SCANNING)
+    done.scope_is(FREE)
+    done.started("start-scan", seen)
+    assert done.control_taken(Cause.PROBLEM, None) == []
+
+
+def test_a_dead_holder_s_tip_is_retracted_in_a_dangerous_state_once_it_has_stopped() -> None:
+    dog = watchdog(FREE)
+    dog.feedback_is(Feedback(on=False))
+    dog.scope_is(SCANNING)
+    assert dog.control_taken(Cause.DEAD, None) == ["stop-scan", "x-retract"]
+    assert dog.wants_retract
+    assert dog.next_action() == "stop-scan"
+    assert dog.next_action() is None
+    assert dog.answered(OK) is Result.DONE
+    assert dog.next_action() is None
+    dog.scope_is(ScopeState.INTERRUPTED)
+    assert dog.next_action() == "x-retract"
+    assert dog.answered(NOT_FREE) is Result.AGAIN
+    assert dog.next_action() is None
+    dog.scope_is(FREE)
+    assert dog.next_action() == "x-retract"
+    assert dog.answered(OK) is Result.DONE
+    assert not dog.wants_retract
+
+
+def test_with_the_feedback_on_a_scan_of_the_dead_is_only_stopped() -> None:
+    dog = watchdog(SCANNING)
+    dog.feedback_is(Feedback(on=True))
+    assert dog.control_taken(Cause.DEAD, None) == ["stop-scan"]
+
+
+def test_a_microscope_that_can_not_retract_is_not_asked_to() -> None:
+    dog = watchdog(ScopeState.COARSE_MOTOR)
+    dog.cannot("x-retract")
+    assert dog.control_taken(Cause.DEAD, None) == []
+    assert watchdog(ScopeState.COARSE_MOTOR, retract=None).control_taken(Cause.DEAD, None) == []
+
+
+def test_silence_is_tried_again_and_given_up_loudly() -> None:
+    dog = watchdog(SCANNING, attempts=3)
+    dog.control_taken(Cause.MANUAL, None)
+    results = []
+    for _ in range(3):
+        assert dog.next_action() == "stop-scan"
+        results.append(dog.answered(SILENCE))
+    assert results == [Result.AGAIN, Result.AGAIN, Result.FAILED]
+    assert dog.wanted == ()
+
+
+def test_what_could_not_be_sent_is_sent_when_the_translator_is_back_unless_it_is_free_by_then() -> None:
+    dog = watchdog(SCANNING)
+    dog.control_taken(Cause.MANUAL, None)
+    dog.next_action()
+    dog.unsent()
+    assert dog.next_action() == "stop-scan"
+    dog.unsent()
+    dog.scope_is(FREE)
+    assert dog.next_action() is None
+
+
+NS = 10**9
+
+
+def test_a_holder_that_does_nothing_has_a_deadline_and_using_control_moves_it() -> None:
+    lease = Lease(60 * NS)
+    lease.held_by("greedy", 0)
+    assert lease.deadline_ns() == 60 * NS
+    lease.used(30 * NS)
+    assert lease.deadline_ns() == 90 * NS
+
+
+def test_while_the_microscope_works_its_holder_is_not_idle() -> None:
+    lease = Lease(60 * NS)
+    lease.held_by("experiment", 0)
+    lease.scope_is(SCANNING, 10 * NS)
+    assert lease.deadline_ns() is None
+    lease.scope_is(FREE, 1000 * NS)
+    assert lease.deadline_ns() == 1060 * NS
+
+
+def test_asking_again_does_not_renew_a_lease() -> None:
+    lease = Lease(60 * NS)
+    lease.held_by("greedy", 0)
+    lease.held_by("greedy", 59 * NS)
+    assert lease.deadline_ns() == 60 * NS
+
+
+def test_without_a_lease_or_a_holder_there_is_no_deadline() -> None:
+    lease = Lease()
+    lease.held_by("greedy", 0)
+    assert lease.deadline_ns() is None
+    assert Lease(NS).deadline_ns() is None
