@@ -153,6 +153,8 @@ def recovery() -> Iterator[Row]:
 def _component_back_s(run: Running) -> float:
     began_s = perf_counter()
     os.kill(run.pids["watcher"], signal.SIGKILL)
+    run.wait_for(r"watcher .*killed by SIGKILL")  # what it said before it died is no sign of life
+    run.wait_for(r"watcher .*started, process")
     run.wait_for(r"watcher .*knows the state")
     return perf_counter() - began_s
 
@@ -166,6 +168,7 @@ def _back_s(name: str) -> float:
             scope.get("scan-speed")
             began_s = perf_counter()
             os.kill(run.pids[name], signal.SIGKILL)
+            run.wait_for(rf"{name} .*killed by SIGKILL")
             deadline_s = began_s + DEADLINE_S
             while perf_counter() < deadline_s:
                 with contextlib.suppress(RequestError):
