@@ -88,6 +88,22 @@ class Link:
                 self.pump(left_s)
         return True
 
+    def wait_connected(self, done: Callable[[], bool], within_s: float, until_s: float | None = None) -> bool:
+        """Wait until `done()`, as long as the scheduler is not there and then for `within_s` at most.
+
+        What it has to say can't come while it is being restarted.
+        """
+        while not done():
+            if not self.wait(lambda: self.connected or done(), until_s):
+                return False
+            connections = self.connections
+            if not self.wait(
+                lambda n=connections: done() or not self.connected or self.connections != n,  # type: ignore[misc]
+                self._earlier(within_s, until_s),
+            ):
+                return False
+        return True
+
     def pump(self, timeout_s: float | None) -> None:
         """Wait for what arrives, once, and bring it to whom it is for."""
         self.check()
@@ -102,11 +118,13 @@ class Link:
         if self.ended:
             raise ExperimentEnded("the experiment has ended", where=self.name)
 
-    def wait_caught_up(self) -> None:
-        """Wait until everything the scheduler has cached is here; once that is so, returns at once."""
-        if self.wait(self.is_caught_up, self.clock.monotonic_s() + CAUGHT_UP_WITHIN_S):
-            return
-        self._caught_up.add(self._source or "")
+    def wait_caught_up(self, until_s: float | None = None) -> None:
+        """Wait until everything the scheduler has cached is here; once that is so, returns at once.
+
+        A scheduler that is not there is waited for: what it has to say may be that we have been measured already.
+        """
+        if not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s) and self.connected:
+            self._caught_up.add(self._source or "")  # it does not say, it is of version 1
 
     def is_caught_up(self) -> bool:
         return self._source in self._caught_up if self._source else bool(self._caught_up)

@@ -100,7 +100,7 @@ class Measuring:
         """
         if key is not None and (found := self._results.find(check_key(key), plan.facts)) is not None:
             return found
-        self._link.wait_caught_up()  # what is cached must not be taken for ours
+        self._link.wait_caught_up(until_s)  # what is cached must not be taken for ours
         progress = _Progress(plan, key, f"{self._link.name}/{key}" if key else self._link.next_id(), until_s)
         cycle = self._taken_up(progress)
         if cycle is not None and self._is_complete(progress, cycle):
@@ -199,10 +199,7 @@ class Measuring:
     def _follow(self, progress: _Progress, cycle: Cycle) -> None:
         """From the success of the action to the end of it."""
         link, until_s = self._link, progress.until_s
-        begun_s = link.clock.monotonic_s() + BEGUN_WITHIN_S
-        if not link.wait(
-            lambda: cycle.begun or cycle.outcome is not None, begun_s if until_s is None else min(begun_s, until_s)
-        ):
+        if not link.wait_connected(lambda: cycle.begun or cycle.outcome is not None, BEGUN_WITHIN_S, until_s):
             cycle.outcome = Outcome.VANISHED
         elif not link.wait(lambda: cycle.outcome is not None, until_s):
             raise NoResponse(

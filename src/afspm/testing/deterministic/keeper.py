@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from afspm.logic.supervision import ChildWatch, Effect, GiveUp, Kill, Policy, Start
+from afspm.logic.supervision import ChildWatch, Effect, GiveUp, Kill, Phase, Policy, Start
 from afspm.testing.deterministic.process import Process
 from afspm.testing.deterministic.timeline import Timeline
 
@@ -64,3 +64,10 @@ class Keeper:
                 process.kill()
             elif isinstance(effect, GiveUp):
                 self.given_up.append(process.name)
+        watch = self._children[process.name][1]
+        if watch.phase is Phase.WAITING and (again_s := watch.deadline_s()) is not None:
+            self._timeline.after(again_s - self._timeline.monotonic_s(), self._tick, process.name)
+
+    def _tick(self, name: str) -> None:
+        process, watch = self._children[name]
+        self._do(process, watch.tick(self._timeline.monotonic_s()))
