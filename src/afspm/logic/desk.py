@@ -21,6 +21,8 @@ from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Res
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
 _SENT_REMEMBERED = 100
+_UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
+_TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 
 
 class Desk:
@@ -58,6 +60,7 @@ class Desk:
         # actions that only we know of: a translator of version 1 would do them again
         self._sent: deque[tuple[str, str, int]] = deque(maxlen=_SENT_REMEMBERED)
         self._refused: set[int] = set()
+        self._unclear: dict[str, tuple[RequestIn, float]] = {}  # by name, and until when it is not answered
 
     def snapshot(self) -> dict[str, Any]:
         """What must survive a kill, as plain JSON."""
@@ -75,31 +78,51 @@ class Desk:
         self._refused.discard(connection)
         return self.sessions.disconnected(connection, now_s)
 
+    def clear_up(self, name: str) -> RequestIn | None:
+        """The request of the peer that waited until the one connected as `name` before it has closed."""
+        waiting = self._unclear.pop(name, None)
+        return waiting[0] if waiting is not None else None
+
+    def unclear_until_s(self) -> float | None:
+        """When the first of them has waited long enough; None: nobody waits."""
+        return min((until_s for _, until_s in self._unclear.values()), default=None)
+
+    def refuse_unclear(self, now_s: float) -> None:
+        """Both connections go on: they are two."""
+        for name, (event, until_s) in list(self._unclear.items()):
+            if now_s >= until_s:
+                del self._unclear[name]
+                self._refuse(event, _TWO_OF_A_NAME.format(name=name))
+
     def take(self, event: RequestIn, now_s: float) -> bool:
         """Hear a request. True: it is new and to be decided; False: it is seen to."""
-        if self._hear(event, now_s) is not Hearing.ACCEPTED:
+        if not self._hear(event, now_s):
             return False
         outcome = self._once.look_up(event.name, event.request) if event.request.id else None
         return outcome is None or not self._repeated(event, outcome, now_s)
 
-    def _hear(self, event: RequestIn, now_s: float) -> Hearing:
+    def _hear(self, event: RequestIn, now_s: float) -> bool:
         """Whether the peer may speak for the name that it gives; if not, it is told so."""
         name = event.name
         if not name:
-            why = "say who you are: set the socket's identity to the component's name"
-        elif event.user is not None and event.user != name:
-            why = f"the key is that of {event.user}, not of {name}"
-        else:
-            hearing = self.sessions.hear(event.connection, name, event.request.id, now_s)
-            if hearing is not Hearing.TAKEN:
-                return hearing
-            why = f"another component is connected as {name}; each needs a name of its own"
+            self._refuse(event, "say who you are: set the socket's identity to the component's name")
+            return False
+        if event.user is not None and event.user != name:
+            self._refuse(event, f"the key is that of {event.user}, not of {name}")
+            return False
+        hearing = self.sessions.hear(event.connection, name, event.request.id, now_s)
+        if hearing is Hearing.UNCLEAR and name not in self._unclear and event.connection not in self._refused:
+            self._unclear[name] = (event, now_s + _UNCLEAR_S)
+        elif hearing in (Hearing.TAKEN, Hearing.UNCLEAR):
+            self._refuse(event, _TWO_OF_A_NAME.format(name=name))
+        return hearing is Hearing.ACCEPTED
+
+    def _refuse(self, event: RequestIn, why: str) -> None:
         if event.connection not in self._refused:
             self._refused.add(event.connection)
-            self._log("WARNING", f"refused a request of {name or 'a nameless peer'}: {why}")
+            self._log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
         response = Response(int(ControlResponse.FAILURE), b"", why, event.request.id)
-        self.effects.append(Reply(event.connection, name, response))
-        return Hearing.TAKEN
+        self.effects.append(Reply(event.connection, event.name, response))
 
     def _repeated(self, event: RequestIn, outcome: Fate | Response, now_s: float) -> bool:
         """A request comes again with its id: answer it without doing it again. False: it may be done."""
@@ -185,6 +208,8 @@ class Desk:
             self._once.note(job.client, job.request, response)
             self._log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
         elif end is End.UNKNOWN:
+            if job.request.kind == _ACTION:
+                self._watchdog.started(str(job.request.subject), job.states_seen)  # as far as we know
             self._finish(job, response, Fate.UNKNOWN)
         else:
             self._once.forget(job.client, job.request)

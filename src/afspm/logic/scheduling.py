@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -24,6 +25,7 @@ from afspm.logic.events import (
     PacketIn,
     Publish,
     Replay,
+    Reply,
     RequestIn,
     SaveState,
     SubscriberJoined,
@@ -45,6 +47,7 @@ from afspm.model import (
     Packet,
     PacketHeader,
     ProbePosition,
+    Response,
     ScanParameters,
     ScopeStatus,
 )
@@ -135,7 +138,7 @@ class SchedulerCore:
     def deadline_s(self) -> float | None:
         """When, in real monotonic time, a Tick is due at the latest; None: no deadline."""
         soonest_s = self._forwarder.deadline_s()
-        for deadline_s in (self._holder_dead_at_s(), self._announce_at_s):
+        for deadline_s in (self._holder_dead_at_s(), self._announce_at_s, self._desk.unclear_until_s()):
             if deadline_s is not None and (soonest_s is None or deadline_s < soonest_s):
                 soonest_s = deadline_s
         return soonest_s
@@ -196,13 +199,17 @@ class SchedulerCore:
 
     def _on_disconnected(self, event: Disconnected, now_s: float, now_ns: int) -> None:
         name = self._desk.disconnected(event.connection, now_s)
-        if name is not None and name == self._control.holder and now_s >= self._missed_again_s:
+        if name is None:
+            return
+        if (waiting := self._desk.clear_up(name)) is not None:
+            self._on_request(waiting, now_s, now_ns)
+        elif name == self._control.holder and now_s >= self._missed_again_s:
             self._missed_again_s = now_s + self._settings.grace_s
             self._log("WARNING", f"{name} is in control and gone; it has {self._settings.grace_s:g} s to come back")
 
     def _on_greeted(self, event: Greeted, now_s: float, now_ns: int) -> None:
         if event.name and (event.user is None or event.user == event.name):
-            self._sessions.hear(event.connection, event.name, "", now_s)
+            self._sessions.hear(event.connection, event.name, None, now_s)
 
     def _on_died(self, event: ComponentDied, now_s: float, now_ns: int) -> None:
         self._arbitrate(Ask(Event.DEAD, event.name), None, now_s, now_ns)
@@ -220,6 +227,8 @@ class SchedulerCore:
         control_event = _CONTROL_EVENTS.get(kind)
         if self._control.ended:
             self._desk.answer(event, ControlResponse.FAILURE, "the experiment has ended")
+        elif kind == ControlRequest.CLOCK:
+            self._tell_time(event, now_ns)
         elif control_event is not None:
             number = int(request.subject or 0)
             self._arbitrate(Ask(control_event, name, number), event, now_s, now_ns)
@@ -229,6 +238,12 @@ class SchedulerCore:
             self._arbitrate(Ask(Event.READ, name), event, now_s, now_ns)
         else:
             self._arbitrate(Ask(Event.COMMAND, name), event, now_s, now_ns)
+
+    def _tell_time(self, event: RequestIn, now_ns: int) -> None:
+        """What time it is, and how it passes: all parts of an experiment go by the scheduler's clock."""
+        told = json.dumps({**self._settings.clock, "now_ns": now_ns}).encode()
+        response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
+        self._effects.append(Reply(event.connection, event.name, response))
 
     # --- control ---
 
@@ -352,6 +367,7 @@ class SchedulerCore:
         lease_ns, holder = self._lease.deadline_ns(), self._control.holder
         if holder is not None and lease_ns is not None and now_ns >= lease_ns:
             self._arbitrate(Ask(Event.IDLE, holder), None, now_s, now_ns)
+        self._desk.refuse_unclear(now_s)
         self._desk.settle_all(self._forwarder.expire(now_s), now_s, now_ns)
 
     # --- telling people ---

@@ -4,10 +4,13 @@ A name belongs to one session at a time: one life of one process. Its first conn
 later connections by the token in its request ids ("<name>/<token>/<n>"); of peers without ids the connection is the
 session.
 
-ROUTER hands a name over to its newest connection and closes the older one. So when a second process takes a name that
-is in use, the first is disconnected *after* the second was accepted, while a process that is restarted connects after
-its former life was disconnected. That tells the impostor, who is refused, from the restarted, who is the same client. A
-former life that speaks again was none: it was first, and has its name back.
+ROUTER hands a name over to its newest connection, and the owner, who hears no more answers, connects anew. So when a
+second process takes a name that is in use, the first is disconnected *after* the second was accepted, while a process
+that is restarted connects after its former life was disconnected. That tells the impostor, who is refused, from the
+restarted, who is the same client. A former life that speaks again was none: it was first, and has its name back.
+
+Peers without ids close their connection and open another whenever an answer is late; which of the two is seen first is
+chance. Such a newcomer is asked to wait a moment (`Hearing.UNCLEAR`), and has the name if the older connection closes.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ class Hearing(Enum):
     """The connection is closed already: there is nobody to answer, and whoever sent it will ask again."""
     TAKEN = auto()
     """Another live process has this name."""
+    UNCLEAR = auto()
+    """The same, but the two may be one: hear it again when the other's connection closes, or a moment later."""
 
 
 @dataclass(slots=True)
@@ -36,6 +41,7 @@ class _Session:
     former: str | None = None  # the token of the session that this one replaced
     lost_order: int = 0
     lost_s: float = 0.0
+    has_ids: bool = True  # until it has asked for something without one
 
 
 def token_of(name: str, request_id: str) -> str | None:
@@ -82,21 +88,28 @@ class Sessions:
             del self._names[self._lost.popitem(last=False)[0]]
         return name
 
-    def hear(self, connection: int, name: str, request_id: str, now_s: float) -> Hearing:
-        """A message came from `name` by `connection`: may it speak for that name?"""
+    def hear(self, connection: int, name: str, request_id: str | None, now_s: float) -> Hearing:
+        """A message came from `name` by `connection`: may it speak for that name?
+
+        Args:
+            request_id: of the request, empty if it has none; None: it only said its name.
+        """
         session = self._names.get(name)
+        has_ids = request_id != ""
         if session is not None and session.connection == connection:
             if session.token is None:
-                session.token = token_of(name, request_id)
+                session.token, session.has_ids = token_of(name, request_id or ""), has_ids
             return Hearing.ACCEPTED
         if connection not in self._open:
             if connection <= self._highest:
                 return Hearing.STALE
             self.connected(connection)
-        token = token_of(name, request_id)
-        if session is not None and not self._gives_way(session, token, connection, now_s):
-            return Hearing.TAKEN
+        token = token_of(name, request_id or "")
+        without_ids = session is not None and not (session.has_ids or has_ids)
+        if session is not None and not self._gives_way(session, token, connection, now_s, without_ids=without_ids):
+            return Hearing.UNCLEAR if without_ids else Hearing.TAKEN
         self._bind(name, token, connection)
+        self._names[name].has_ids = has_ids
         return Hearing.ACCEPTED
 
     def connection_of(self, name: str) -> int | None:
@@ -119,12 +132,16 @@ class Sessions:
         for name, token in tokens.items():
             self._names[name] = _Session(token, None, lost_s=-math.inf)
 
-    def _gives_way(self, session: _Session, token: str | None, connection: int, now_s: float) -> bool:
+    def _gives_way(
+        self, session: _Session, token: str | None, connection: int, now_s: float, *, without_ids: bool
+    ) -> bool:
         # its owner; or the one before, who was taken for dead, and was first
         if token is not None and token in (session.token, session.former):
             return True
         if session.connection is not None:
             return False
+        if without_ids:
+            return True
         handed_over = self._open[connection] < session.lost_order
         return not handed_over or now_s - session.lost_s >= self._takeover_s
 

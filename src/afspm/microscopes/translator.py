@@ -6,6 +6,7 @@ is published, whoever changed it.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -23,7 +24,7 @@ from afspm.microscopes.parameters import Value
 from afspm.microscopes.sequence import Complain, Deliver, Discard, Say, Step
 from afspm.microscopes.sequence import Sequence as StateSequence
 from afspm.microscopes.service import Service
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus, names
 from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.memory import Memory
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
@@ -75,11 +76,12 @@ class Translator:
         self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
+        self._ended = False
 
     def run(self) -> ExitCode:
-        """Until the parent has gone or wants us to stop."""
+        """Until the experiment ends, or the parent has gone or wants us to stop."""
         try:
-            while True:
+            while not self._ended:
                 with self._step():
                     self.look()
                 for arrived in self._port.poll(self.wait_s()):
@@ -87,6 +89,7 @@ class Translator:
                         return ExitCode.ORPHAN
                     with self._step():
                         self.handle(arrived)
+            return ExitCode.ENDED
         finally:
             self.microscope.close()
             self._port.close()
@@ -187,6 +190,9 @@ class Translator:
     # --- requests ---
 
     def _on_request(self, frames: Sequence[bytes]) -> None:
+        if frames[:1] == [wire.CLOSE]:
+            self._end()
+            return
         try:
             request = wire.decode_request(frames)
         except WireError as error:
@@ -203,6 +209,17 @@ class Translator:
                 self._lose(error)
             reason = f"the controller can't be reached: {error}"
             self._finish(request, Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id))
+
+    def _end(self) -> None:
+        """The scheduler says that the experiment is over: the tip does not go on scanning with nobody there."""
+        stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(self._sequence.said.state)
+        if stop is not None and self._connected:
+            with contextlib.suppress(*LOST):
+                self._play(self._service.answer(Request(ControlRequest.ACTION, stop)).steps)
+                self._observe()
+                self._save()
+        self._reply(Response(ControlResponse.SUCCESS))
+        self._ended = True
 
     def _answer(self, request: Request) -> None:
         if not self._connected:

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from afspm.transport.scheduler_sockets import SchedulerSockets, Source
 
 _LEVELS = logging.getLevelNamesMapping()
+_LATE_S = 0.005
+"""How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
+them do."""
 
 
 class Shell:
@@ -49,7 +52,7 @@ class Shell:
         self._complaints = complaints
         self._log = log
         self._replay: tuple[Packet, ...] = ()
-        self._next_s = -math.inf
+        self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         sockets.publisher.history = self._history
 
@@ -58,7 +61,8 @@ class Shell:
 
     def wait(self) -> list[Source]:
         """Wait for whatever comes first, a message or a deadline."""
-        return self._sockets.wait(self._timeout_ms())
+        timeout_s = self._look_at_s - self._clock.monotonic_s()
+        return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
 
     def handle(self, ready: list[Source]) -> None:
         """See to what has come, and to the deadlines."""
@@ -80,7 +84,11 @@ class Shell:
             else:
                 for change in sockets.link.follow():
                     self._take(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
-        self._deadlines()
+        now_s = self._clock.monotonic_s()
+        if now_s >= self._look_at_s:
+            self._deadlines(now_s)
+        elif now_s + _LATE_S < self._look_at_s:
+            self._look_at_s = now_s + _LATE_S  # what has come may have set an earlier one
 
     def close(self) -> None:
         """Write down what is cached, unless the experiment is over."""
@@ -135,15 +143,15 @@ class Shell:
         self._take(events.SubscriberJoined(subscriber, prefixes, since_ns))
         return self._replay
 
-    def _deadlines(self) -> None:
-        now_s = self._clock.monotonic_s()
-        if now_s < self._next_s:
-            return
+    def _deadlines(self, now_s: float) -> None:
+        """See to those that have come, and find the next."""
         due_s = self._journal.due_s
         if due_s is not None and now_s >= due_s:
             self._journal.follow(self._core.cached())
         if self._core_due_s() <= now_s:
             self._take(events.Tick())
+        due_s = self._journal.due_s
+        self._look_at_s = min(math.inf if due_s is None else due_s, self._core_due_s())
 
     def _core_due_s(self) -> float:
         """When, in real monotonic time, the core is due."""
@@ -152,13 +160,6 @@ class Shell:
             wait_s = self._clock.real_s((deadline_ns - self._clock.now_ns()) * 1e-9)
             due_s = min(math.inf if due_s is None else due_s, self._clock.monotonic_s() + wait_s)
         return math.inf if due_s is None else due_s
-
-    def _timeout_ms(self) -> int | None:
-        due_s = self._core_due_s()
-        if (journal_s := self._journal.due_s) is not None and journal_s < due_s:
-            due_s = journal_s
-        self._next_s = due_s
-        return None if due_s == math.inf else milliseconds(due_s - self._clock.monotonic_s())
 
     # --- what goes out ---
 
@@ -183,6 +184,7 @@ class Shell:
                 case events.Kill():
                     sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
                     sockets.publisher.kill()
+                    sockets.link.send(0, [wire.CLOSE])  # the translator subscribes to nobody
                     self.ended = True
 
 

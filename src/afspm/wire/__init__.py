@@ -5,6 +5,7 @@ from __future__ import annotations
 from afspm.wire.codec import Buffer, decode, encode, header
 from afspm.wire.frames import (
     BEAT,
+    CLOSE,
     CLOSING,
     KILL,
     decode_packet,
@@ -21,6 +22,7 @@ from afspm.wire.messages import known_messages, message_of, message_type, regist
 
 __all__ = [
     "BEAT",
+    "CLOSE",
     "CLOSING",
     "KILL",
     "Buffer",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any, Final
 
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -15,6 +16,9 @@ from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectrosco
 from afspm.wire.messages import parse
 
 KILL: Final = b"KILL"
+"""The packet of one frame by which everybody who subscribes learns that the experiment has ended."""
+CLOSE: Final = bytes([100])
+"""The request of one frame by which the scheduler tells its translator the same, which subscribes to nobody."""
 BEAT: Final = b"\x00"
 CLOSING: Final = b"\x01"
 LONGEST_ID = 200
@@ -90,13 +94,11 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
         raise WireError(f"there is no request {kind}", response=ControlResponse.CMD_NOT_SUPPORTED)
     payload = bytes(frames[1]) if len(frames) > 1 else b""
     request_id = _request_id(frames[2]) if len(frames) == 3 else ""
-    name = ControlRequest(kind).name
     try:
         return Request(kind, subject_of(payload), payload, request_id)
-    except WireError as error:
-        raise WireError(f"{name}: {error}", response=error.response) from error
     except AfspmError as error:
-        raise WireError(f"{name}: {error}", response=ControlResponse.PARAM_ERROR) from error
+        response = error.response if isinstance(error, WireError) else ControlResponse.PARAM_ERROR
+        raise WireError(f"{ControlRequest(kind).name}: {error}", response=response) from error
 
 
 def _request_id(frame: Buffer) -> str:
@@ -122,11 +124,12 @@ def decode_response(frames: Sequence[Buffer]) -> Response:
     Raises:
         WireError: it is none.
     """
-    if not 1 <= len(frames) <= 4 or len(frames[0]) != 1:
-        raise WireError(f"a response of {len(frames)} frames, the first of {len(frames[0]) if frames else 0} bytes")
-    payload = bytes(frames[1]) if len(frames) > 1 else b""
-    reason = str(frames[2], "utf-8", "replace") if len(frames) > 2 else ""
-    request_id = str(frames[3], "utf-8", "replace") if len(frames) > 3 else ""
+    count = len(frames)
+    if not 1 <= count <= 4 or len(frames[0]) != 1:
+        raise WireError(f"a response of {count} frames, the first of {len(frames[0]) if frames else 0} bytes")
+    payload = bytes(frames[1]) if count > 1 else b""
+    reason = str(frames[2], "utf-8", "replace") if count > 2 and frames[2] else ""
+    request_id = str(frames[3], "utf-8", "replace") if count > 3 else ""
     return Response(frames[0][0], payload, reason, request_id)
 
 
@@ -142,6 +145,18 @@ def decode_parameter(payload: Buffer) -> Parameter:
         raise WireError(f"the answer holds no parameter: {error}") from error
 
 
+def _action(payload: bytes) -> str:
+    # there are few actions, and they are asked for again and again
+    return _known_action(payload) if len(payload) <= LONGEST_ID else _new_action(payload)
+
+
+def _new_action(payload: bytes) -> str:
+    return convert.action_from_wire(parse(control_pb2.ActionMsg, payload))
+
+
+_known_action = lru_cache(256)(_new_action)
+
+
 def _nothing(payload: bytes) -> None:
     if payload:
         raise WireError(f"an object of {len(payload)} bytes where there should be none")
@@ -154,7 +169,7 @@ def _number(payload: bytes) -> int:
 
 
 _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
-    ControlRequest.ACTION: lambda p: convert.action_from_wire(parse(control_pb2.ActionMsg, p)),
+    ControlRequest.ACTION: _action,
     ControlRequest.PARAM: lambda p: convert.parameter_from_wire(parse(control_pb2.ParameterMsg, p)),
     ControlRequest.SET_SCAN_PARAMS: lambda p: convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, p)),
     ControlRequest.SET_ZCTRL_PARAMS: lambda p: convert.feedback_from_wire(parse(feedback_pb2.ZCtrlParameters, p)),
@@ -165,5 +180,6 @@ _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     ControlRequest.RMV_EXP_PRBLM: _number,
     ControlRequest.SET_CONTROL_MODE: _number,
     ControlRequest.END_EXPERIMENT: _nothing,
-    ControlRequest.ACTION_SUPPORT: lambda p: convert.action_from_wire(parse(control_pb2.ActionMsg, p)),
+    ControlRequest.CLOCK: _nothing,
+    ControlRequest.ACTION_SUPPORT: _action,
 }

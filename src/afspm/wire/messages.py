@@ -98,9 +98,7 @@ def parse(message: type[M], payload: bytes | memoryview) -> M:
     Raises:
         WireError: they are none.
     """
-    parsed = message()
     try:
-        parsed.ParseFromString(payload if isinstance(payload, bytes) else bytes(payload))
+        return message.FromString(payload if isinstance(payload, bytes) else bytes(payload))
     except DecodeError as error:
         raise WireError(f"the bytes are no {message.DESCRIPTOR.name}: {error}") from None
-    return parsed

@@ -14,7 +14,7 @@ import zmq
 
 from afspm import wire
 from afspm.clock import ExperimentClock
-from afspm.model import Request, Response
+from afspm.model import ControlResponse, Request, Response
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys
@@ -129,6 +129,9 @@ class Rig:
         if self.translator is not None:
             for received in self.translator.poll(0.001):
                 if isinstance(received, RequestReceived):
+                    if received.frames == [wire.CLOSE]:  # as a translator of version 1 would
+                        self.translator.reply([bytes([ControlResponse.CMD_NOT_SUPPORTED])])
+                        continue
                     request = wire.decode_request(received.frames)
                     if not request.id.startswith("scheduler/"):
                         self.asked.append(request)

@@ -257,6 +257,16 @@ def test_it_ends_when_its_parent_goes(run: Any) -> None:
     assert running.stop() == 81
 
 
+def test_told_that_the_experiment_has_ended_it_stops_the_scan_and_ends(run: Any) -> None:
+    running = run(speed=1.0)
+    peer = running.peer().ready()
+    assert peer.act(START_SCAN) == OK
+    peer.until(SCANNING)
+    assert peer.ask(100) == [bytes([OK])]
+    assert states(peer.until(FREE)) == [INTERRUPTED, FREE]
+    assert running.wait(20) == 80
+
+
 def test_settings_that_cannot_be_end_it_for_good_with_a_hint(run: Any) -> None:
     running = run({"drift": {"velocity": [1, 2, 3]}})
     assert running.wait(20) == 78

@@ -105,6 +105,17 @@ def test_a_flag_stops_the_scan_before_anything_else_is_sent(lab: Lab) -> None:
     assert lab.forwarded[-1].request.subject == "x-pulse"
 
 
+def test_a_start_of_which_nobody_knows_is_stopped_as_well(lab: Lab) -> None:
+    """The translator was killed while it began the scan; the instrument scans on."""
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
+    lab.step(TranslatorDown())
+    lab.flag("classifier", TIP)
+    lab.step(TranslatorUp())
+    lab.answer(lab.forwarded[-1])
+    assert lab.forwarded[-1].request.subject == "stop-scan"
+
+
 def test_manual_stops_a_scan_that_nobody_holds_as_well(lab: Lab) -> None:
     lab.scope_is(ScopeState.SCANNING)
     lab.mode("person", ControlMode.MANUAL)
@@ -205,6 +216,25 @@ def test_a_second_of_the_same_name_is_refused_with_a_reason(lab: Lab) -> None:
     assert (answer.connection, answer.response.code) == (second, ControlResponse.FAILURE)
     assert "experiment" in answer.response.reason
     assert lab.forwarded == []
+
+
+def test_a_peer_without_ids_that_connects_anew_is_answered_once_its_old_connection_closes(lab: Lab) -> None:
+    lab.take_control("plain")
+    old = lab.connections.pop("plain")
+    assert lab.ask("plain", ControlRequest.REQUEST_CTRL, 0) == []
+    effects = lab.step(Disconnected(old))
+    assert [(reply.connection, reply.response.code) for reply in replies(effects)] == [(lab.newest, OK)]
+    assert lab.core.deadline_s() is None
+
+
+def test_two_without_ids_that_both_go_on_are_two(lab: Lab) -> None:
+    lab.take_control("plain")
+    lab.connections.pop("plain")
+    assert lab.ask("plain", ControlRequest.REQUEST_CTRL, 0) == []
+    deadline_s = lab.core.deadline_s()
+    assert deadline_s is not None
+    lab.later(real_s=deadline_s - lab.now_s)
+    assert replies(lab.step(Tick()))[0].response.code == ControlResponse.FAILURE
 
 
 def test_who_is_authenticated_as_another_is_refused(lab: Lab) -> None:

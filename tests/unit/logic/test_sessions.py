@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from afspm.logic.sessions import Hearing, Sessions, token_of
 
-ACCEPTED, TAKEN, STALE = Hearing.ACCEPTED, Hearing.TAKEN, Hearing.STALE
+ACCEPTED, TAKEN, STALE, UNCLEAR = Hearing.ACCEPTED, Hearing.TAKEN, Hearing.STALE, Hearing.UNCLEAR
 
 
 def test_the_token_is_read_from_ids_of_our_form_only() -> None:
@@ -50,16 +50,24 @@ def test_handing_the_name_over_does_not_make_the_impostor_its_owner() -> None:
     assert sessions.hear(4, "exp", "exp/b/1", 1.2) is TAKEN
 
 
-def test_the_same_holds_for_peers_without_ids() -> None:
+def test_a_peer_without_ids_that_connects_anew_is_the_same_client_whichever_is_seen_first() -> None:
     sessions = Sessions()
     sessions.connected(1)
     assert sessions.hear(1, "old", "", 0.0) is ACCEPTED
     sessions.connected(2)
-    sessions.disconnected(1, 1.0)
-    assert sessions.hear(2, "old", "", 1.0) is TAKEN
-    sessions.connected(3)
-    sessions.disconnected(2, 1.1)
-    assert sessions.hear(3, "old", "", 1.1) is ACCEPTED
+    assert sessions.hear(2, "old", "", 1.0) is UNCLEAR
+    sessions.disconnected(1, 1.001)
+    assert sessions.hear(2, "old", "", 1.002) is ACCEPTED
+
+
+def test_a_peer_without_ids_does_not_take_the_name_of_one_with_ids() -> None:
+    sessions = Sessions(takeover_s=3.0)
+    sessions.connected(1)
+    assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
+    sessions.connected(2)
+    assert sessions.hear(2, "exp", "", 1.0) is TAKEN
+    sessions.disconnected(1, 1.1)
+    assert sessions.hear(2, "exp", "", 1.2) is TAKEN
 
 
 def test_a_name_whose_owner_never_comes_back_is_free_in_the_end() -> None:
