@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from afspm.logic.arbitration import Rules
@@ -25,6 +26,7 @@ class SchedulerSettings:
         takeover_s: see `Sessions`.
         cache_bytes: how much is cached at most.
         catch_up_s: how long (real) a scheduler waits at its start for what the translator has published before.
+        clock: `ExperimentClock.as_dict()`, to be told to those who ask; empty: real time.
     """
 
     rules: Rules = field(default_factory=Rules)
@@ -40,3 +42,4 @@ class SchedulerSettings:
     envelopes: Envelopes = field(default_factory=Envelopes)
     cache_bytes: int = 512 * 2**20
     catch_up_s: float = 1.0
+    clock: Mapping[str, float] = field(default_factory=dict)

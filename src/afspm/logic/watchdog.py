@@ -102,7 +102,7 @@ class Watchdog:
             self._feedback_on = feedback.on
 
     def started(self, action: str, states_seen: int) -> None:
-        """A start action succeeded that was sent when `states_seen` states were known.
+        """A start action succeeded, or may have, that was sent when `states_seen` states were known.
 
         The answer may overtake the state that the microscope is in by it, or be overtaken.
         """

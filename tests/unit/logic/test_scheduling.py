@@ -485,3 +485,10 @@ def test_odd_requests_are_answered(lab: Lab, garbage: Request) -> None:
 
     lab.connect("odd")
     assert [type(e) for e in lab.step(RequestIn(1, "odd", garbage)) if isinstance(e, Reply | Publish)]
+
+
+def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> None:
+    lab = Lab(SchedulerSettings(clock={"origin_s": 5.0, "start_s": 7.0, "speed": 600.0}))
+    answer = replies(lab.ask("elsewhere", ControlRequest.CLOCK, id_="elsewhere/a/1"))[0].response
+    assert (answer.code, answer.id) == (OK, "elsewhere/a/1")
+    assert json.loads(answer.payload) == {"origin_s": 5.0, "start_s": 7.0, "speed": 600.0, "now_ns": lab.now_ns}
