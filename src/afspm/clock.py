@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 NS_PER_S = 1_000_000_000
@@ -79,10 +80,19 @@ class ExperimentClock:
         return self.start_s + (self._wall_at_zero_s + time.monotonic() - self.origin_s) * self.speed
 
     def now_ns(self) -> int:
-        # float64 would round to a quarter microsecond: whole seconds and the fraction apart
-        real_ns = int(self._wall_at_zero_s * NS_PER_S) + time.monotonic_ns() - int(self.origin_s * NS_PER_S)
-        elapsed_ns = real_ns if self.speed == 1.0 else int(real_ns * self.speed)
-        return int(self.start_s * NS_PER_S) + elapsed_ns
+        real_ns = time.monotonic_ns() + self._since_origin_ns
+        return self._start_ns + (real_ns if self.speed == 1.0 else int(real_ns * self.speed))
+
+    # float64 would round the sum to a quarter of a microsecond: in whole nanoseconds, and reckoned once
+
+    @cached_property
+    def _since_origin_ns(self) -> int:
+        """How long the run had lasted at the zero of time.monotonic()."""
+        return int(self._wall_at_zero_s * NS_PER_S) - int(self.origin_s * NS_PER_S)
+
+    @cached_property
+    def _start_ns(self) -> int:
+        return int(self.start_s * NS_PER_S)
 
     def monotonic_s(self) -> float:
         return time.monotonic()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -25,31 +25,52 @@ class Activity:
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._since_s: float | None = None
+        self.since_s: float | None = None
         self.longest_step_s = DEFAULT_LONGEST_STEP_S
 
-    @contextmanager
-    def step(self) -> Iterator[None]:
+    def step(self) -> AbstractContextManager[None]:
         """Something is being worked on in this block."""
-        before, self._since_s = self._since_s, self._clock.monotonic_s()
-        try:
-            yield
-        finally:
-            self._since_s = before
+        return _Step(self, self._clock)
 
-    @contextmanager
-    def waiting(self) -> Iterator[None]:
+    def waiting(self) -> AbstractContextManager[None]:
         """Within a step: this block only waits. The step counts anew afterwards."""
-        working, self._since_s = self._since_s is not None, None
-        try:
-            yield
-        finally:
-            self._since_s = self._clock.monotonic_s() if working else None
+        return _Waiting(self, self._clock)
 
     def age_s(self) -> float:
         """Real seconds since the current step began; 0 when idle."""
-        since_s = self._since_s
+        since_s = self.since_s
         return 0.0 if since_s is None else max(0.0, self._clock.monotonic_s() - since_s)
+
+
+class _Block:
+    """Classes and no generators: these are around everything that a process does."""
+
+    __slots__ = ("_activity", "_before", "_clock")
+
+    def __init__(self, activity: Activity, clock: Clock) -> None:
+        self._activity = activity
+        self._clock = clock
+        self._before = activity.since_s
+
+
+class _Step(_Block):
+    __slots__ = ()
+
+    def __enter__(self) -> None:
+        self._activity.since_s = self._clock.monotonic_s()
+
+    def __exit__(self, *_: object) -> None:
+        self._activity.since_s = self._before
+
+
+class _Waiting(_Block):
+    __slots__ = ()
+
+    def __enter__(self) -> None:
+        self._activity.since_s = None
+
+    def __exit__(self, *_: object) -> None:
+        self._activity.since_s = None if self._before is None else self._clock.monotonic_s()
 
 
 def _never(_: Callable[[], None]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 
 import zmq
@@ -10,7 +9,7 @@ import zmq
 from afspm import wire
 from afspm.errors import WireError
 from afspm.transport.complaints import Complaints
-from afspm.transport.frames import receive, send
+from afspm.transport.frames import receive_small, send
 from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
@@ -49,9 +48,7 @@ class ControlClient:
             return
         self._unanswered = asked
         self.touched = True
-        # full: the scheduler has stood still for thousands of requests
-        with contextlib.suppress(zmq.Again):
-            send(self.socket, [b"", *frames])
+        send(self.socket, [b"", *frames])  # or not, if it is full: then the scheduler has stood still for thousands
 
     def _reconnect(self) -> None:
         self._connected, self._unanswered = False, b""
@@ -61,7 +58,7 @@ class ControlClient:
     def receive(self) -> list[Incoming]:
         """The next answer."""
         self.touched = True
-        frames = [frame.bytes for frame in receive(self.socket)]
+        _, frames = receive_small(self.socket)
         if not frames:
             return []
         try:

@@ -21,7 +21,9 @@ _send: Any = _Library.send
 _receive: Any = _Library.recv
 _get: Any = _Library.get
 _NOBLOCK, _SNDMORE, _EVENTS, _POLLIN = int(zmq.NOBLOCK), int(zmq.SNDMORE), int(zmq.EVENTS), int(zmq.POLLIN)
-_SRCFD = int(zmq.SRCFD)
+_SRCFD, _NOBLOCK_MORE = int(zmq.SRCFD), int(zmq.NOBLOCK | zmq.SNDMORE)
+# (the argument `copy`: a frame costs less than bytes, since it knows whether more frames follow)
+_AS_FRAME = False
 
 
 def readable(socket: Socket) -> bool:
@@ -32,21 +34,39 @@ def readable(socket: Socket) -> bool:
 def receive(socket: Socket) -> list[zmq.Frame]:
     """One whole message as it lies in the library's buffers; empty if there is none."""
     try:
-        frame: zmq.Frame = _receive(socket, _NOBLOCK, copy=False)
+        frame: zmq.Frame = _receive(socket, _NOBLOCK, _AS_FRAME)
     except zmq.Again:
         return []
     frames = [frame]
     while frame.more:
-        frame = _receive(socket, _NOBLOCK, copy=False)
+        frame = _receive(socket, _NOBLOCK, _AS_FRAME)
         frames.append(frame)
     return frames
 
 
-def send(socket: Socket, frames: Sequence[bytes]) -> None:
-    """Send one whole, small message. Raises zmq.Again if nobody is there to take it."""
-    for frame in frames[:-1]:
-        _send(socket, frame, _NOBLOCK | _SNDMORE)
-    _send(socket, frames[-1], _NOBLOCK)
+def receive_small(socket: Socket) -> tuple[zmq.Frame | None, list[bytes]]:
+    """One whole message whose frames are small: the first, which knows the connection, and the contents of all."""
+    try:
+        first = frame = _receive(socket, _NOBLOCK, _AS_FRAME)
+    except zmq.Again:
+        return None, []
+    contents = [frame.bytes]
+    while frame.more:
+        frame = _receive(socket, _NOBLOCK, _AS_FRAME)
+        contents.append(frame.bytes)
+    return first, contents
+
+
+def send(socket: Socket, frames: list[bytes]) -> bool:
+    """Send one whole, small message, which uses up the list; False if nobody is there to take it. Never blocks."""
+    last = frames.pop()
+    try:
+        for frame in frames:
+            _send(socket, frame, _NOBLOCK_MORE)
+        _send(socket, last, _NOBLOCK)
+    except zmq.Again:
+        return False
+    return True
 
 
 def payload_of(frame: zmq.Frame) -> bytes | memoryview:

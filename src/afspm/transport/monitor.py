@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import select
 import struct
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zmq
 
@@ -34,16 +35,24 @@ class Monitor:
 
     def __init__(self, network: Network, socket: zmq.Socket[bytes], events: int) -> None:
         self._watched = socket
-        self.touched = True
         address = f"inproc://monitor-{next(_numbers)}"
         socket.monitor(address, events)
         self.socket = network.socket(zmq.PAIR)
         self.socket.setsockopt(zmq.RCVHWM, 0)
         self.socket.connect(address)
+        self._descriptor: Any = None
+        if hasattr(select, "poll") and not readable(self.socket):
+            self._descriptor = select.poll()
+            self._descriptor.register(int(self.socket.getsockopt(zmq.FD)), select.POLLIN)
+
+    def has_news(self) -> bool:
+        """Whether `drain` would find anything: mostly not."""
+        # nothing is sent by this socket, and all that there is received at once, so its descriptor does not lie: asking
+        # that takes a third of the time
+        return readable(self.socket) if self._descriptor is None else bool(self._descriptor.poll(0))
 
     def drain(self) -> list[ConnectionEvent]:
-        """All events that have come; mostly none, which costs half a microsecond."""
-        self.touched = False
+        """All events that have come."""
         events: list[ConnectionEvent] = []
         while readable(self.socket):
             kind, value = _HEADER.unpack(self.socket.recv_multipart(zmq.NOBLOCK)[0])

@@ -7,6 +7,7 @@ import select
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import zmq
+from zmq.backend import zmq_poll
 
 from afspm.transport.frames import readable
 from afspm.transport.wakeup import WakeUp
@@ -39,32 +40,40 @@ class Poller(Generic[S]):
 
     def __init__(self, wake_up: WakeUp[Any]) -> None:
         self._by_descriptor: dict[int, S] = {}
-        self._owners: list[tuple[Touching, Socket, S]] = []
+        self._by_socket: dict[Any, S] = {}
+        self._owners: list[tuple[Touching, tuple[Socket, int]]] = []
+        self._found: list[S] = []
         self._poll = select.poll()
         self._poll.register(wake_up.fileno(), select.POLLIN)
 
-    def register(self, socket: Socket, source: S, owner: Touching) -> None:
-        """Wait for `socket` too."""
+    def register(self, socket: Socket, source: S, owner: Touching | None) -> None:
+        """Wait for `socket` too; without an owner: nothing is sent by it, and everything received at once."""
         descriptor = int(socket.getsockopt(zmq.FD))
         self._by_descriptor[descriptor] = source
-        self._owners.append((owner, socket, source))
+        if owner is not None:
+            self._by_socket[socket] = source
+            self._owners.append((owner, (socket, int(zmq.POLLIN))))
+        elif readable(socket):
+            self._found.append(source)
         self._poll.register(descriptor, select.POLLIN)
 
     def wait(self, timeout_ms: int | None) -> tuple[list[S], bool]:
         """The sources of the sockets that have news, mostly something to receive, and whether we were woken up."""
-        found = []
-        for owner, socket, source in self._owners:
+        found, self._found = self._found, []
+        touched = []
+        for owner, item in self._owners:
             if owner.touched:
                 owner.touched = False
-                if readable(socket):
-                    found.append(source)
+                touched.append(item)
+        if touched:
+            found += [self._by_socket[socket] for socket, _ in zmq_poll(touched, 0)]
         woken = False
+        known = self._by_descriptor
         for descriptor, _ in self._poll.poll(0 if found else timeout_ms):
-            entry = self._by_descriptor.get(descriptor)
-            if entry is None:
+            if descriptor not in known:
                 woken = True
-            elif entry not in found:
-                found.append(entry)
+            elif (source := known[descriptor]) not in found:
+                found.append(source)
         return found, woken
 
 
@@ -76,7 +85,7 @@ class PortablePoller(Generic[S]):
         self._poller = zmq.Poller()
         self._poller.register(wake_up.fileno(), zmq.POLLIN)
 
-    def register(self, socket: Socket, source: S, owner: Touching) -> None:
+    def register(self, socket: Socket, source: S, owner: Touching | None) -> None:
         self._sources[socket] = source
         self._poller.register(socket, zmq.POLLIN)
 

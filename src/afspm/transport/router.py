@@ -8,7 +8,7 @@ from typing import NamedTuple
 import zmq
 
 from afspm.transport.complaints import Complaints
-from afspm.transport.frames import descriptor_of, readable, receive, send, user_of
+from afspm.transport.frames import descriptor_of, readable, receive_small, send, user_of
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import QUEUE_LENGTH, Network
 
@@ -74,24 +74,26 @@ class Router:
     def receive(self) -> list[RouterEvent]:
         """The next request; if it has to do with a change of connections, that change too and all that came with it."""
         self.touched = True
-        frames = receive(self.socket)
-        if not frames:
+        first, frames = receive_small(self.socket)
+        if first is None:
             return []
-        peer = self._by_descriptor.get(descriptor_of(frames[0]) or -1)
-        if peer is not None and peer.identity == frames[0].bytes and not readable(self.monitor.socket):
+        peer = self._by_descriptor.get(descriptor_of(first) or -1)
+        if peer is not None and peer.identity == frames[0] and not self.monitor.has_news():
             return self._interpret(peer, frames)
-        return self._settle([frames])
+        return self._settle([(first, frames)])
 
     def follow(self) -> list[RouterEvent]:
         """Connections that came and went, and what came with them."""
         return self._settle([])
 
-    def _settle(self, messages: list[list[zmq.Frame]]) -> list[RouterEvent]:
+    def _settle(self, messages: list[tuple[zmq.Frame, list[bytes]]]) -> list[RouterEvent]:
         """Connections in the order in which they came and went, with what was said by each before it went."""
         changes: list[tuple[_Peer, bool]] = []
         for _ in range(_MOST_ROUNDS):
             while len(messages) < QUEUE_LENGTH and readable(self.socket):
-                messages.append(receive(self.socket))
+                first, frames = receive_small(self.socket)
+                if first is not None:
+                    messages.append((first, frames))
             # The monitor tells everything in order: it knows of every connection that these came by, and once it has
             # nothing new, they are all that was said by those that it said are gone.
             news = self._changes()
@@ -99,8 +101,8 @@ class Router:
                 break
             changes += news
         said: list[tuple[_Peer, list[RouterEvent]]] = []
-        for frames in messages:
-            sender = self._sender(frames[0], changes)
+        for first, frames in messages:
+            sender = self._sender(first, changes)
             if sender is not None:
                 said.append((sender, self._interpret(sender, frames)))
         told: list[RouterEvent] = []
@@ -142,11 +144,11 @@ class Router:
             self.touched = True
             send(self.socket, [identity, b"", *frames])
 
-    def _interpret(self, peer: _Peer, frames: list[zmq.Frame]) -> list[RouterEvent]:
-        if len(frames) < 2 or len(frames[1]):
+    def _interpret(self, peer: _Peer, frames: list[bytes]) -> list[RouterEvent]:
+        if len(frames) < 2 or frames[1]:
             self._complaints.say(f"dropped a request of {peer.name or 'somebody'}: no empty frame before it")
             return []
-        return [PeerAsked(peer.connection, peer.name, peer.user, [frame.bytes for frame in frames[2:]])]
+        return [PeerAsked(peer.connection, peer.name, peer.user, frames[2:])]
 
     def _changes(self) -> list[tuple[_Peer, bool]]:
         """The monitor's events: who, and whether it came or went."""

@@ -50,7 +50,7 @@ class SchedulerSockets:
         for source in (self.router, self.link, self.publisher, self.subscriber):
             self._poller.register(source.socket, source, source)
         for monitor in (self.router.monitor, self.link.monitor, self.subscriber.monitor):
-            self._poller.register(monitor.socket, monitor, monitor)
+            self._poller.register(monitor.socket, monitor, None)
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
         """Those that have something to receive; returns early, perhaps with none, after `wake_up`."""

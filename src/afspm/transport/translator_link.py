@@ -8,7 +8,7 @@ from typing import NamedTuple
 import zmq
 
 from afspm.transport.complaints import Complaints
-from afspm.transport.frames import receive, send
+from afspm.transport.frames import receive_small, send
 from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
 
@@ -48,17 +48,13 @@ class TranslatorLink:
 
     def send(self, number: int, frames: Sequence[bytes]) -> bool:
         """Ask; False if there is no translator to ask."""
-        try:
-            self.touched = True
-            send(self.socket, [b"%d" % number, b"", *frames])
-        except zmq.Again:
-            return False
-        return True
+        self.touched = True
+        return send(self.socket, [b"%d" % number, b"", *frames])
 
     def receive(self) -> LinkReply | None:
         """The next answer; None: there is none, or it is malformed."""
         self.touched = True
-        frames = [frame.bytes for frame in receive(self.socket)]
+        _, frames = receive_small(self.socket)
         if not frames:
             return None
         if len(frames) < 3 or frames[1] or not frames[0].isdigit() or len(frames[0]) > _LONGEST_NUMBER:

@@ -60,11 +60,11 @@ class ZmqPort:
         if control is not None:
             self._control = ControlClient(network, name, control, complaints)
             self._poller.register(self._control.socket, self._control.receive, self._control)
-            self._poller.register(self._control.monitor.socket, self._control.follow, self._control.monitor)
+            self._poller.register(self._control.monitor.socket, self._control.follow, None)
         for address in subscribe:
             subscriber = Subscriber(network, name, address, envelopes, complaints)
             self._poller.register(subscriber.socket, subscriber.receive, subscriber)
-            self._poller.register(subscriber.monitor.socket, subscriber.follow, subscriber.monitor)
+            self._poller.register(subscriber.monitor.socket, subscriber.follow, None)
 
     @property
     def clock(self) -> Clock:

@@ -8,7 +8,7 @@ import zmq
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
-from afspm.transport.frames import readable, receive, send, user_of
+from afspm.transport.frames import receive_small, send, user_of
 from afspm.transport.history import Published
 from afspm.transport.network import Network
 from afspm.transport.polling import milliseconds, poller
@@ -73,16 +73,17 @@ class ZmqServerPort:
     def _request(self) -> list[Served]:
         """The next request, if the last one was answered."""
         self.touched = True
-        while self._asker is None and readable(self._socket):
-            frames = receive(self._socket)
-            parts = [frame.bytes for frame in frames]
+        while self._asker is None:
+            first, parts = receive_small(self._socket)
+            if first is None:
+                break
             if b"" not in parts[1:]:
                 continue  # not what REQ or DEALER peers send: there is no telling where an answer would go
             start = parts.index(b"", 1) + 1
             if start == len(parts):
                 continue  # somebody says its name, as to a scheduler
             self._asker = parts[:start]
-            user = user_of(frames[-1]) if self._network.keys is not None else None
+            user = user_of(first) if self._network.keys is not None else None
             if self._allowed is None or self._network.keys is None or user == self._allowed:
                 return [RequestReceived(parts[start:], user)]
             self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])
