@@ -136,6 +136,12 @@ class Experiment:
             for start in starts
         ]
 
+    def asking(self, names: Collection[str]) -> Launch | None:
+        """A launch line by which those of `names` ask the scheduler where it is started elsewhere; None: nobody can."""
+        from afspm.experiment import starting
+
+        return starting.asking(self, names)
+
     def policy(self) -> Policy:
         """How processes are watched and started again, from [restart]."""
         from afspm.logic.liveness import LivenessPolicy

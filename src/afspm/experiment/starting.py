@@ -115,11 +115,34 @@ def _command(part: Part) -> tuple[str, ...]:
     return (sys.executable, *part.command[1:]) if part.command[:1] == ("python",) else part.command
 
 
+def asking(experiment: Experiment, names: Collection[str]) -> Launch | None:
+    """A launch line by which to ask the scheduler, which runs elsewhere, in the name of the first of `names`.
+
+    None where it is not said where it is, or it is of another language and perhaps knows nothing of our requests.
+    """
+    resolved = experiment.resolved
+    part = next((part for part in resolved.parts.components if resolved.roles[part.name] is Role.SCHEDULER), None)
+    if part is None or part.command:
+        return None
+    # as those that are started here reach it; a translator, which asks nobody, by what the scheduler binds
+    known = [*(resolved.net.links[name].control for name in names), f"{part.name}/serve"]
+    addresses = {key: slot.address for key, slot in resolved.net.slots.items()}
+    address = next((found for key in known if key and (found := addresses.get(key, key)) is not None), None)
+    if address is None:
+        return None
+    target = wiring.connectable(address)
+    keys = _keys(resolved, wiring.Links(), {key: found for key, found in addresses.items() if found is not None})
+    if keys is not None and "folder" in keys:
+        keys = {**keys, target: part.name}
+    return Launch(next(iter(names)), sockets=Sockets(control=target), keys=keys)
+
+
 def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str]) -> dict[str, str] | None:
     """The folder of the keys, and whose key to expect at each address; see `transport.network.Network.from_launch`."""
     if resolved.keys_folder is None:
         return {"insecure": "true"} if resolved.security.insecure else None
-    owners = {wiring.connectable(addresses[key]): slot.owner for key, slot in resolved.net.slots.items()}
+    slots = resolved.net.slots.items()
+    owners = {wiring.connectable(addresses[key]): slot.owner for key, slot in slots if key in addresses}
     keys = {"folder": str(resolved.keys_folder)}
     scheduler = next((name for name, role in resolved.roles.items() if role is Role.SCHEDULER), None)
     if scheduler is not None:

@@ -40,6 +40,7 @@ from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import Watchdog
 from afspm.logic.words import said
 from afspm.model import (
+    CLOCK_REQUEST,
     ControlRequest,
     ControlResponse,
     ControlState,
@@ -227,7 +228,7 @@ class SchedulerCore:
         control_event = _CONTROL_EVENTS.get(kind)
         if self._control.ended:
             self._desk.answer(event, ControlResponse.FAILURE, "the experiment has ended")
-        elif kind == ControlRequest.CLOCK:
+        elif kind == CLOCK_REQUEST:
             self._tell_time(event, now_ns)
         elif control_event is not None:
             number = int(request.subject or 0)

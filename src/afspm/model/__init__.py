@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from afspm.model.control import Parameter, Request, Response
 from afspm.model.enums import (
+    CLOCK_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -18,6 +19,7 @@ from afspm.model.spectrum import Spectrum
 from afspm.model.state import ControlState, Feedback, ProbePosition, ScopeStatus
 
 __all__ = [
+    "CLOCK_REQUEST",
     "ControlMode",
     "ControlRequest",
     "ControlResponse",

@@ -54,6 +54,10 @@ class ControlRequest(IntEnum):
     ACTION_SUPPORT = 12
 
 
+CLOCK_REQUEST = 101
+"""A request of ours, not in version 1: what time it is in the experiment."""
+
+
 class ControlResponse(IntEnum):
     """How a request is answered."""
 

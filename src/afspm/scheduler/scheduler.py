@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,6 +30,8 @@ _ENDED, _ORPHAN = 80, 81
 class SchedulerLaunch(Launched, Protocol):
     """The part of `runtime.launch.Launch` that is needed here."""
 
+    @property
+    def clock(self) -> Mapping[str, Any]: ...
     @property
     def state_dir(self) -> str: ...
     @property
@@ -117,7 +120,7 @@ class Scheduler:
         settings = scheduler_settings(
             self._control, self._limits, self._cache, context.problems, context.launch.request_timeout_s
         )
-        core = SchedulerCore(settings, WireCodec())
+        core = SchedulerCore(replace(settings, clock=dict(context.launch.clock)), WireCodec())
         saved = state.load()
         try:
             if saved:

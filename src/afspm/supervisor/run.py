@@ -15,7 +15,7 @@ from afspm.experiment import Experiment, Role, Start
 from afspm.experiment.wiring import connectable
 from afspm.runtime.connect import GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
-from afspm.supervisor import run_folder, summary
+from afspm.supervisor import common_clock, run_folder, summary
 from afspm.supervisor.log import SUPERVISOR, RunLog
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.supervisor import Outcome, Supervisor
@@ -58,7 +58,9 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     experiment.require_valid()
     clock = _clock(experiment, options.speed)
     # whatever is wrong is told before a folder is made
-    names = [start.launch.name for start in _starts(experiment, options, clock, FreePorts())]
+    first = _starts(experiment, options, clock, FreePorts())
+    names = [start.launch.name for start in first]
+    clock = _common_clock(experiment, first, clock, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, _now())
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:
@@ -135,6 +137,24 @@ def _clock(experiment: Experiment, speed: float | None) -> ExperimentClock:
     if not experiment.resolved.simulated:
         raise ConfigError("a real microscope has real time", where="--speed", hint="leave --speed away")
     return replace(clock, speed=speed)
+
+
+def _common_clock(
+    experiment: Experiment, starts: Sequence[Start], own: ExperimentClock, options: Options, terminal: TextIO | None
+) -> ExperimentClock:
+    """The clock of the whole experiment, of which perhaps only a part is started here: it is the scheduler's."""
+    here = {start.launch.name: start.role for start in starts}
+    if Role.SCHEDULER in here.values() or not experiment.resolved.simulated:
+        return own  # real time is the same everywhere
+    launch = experiment.asking(list(here))
+    if launch is None:
+        return own
+    clock = common_clock.of_scheduler(launch, lambda text: print(text, file=terminal, flush=True))
+    if options.speed is not None and clock.speed != options.speed:
+        raise ConfigError(
+            f"the experiment goes at {clock.speed:g}", where="--speed", hint="it is set where the scheduler is started"
+        )
+    return clock
 
 
 def _now() -> datetime:

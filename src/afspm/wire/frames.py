@@ -9,7 +9,7 @@ from typing import Any, Final
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from afspm.errors import AfspmError, WireError
-from afspm.model import ControlRequest, ControlResponse, Packet, Parameter, Request, Response
+from afspm.model import CLOCK_REQUEST, ControlRequest, ControlResponse, Packet, Parameter, Request, Response
 from afspm.wire import convert
 from afspm.wire.codec import Buffer, encode
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
@@ -180,6 +180,6 @@ _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     ControlRequest.RMV_EXP_PRBLM: _number,
     ControlRequest.SET_CONTROL_MODE: _number,
     ControlRequest.END_EXPERIMENT: _nothing,
-    ControlRequest.CLOCK: _nothing,
+    CLOCK_REQUEST: lambda p: None,
     ControlRequest.ACTION_SUPPORT: _action,
 }

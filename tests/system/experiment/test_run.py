@@ -75,6 +75,7 @@ def test_an_experiment_can_be_started_in_two_parts(run: Run) -> None:
     acts.wait_for("ran: microscope, scheduler$")
     assert len(list((acts.folder / "scans").iterdir())) == 4
     assert set(decides.witnessed().values()) == {1}
+    assert decides.facts()["clock"] == acts.facts()["clock"], "each part has a time of its own"
 
 
 def test_the_second_file_wins(run: Run) -> None:

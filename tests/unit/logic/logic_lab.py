@@ -79,9 +79,7 @@ class Lab:
     ) -> list[Effect]:
         return self.step(TranslatorReply(forward.number, Response(int(code), payload, "", forward.request.id)))
 
-    def ask(
-        self, name: str, kind: ControlRequest, subject: Any = None, id_: str = "", user: str | None = None
-    ) -> list[Effect]:
+    def ask(self, name: str, kind: int, subject: Any = None, id_: str = "", user: str | None = None) -> list[Effect]:
         connection = self.connections.get(name) or self.connect(name)
         payload = b"" if subject is None else self.codec.encode(subject)
         return self.step(RequestIn(connection, name, Request(int(kind), subject, payload, id_), user))

@@ -32,6 +32,7 @@ from afspm.logic.limits import Limit, Limits
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import (
+    CLOCK_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -489,6 +490,6 @@ def test_odd_requests_are_answered(lab: Lab, garbage: Request) -> None:
 
 def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> None:
     lab = Lab(SchedulerSettings(clock={"origin_s": 5.0, "start_s": 7.0, "speed": 600.0}))
-    answer = replies(lab.ask("elsewhere", ControlRequest.CLOCK, id_="elsewhere/a/1"))[0].response
+    answer = replies(lab.ask("elsewhere", CLOCK_REQUEST, id_="elsewhere/a/1"))[0].response
     assert (answer.code, answer.id) == (OK, "elsewhere/a/1")
     assert json.loads(answer.payload) == {"origin_s": 5.0, "start_s": 7.0, "speed": 600.0, "now_ns": lab.now_ns}
