@@ -203,7 +203,8 @@ class LimitsReader:
         try:
             number = _rate(value, unit or "") if per_s else si(value, unit or "")
         except AfspmError as error:
-            self._findings.error(f"{where}: {error.what}", self._document.place(*path, key), error.hint)
+            hint = f'a change in a time, as in "1 {unit or ""}/s"' if per_s else error.hint
+            self._findings.error(f"{where}: {error.what}", self._document.place(*path, key), hint)
             return None
         if not math.isfinite(number):
             self._findings.error(f"{where} is not a finite number", self._document.place(*path, key))

@@ -69,7 +69,7 @@ class Plans:
             prepare=prepare,
             fits=lambda result: fits(facts, result),
             facts=facts,
-            name_of=lambda spectrum: str(spectrum.kind),
+            name_of=lambda spectrum: "",  # there is one, and the next may be of another kind
         )
 
     def move_probe(self, xy_m: tuple[float, float], until_s: float | None) -> None:

@@ -85,6 +85,11 @@ def test_a_limit_of_unknown_dimension_is_in_the_unit_given(write: Write) -> None
     assert (limit.low, limit.high, limit.unit) == (0.1, 0.5, "V")
 
 
+def test_a_rate_of_a_wrong_unit_is_told_what_a_rate_is(write: Write) -> None:
+    error = only_error(write('[limits.scan-speed]\nrate = "1 um/s^2"\n'))
+    assert "1 m/s/s" in error.hint
+
+
 SERIES = '[series]\ncomponent = true\nclass = "ScanSeries"\nsize = ["2 um", "2 um"]\n'
 REGION = '[limits]\nregion = { x = ["-1.5 um", "1.5 um"], y = ["-1.5 um", "1.5 um"] }\n'
 

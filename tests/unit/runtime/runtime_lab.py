@@ -298,8 +298,8 @@ class Lab:
         self.publish_scan(self.parameters.region, self.parameters.shape or (8, 8))
 
     def _finish_spectrum(self) -> None:
-        values = np.zeros((3, 2))
-        self.publish(Spectrum(self.position.xy_m, "IV", ("U", "I"), ("V", "A"), values, self.clock.now_ns()))
+        values, kind = np.zeros((3, 2)), self.values.get("x-spec-kind") or "IV"
+        self.publish(Spectrum(self.position.xy_m, kind, ("U", "I"), ("V", "A"), values, self.clock.now_ns()))
 
 
 class Kill9(BaseException):

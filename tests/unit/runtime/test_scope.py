@@ -388,6 +388,11 @@ def test_a_spectrum_is_taken_where_it_was_asked_for(lab: Lab, scope: Scope) -> N
     assert lab.control.holder is None
 
 
+def test_a_spectrum_of_another_kind_than_the_last_is_taken_once(lab: Lab, scope: Scope) -> None:
+    assert [scope.spectrum((2e-7, 3e-7), kind=kind).kind for kind in ("IV", "force", "IV")] == ["IV", "force", "IV"]
+    assert len(lab.executed) == 4, "more than the probe's move and three spectra"
+
+
 def test_the_probe_stands_where_it_was_moved_to_when_the_call_returns(lab: Lab, scope: Scope) -> None:
     scope.move_probe((1e-7, 2e-7))
     assert scope.probe_position == model.ProbePosition((1e-7, 2e-7))
