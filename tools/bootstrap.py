@@ -26,6 +26,17 @@ def main() -> None:
     command = [uv, "sync", "--frozen", "--all-extras", "--python", sys.executable, "--quiet"]
     if subprocess.run(command, cwd=ROOT, env=environment).returncode != 0:
         sys.exit("the environment could not be made: see above")
+    _compile()
+
+
+def _compile() -> None:
+    """Compile all modules now, as pip would and uv does not: an experiment starts many processes, and where Python may
+    not keep what it compiled (PYTHONDONTWRITEBYTECODE), each would spend most of its start on compiling them again."""
+    python = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    packages = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    folder = subprocess.run([str(python), "-c", packages], capture_output=True, text=True, check=True).stdout.strip()
+    # what can't be compiled is a package's template for another Python: nobody imports it
+    subprocess.run([str(python), "-m", "compileall", "-qq", "-j", "0", folder, str(ROOT / "src")], check=False)
 
 
 def _own_uv() -> str:
