@@ -109,7 +109,9 @@ def _example_of_a_guest(starts: Sequence[Start]) -> Launch | None:
         component = by_role.get(Role.COMPONENT)
         return component if component and component.sockets.subscribe and component.sockets.control else None
     sockets = Sockets(subscribe=(connectable(scheduler.sockets.publish),), control=connectable(scheduler.sockets.serve))
-    keys = by_role[Role.COMPONENT].keys if Role.COMPONENT in by_role else scheduler.keys
+    keys = scheduler.keys
+    if keys is not None and "folder" in keys:  # the scheduler itself need not know whose key to expect there: its own
+        keys = {**keys, **dict.fromkeys((*sockets.subscribe, str(sockets.control)), scheduler.name)}
     return replace(scheduler, sockets=sockets, keys=keys)
 
 
