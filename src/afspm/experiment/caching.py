@@ -6,7 +6,7 @@ history = { Scan2d = 10 }
 [[cache.rules]]
 message = "Scan2d"
 above = "5 um"
-envelope = "wide_{channel}"
+envelope = "Scan2d_wide_{channel}"
 history = 3
 """
 
@@ -26,10 +26,17 @@ from afspm.experiment.findings import Findings
 from afspm.experiment.known import Wire
 from afspm.experiment.parts import wire_of
 from afspm.experiment.sections import Section, parse
-from afspm.logic.envelopes import CacheRule
+from afspm.logic.envelopes import CacheRule, Envelopes
+from afspm.model import PacketHeader
 from afspm.units import Length, si
 
 Count = Annotated[int, Field(ge=1)]
+
+_EXAMPLES = (
+    PacketHeader("Scan2d", "Height", (1e-6, 1e-6)),
+    PacketHeader("Spec1d", kind="IV"),
+    *map(PacketHeader, ("ScopeStateMsg", "ScanParameters2d", "ZCtrlParameters", "ProbePosition")),
+)
 
 
 class Rule(Section):
@@ -104,6 +111,13 @@ def _check_mapping(name: str, document: Document, findings: Findings) -> None:
         return
     if not callable(function):
         findings.error(f"[cache] mapping: {name} is no function", place)
+        return
+    for header in _EXAMPLES:  # else its packets would be missing, in the middle of the night
+        try:
+            Envelopes(mapping=function).of(header)
+        except AfspmError as error:
+            findings.error(f"[cache] mapping: {error.what}", place, error.hint)
+            return
 
 
 def _published_history(logic: Mapping[str, Any]) -> dict[str, int]:

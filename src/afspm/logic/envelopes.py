@@ -24,6 +24,11 @@ def default_envelope(header: PacketHeader) -> str:
     return header.message
 
 
+def tells(envelope: str, message: str) -> bool:
+    """Whether subscribers can know from the envelope which message is in it: it begins with its name."""
+    return envelope == message or envelope.startswith(f"{message}_")
+
+
 def size_text(size_m: float) -> str:
     """A length in nm, rounded, as a decimal number; below 1 nm with its digits, since all of them would be 0.0 or 1.0.
 
@@ -61,7 +66,13 @@ class CacheRule:
         if self.history is not None and self.history < 1:
             raise ConfigError(f"a history of {self.history} keeps nothing", where="[cache]", hint="1 or more")
         if self.envelope is not None:
-            self.name(PacketHeader("", "", (0.0, 0.0), ""))
+            message = self.message or "AnyMessage"
+            if not tells(self.name(PacketHeader(message, "", (0.0, 0.0), "")), message):
+                raise ConfigError(
+                    f"the envelope {self.envelope!r} does not begin with the name of its message: nobody could read it",
+                    where="[cache]",
+                    hint=f"e.g. {self.message or '{message}'}_{self.envelope}",
+                )
         if self.above_m is not None and self.up_to_m is not None and self.above_m >= self.up_to_m:
             raise ConfigError(f"no width is above {self.above_m:g} m and up to {self.up_to_m:g} m", where="[cache]")
 
@@ -121,11 +132,11 @@ class Envelopes:
             history = rule.history
         if self._mapping is not None:
             envelope = self._mapped(self._mapping, header)
-            if not isinstance(envelope, str) or not envelope or "\0" in envelope or envelope == "KILL":
+            if not isinstance(envelope, str) or "\0" in envelope or not tells(envelope, header.message):
                 raise ConfigError(
-                    f"the mapping of envelopes gave {envelope!r} for {header.message}",
+                    f"the mapping of envelopes gave {envelope!r} for {header.message}: nobody could read it",
                     where="[cache]",
-                    hint="it must return a text, not empty, without NUL",
+                    hint=f"a text without NUL: {header.message}, or what begins with {header.message}_",
                 )
             return envelope, history
         return (default_envelope(header) if rule is None else rule.name(header)), history

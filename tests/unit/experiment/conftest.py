@@ -63,6 +63,18 @@ class Plan:
         self.size, self.rounds = size, rounds
 
 
+def mute(header):
+    return f"mine/{header.message}"
+
+
+def narrow(header):
+    return f"{header.message}_{header.size_m[0]}"
+
+
+def wide(header):
+    return header.message if header.size_m is None else f"{header.message}_{header.size_m[0]}"
+
+
 class Planner(Component):
     def __init__(self, plan: Plan, more: list[Plan] | None = None):
         self.plan, self.more = plan, more

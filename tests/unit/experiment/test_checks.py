@@ -93,6 +93,11 @@ BROKEN = {
     "a rule of the cache that fits nothing": (
         '[[cache.rules]]\nabove = "2 um"\nup_to = "1 um"\n', FRAME, "no width is above"
     ),
+    "an envelope that does not say what is in it": (
+        '[[cache.rules]]\nmessage = "Scan2d"\nenvelope = "wide_{channel}"\n', FRAME, "nobody could read it"
+    ),
+    "a mapping that does not say what is in it": ('[cache]\nmapping = "parts.mute"\n', FRAME, "nobody could read it"),
+    "a mapping that fails": ('[cache]\nmapping = "parts.narrow"\n', FRAME, "[cache] mapping"),
     "a mapping that is not there": ('[cache]\nmapping = "parts.no_such"\n', FRAME, "[cache] mapping"),
 }  # fmt: skip
 
@@ -115,9 +120,13 @@ def test_a_scan_s_envelope_may_be_given_whole(write: Write) -> None:
 
 
 def test_an_envelope_that_a_rule_of_the_cache_makes_is_published(write: Write) -> None:
-    rule = '[[cache.rules]]\nmessage = "Scan2d"\nabove = "1 um"\nenvelope = "wide_{channel}"\n'
-    assert not errors(write(ANYTHING + 'envelopes = ["wide_Height"]\n' + rule))
+    rule = '[[cache.rules]]\nmessage = "Scan2d"\nabove = "1 um"\nenvelope = "Scan2d_wide_{channel}"\n'
+    assert not errors(write(ANYTHING + 'envelopes = ["Scan2d_wide_Height"]\n' + rule))
     assert errors(write(ANYTHING + 'envelopes = ["wdie_Height"]\n' + rule))
+
+
+def test_a_mapping_that_says_what_is_in_an_envelope_is_fine(write: Write) -> None:
+    assert not errors(write('[cache]\nmapping = "parts.wide"\n'))
 
 
 def test_a_problem_that_a_person_solves_may_be_flagged(write: Write) -> None:

@@ -75,10 +75,10 @@ def test_a_rule_may_say_only_how_many_are_kept() -> None:
 
 
 def test_a_mapping_of_the_user_s_own_names_the_envelope() -> None:
-    assert Envelopes(mapping=lambda header: f"mine/{header.message}").of(scan()) == ("mine/Scan2d", 5)
+    assert Envelopes(mapping=lambda header: f"{header.message}_mine").of(scan()) == ("Scan2d_mine", 5)
 
 
-@pytest.mark.parametrize("bad", ["", "a\0b", "KILL", None, 7])
+@pytest.mark.parametrize("bad", ["", "Scan2d_a\0b", "KILL", None, 7, "wide_Height", "Scan2dwide"])
 def test_a_mapping_that_gives_no_envelope_is_an_error(bad: object) -> None:
     with pytest.raises(ConfigError):
         Envelopes(mapping=lambda header: bad).of(scan())  # type: ignore[arg-type, return-value]
@@ -90,7 +90,15 @@ def test_a_mapping_that_fails_is_an_error_of_the_configuration() -> None:
 
 
 @pytest.mark.parametrize(
-    "rule", [{"history": 0}, {"envelope": "{colour}"}, {"envelope": "{"}, {"above_m": 2e-6, "up_to_m": 1e-6}]
+    "rule",
+    [
+        {"history": 0},
+        {"envelope": "Scan2d_{colour}"},
+        {"envelope": "Scan2d_{"},
+        {"above_m": 2e-6, "up_to_m": 1e-6},
+        {"envelope": "wide_{channel}"},
+        {"envelope": "Spec1d_{channel}"},
+    ],
 )
 def test_a_rule_that_can_not_work_is_refused(rule: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
