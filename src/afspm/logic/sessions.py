@@ -21,6 +21,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 
+_FORMERS = 8
+
 
 class Hearing(Enum):
     """What to make of a message from a connection."""
@@ -38,7 +40,7 @@ class Hearing(Enum):
 class _Session:
     token: str | None
     connection: int | None
-    former: str | None = None  # the token of the session that this one replaced
+    formers: tuple[str, ...] = ()  # the tokens of those that it replaced
     lost_order: int = 0
     lost_s: float = 0.0
     has_ids: bool = True  # until it has asked for something without one
@@ -99,6 +101,8 @@ class Sessions:
         if session is not None and session.connection == connection:
             if session.token is None:
                 session.token, session.has_ids = token_of(name, request_id or ""), has_ids
+                if session.token in session.formers:
+                    session.formers = ()
             return Hearing.ACCEPTED
         if connection not in self._open:
             if connection <= self._highest:
@@ -136,7 +140,7 @@ class Sessions:
         self, session: _Session, token: str | None, connection: int, now_s: float, *, without_ids: bool
     ) -> bool:
         # its owner; or the one before, who was taken for dead, and was first
-        if token is not None and token in (session.token, session.former):
+        if token is not None and (token == session.token or token in session.formers):
             return True
         if session.connection is not None:
             return False
@@ -150,8 +154,9 @@ class Sessions:
         if former is not None and former.connection is not None:
             self._name_of.pop(former.connection, None)
         self._lost.pop(name, None)
-        replaced = former.token if former is not None and former.token != token else None
-        if former is not None and former.former == token:
-            replaced = None  # it is back: whoever came in between has no claim
-        self._names[name] = _Session(token, connection, replaced)
+        formers: tuple[str, ...] = ()
+        # one that is back leaves whoever came in between without a claim
+        if former is not None and (token is None or token not in (former.token, *former.formers)):
+            formers = (*former.formers, *filter(None, [former.token]))[-_FORMERS:]
+        self._names[name] = _Session(token, connection, formers)
         self._name_of[connection] = name

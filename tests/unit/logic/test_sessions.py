@@ -93,6 +93,18 @@ def test_who_was_taken_for_dead_has_its_name_back_when_it_speaks() -> None:
     assert sessions.hear(2, "exp", "exp/b/2", 1.3) is TAKEN
 
 
+def test_also_when_others_had_it_in_between_that_never_said_who_they_are() -> None:
+    sessions = Sessions()
+    sessions.connected(1)
+    sessions.hear(1, "exp", "exp/a/1", 0.0)
+    for connection in (2, 3, 4):
+        sessions.disconnected(connection - 1, float(connection))
+        sessions.connected(connection)
+        assert sessions.hear(connection, "exp", None, float(connection)) is ACCEPTED
+    sessions.connected(5)
+    assert sessions.hear(5, "exp", "exp/a/2", 5.0) is ACCEPTED
+
+
 def test_what_comes_by_a_closed_connection_is_stale() -> None:
     sessions = Sessions()
     sessions.connected(1)

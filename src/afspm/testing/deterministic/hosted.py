@@ -16,11 +16,10 @@ from afspm.microscopes.microscope import Microscope
 from afspm.microscopes.translator import Translator
 from afspm.model import Packet, Request, Response
 from afspm.runtime.component import Component
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.memory import Memory
 from afspm.runtime.process import Activity, Context
-from afspm.testing.deterministic.baton import Baton, Killed
+from afspm.testing.deterministic.baton import Baton
 from afspm.testing.deterministic.network import ControlLine, Feed, Weather
 from afspm.testing.deterministic.process import Process
 from afspm.testing.deterministic.scheduler import SchedulerHost
@@ -32,7 +31,6 @@ from afspm.transport.port import (
     ControlDisconnected,
     Incoming,
     PacketReceived,
-    ParentGone,
     ReplyReceived,
     RequestReceived,
     Served,
@@ -373,6 +371,3 @@ class MemoryServerPort:
 
     def close(self) -> None:
         """Nothing is held open but by the process."""
-
-
-__all__ = ["SOURCE", "ExitCode", "HostedComponent", "HostedProcess", "HostedTranslator", "Killed", "ParentGone"]
