@@ -127,8 +127,8 @@ def nothing_is_called_back(patch: Patch) -> None:
 def told_before_saved(patch: Patch) -> None:
     real = SchedulerCore._control_changed
 
-    def changed(self: SchedulerCore, *args: Any) -> None:
-        real(self, *args)
+    def changed(self: SchedulerCore, *args: Any, **named: Any) -> None:
+        real(self, *args, **named)
         self._effects.sort(key=lambda effect: type(effect).__name__ == "SaveState")
 
     patch.setattr(SchedulerCore, "_control_changed", changed)

@@ -36,9 +36,10 @@ from afspm.logic.events import (
     TranslatorUp,
 )
 from afspm.logic.lease import Lease
+from afspm.logic.sessions import token_of
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import Watchdog
-from afspm.logic.words import said
+from afspm.logic.words import is_routine, said
 from afspm.model import (
     CLOCK_REQUEST,
     ControlRequest,
@@ -87,6 +88,7 @@ class SchedulerCore:
         self._codec = codec
         self._rules = settings.rules
         self._control = Control()
+        self._granted_to: str | None = None  # the token of the life that got control
         self._cache = Cache(settings.envelopes, settings.cache_bytes)
         self._lease = Lease(None if settings.lease_s is None else round(settings.lease_s * 1e9))
         self._watchdog = Watchdog(settings.watchdog)
@@ -97,6 +99,7 @@ class SchedulerCore:
         self._recent: list[tuple[int, int]] = []
         self._missed_again_s = -math.inf
         self._told: set[str] = set()
+        self._holder_told: str | None = None
         self._effects: list[Effect] = []
         self._handlers: dict[type, Callable[[Any, float, int], None]] = {
             RequestIn: self._on_request,
@@ -155,6 +158,7 @@ class SchedulerCore:
             "last_ns": self._cache.last_ns,
             "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
+            "granted_to": self._granted_to,
             **self._desk.snapshot(),
         }
 
@@ -167,6 +171,7 @@ class SchedulerCore:
         self._control = Control.from_dict(state["control"])
         self._cache.not_before(int(state["last_ns"]))
         self._watchdog.restore(map(str, state["wanted"]))
+        self._granted_to = state.get("granted_to")
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
         self._desk.restore(state)
 
@@ -257,25 +262,38 @@ class SchedulerCore:
             self._desk.forward(event, now_s, now_ns, command=ask.event is Event.COMMAND)
             return
         self._control = after = arbitration.apply(row, before, ask)
+        token = None if event is None else token_of(ask.who, event.request.id)
+        if before.holder is None and after.holder is not None:
+            self._granted_to = token
         if after != before:
-            self._control_changed(before, ask, row, now_s, now_ns)
+            had_died = None not in (token, self._granted_to) and token != self._granted_to
+            self._control_changed(before, ask, row, now_s, now_ns, had_died=had_died and ask.who == before.holder)
         if event is not None and row.response is not None:
             self._desk.answer(event, row.response, arbitration.reason(row, before, ask, self._rules))
         if after.ended and not before.ended:
             self._effects.append(Kill())
 
-    def _control_changed(self, before: Control, ask: Ask, row: arbitration.Row, now_s: float, now_ns: int) -> None:
-        """Save, act and tell, in this order, before whoever asked is answered."""
+    def _control_changed(
+        self, before: Control, ask: Ask, row: arbitration.Row, now_s: float, now_ns: int, *, had_died: bool
+    ) -> None:
+        """Save, act and tell, in this order, before whoever asked is answered.
+
+        Args:
+            had_died: `ask` is of a holder in another life than that in which it got control.
+        """
         after = self._control
         self._lease.held_by(after.holder, now_ns)
         wanted: list[str] = []
         if row.cause is not None and (before.holder is not None or row.cause is Cause.MANUAL):
-            wanted = self._watchdog.control_taken(row.cause, self._desk.action_in_flight())
+            wanted = self._watchdog.control_taken(row.cause, self._desk.action_in_flight(), had_died=had_died)
         publish = self._stamp_control(now_ns) if after.published() != before.published() else None
         self._effects.append(self._save())
-        self._log("INFO", said(before, after, ask, row, self._rules))
+        routine = is_routine(before, after, ask, self._holder_told)
+        self._log("DEBUG" if routine else "INFO", said(before, after, ask, row, self._rules))
+        self._holder_told = after.holder or self._holder_told
         for action in wanted:
-            self._log("WARNING", f"{action} is sent to the microscope, since {row.cause.value if row.cause else ''}")
+            why = f"{before.holder} had died in control" if had_died else row.cause.value if row.cause else ""
+            self._log("WARNING", f"{action} is sent to the microscope, since {why}")
         if before.holder is not None and after.holder is None:
             self._desk.call_back(before.holder, row.cause)
         self._desk.errands.send(now_s)

@@ -114,8 +114,11 @@ class Watchdog:
         if action == self._settings.retract:
             self._can_retract = False
 
-    def control_taken(self, cause: Cause, in_flight: str | None) -> list[str]:
+    def control_taken(self, cause: Cause, in_flight: str | None, *, had_died: bool = False) -> list[str]:
         """Control was taken for `cause` while the action `in_flight` was with the translator.
+
+        Args:
+            had_died: the process that got control has died; who gives it back is the one started in its place.
 
         Returns:
             What is wanted now, in order.
@@ -124,8 +127,9 @@ class Watchdog:
         stop = _STOP.get(self._state) or self._starting or _STARTS.get(in_flight or "")
         if stop is not None and cause in self._settings.stop_when:
             wanted.append(stop)
-        if cause is Cause.DEAD and self._settings.retract is not None and self._can_retract and self._is_dangerous():
-            wanted.append(self._settings.retract)
+        died, retract = cause is Cause.DEAD or had_died, self._settings.retract
+        if died and retract is not None and self._can_retract and self._is_dangerous():
+            wanted.append(retract)
         self._wanted += [action for action in wanted if action not in self._wanted]
         return wanted
 

@@ -17,10 +17,12 @@ if TYPE_CHECKING:
 
 S = TypeVar("S")
 
+_LONGEST_MS = 2**31 - 1  # 24 days
+
 
 def milliseconds(timeout_s: float | None) -> int | None:
-    """Rounded up: whoever is woken up before a deadline would only come back."""
-    return None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
+    """Rounded up: whoever is woken up before a deadline would only come back. At most what a poller can wait for."""
+    return None if timeout_s is None else max(0, math.ceil(min(timeout_s * 1000.0, _LONGEST_MS)))
 
 
 class Touching(Protocol):

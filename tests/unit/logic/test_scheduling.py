@@ -185,6 +185,23 @@ def test_a_holder_that_will_not_come_back_is_given_up_at_once(lab: Lab) -> None:
     assert lab.holder is None
 
 
+@pytest.mark.parametrize(
+    ("life", "feedback_on", "last"), [("b", False, "x-retract"), ("b", True, None), ("a", False, None)]
+)
+def test_a_restarted_holder_that_gives_control_back_leaves_no_danger_behind(
+    lab: Lab, life: str, feedback_on: bool, last: str | None
+) -> None:
+    lab.translator()
+    lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, "experiment/a/1")
+    lab.publish("ZCtrlParameters", Feedback(on=False))
+    lab.step(Disconnected(lab.connections.pop("experiment")))
+    lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, f"experiment/{life}/2")
+    lab.publish("ZCtrlParameters", Feedback(on=feedback_on))
+    lab.core.restore(json.loads(json.dumps(lab.core.snapshot())))
+    assert replies(lab.ask("experiment", ControlRequest.RELEASE_CTRL, None, f"experiment/{life}/3"))[0].response.ok
+    assert (lab.forwarded[-1].request.subject if lab.forwarded else None) == last
+
+
 def test_the_tip_of_a_holder_that_died_in_danger_is_retracted_and_nobody_disturbs_that(lab: Lab) -> None:
     lab.publish("ZCtrlParameters", Feedback(on=False))
     lab.take_control("experiment")
