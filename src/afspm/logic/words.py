@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from afspm.logic.arbitration import Ask, Control, Row, Rules
+from afspm.logic.arbitration import Ask, Control, Event, Row, Rules
+
+
+def is_routine(before: Control, after: Control, ask: Ask, holder_told: str | None) -> bool:
+    """Whether a change needs no telling: control is given back, or taken once more by who was told to have it last."""
+    if (after.problems, after.mode, after.ended) != (before.problems, before.mode, before.ended) or after.problems:
+        return False
+    return ask.event is Event.RELEASE_CONTROL if after.holder is None else after.holder == holder_told
 
 
 def said(before: Control, after: Control, ask: Ask, row: Row, rules: Rules) -> str:
