@@ -11,6 +11,7 @@ from typing import Any, Final
 from afspm.errors import InvalidValue
 from afspm.experiment import wiring
 from afspm.experiment.findings import closest, nearest
+from afspm.experiment.handlers import check_handlers
 from afspm.experiment.known import WIRE_SETTINGS
 from afspm.experiment.parts import Role, wire_of
 from afspm.experiment.resolved import Resolved
@@ -320,4 +321,5 @@ CHECKS: Final[tuple[Callable[[Resolved], None], ...]] = (
     check_names_of_people,
     check_likely_typos,
     check_needs,
+    check_handlers,
 )

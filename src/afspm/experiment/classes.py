@@ -166,7 +166,8 @@ def _no_module(module: str, error: ModuleNotFoundError) -> Unloadable:
         with contextlib.suppress(OSError):
             siblings += [p.stem for p in Path(folder).iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()]
     near = closest(last, siblings, 0.7)
-    hint = f"did you mean {(parent + '.' if parent else '') + near!r}?" if near else "a module beside the file is found"
+    beside = f"write {last}.py beside the experiment file" if not parent else ""
+    hint = f"did you mean {(parent + '.' if parent else '') + near!r}?" if near else beside
     return Unloadable(f"there is no module {missing!r}", hint)
 
 

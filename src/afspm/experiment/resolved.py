@@ -128,7 +128,7 @@ def _resolve_part(part: Part, resolved: Resolved) -> None:
         findings.error(
             f"[{name}] {path} is not a component",
             document.place(name, "class"),
-            "derive it from afspm.runtime.component.Component",
+            "derive it from afspm.Component",
         )
         return
     resolved.classes[name], resolved.class_paths[name], resolved.roles[name] = component, path, role

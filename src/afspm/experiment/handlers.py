@@ -1,0 +1,67 @@
+"""The handlers of components: a name that is never called, a signature that can't be called."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from afspm import wire
+from afspm.experiment.findings import closest
+from afspm.experiment.parts import Part, Role
+from afspm.experiment.resolved import Resolved
+from afspm.runtime.component import Component
+from afspm.runtime.dispatch import HANDLERS, snake_case
+
+_NEARLY = 0.8
+_CALLED = ("run", *(name for name in vars(Component) if name.startswith("on_")))
+
+
+def check_handlers(resolved: Resolved) -> None:
+    """What looks like a handler is called by that name, with what it takes."""
+    for part in resolved.with_role(Role.COMPONENT):
+        component = resolved.classes.get(part.name)
+        if component is None or not issubclass(component, Component):
+            continue
+        for name, method in _methods(component):
+            _check_name(part, component, name, resolved)
+            _check_signature(part, component, name, method, resolved)
+
+
+def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Methods of the user's that are called, or look so."""
+    ours = set(Component.__mro__)
+    seen: set[str] = set()
+    for base in (base for base in component.__mro__ if base not in ours):
+        for name, method in vars(base).items():
+            if (name == "run" or name.startswith("on_")) and inspect.isfunction(method) and name not in seen:
+                seen.add(name)
+                yield name, method
+
+
+def _check_name(part: Part, component: type[Component], name: str, resolved: Resolved) -> None:
+    valid = {*_CALLED, *(f"on_{snake_case(message)}" for message in wire.known_messages() if message not in HANDLERS)}
+    near = closest(name, valid, _NEARLY)
+    if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own
+        return
+    hint = f"did you mean {near!r}?" if near else "on_scan, on_state, …; of a message of your own after its name"
+    resolved.findings.warning(
+        f"[{part.name}] {component.__name__}.{name} is never called: there is no such handler",
+        resolved.document.place(part.name, "class"),
+        hint,
+    )
+
+
+def _check_signature(
+    part: Part, component: type[Component], name: str, method: Callable[..., Any], resolved: Resolved
+) -> None:
+    base = getattr(Component, name, None)
+    wanted = list(inspect.signature(base).parameters) if base is not None else ["self", "message"]
+    try:
+        inspect.signature(method).bind(*wanted)
+    except TypeError as error:
+        resolved.findings.error(
+            f"[{part.name}] {component.__name__}.{name} can't be called as it will be: {error}",
+            resolved.document.place(part.name, "class"),
+            f"write `def {name}({', '.join(wanted)})`",
+        )

@@ -1,0 +1,55 @@
+"""Handlers that would never be called, or can't be, are told before anything starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from afspm.experiment import load
+
+from .conftest import FRAME
+
+COMPONENT = """
+from afspm import Component
+class Mine(Component):
+    def {method}:
+        pass
+    def helper(self):
+        pass
+"""
+TABLE = '[mine]\ncomponent = true\nclass = "mine.Mine"\n'
+
+
+def findings(folder: Path, method: str, more: str = "") -> list[str]:
+    (folder / "mine.py").write_text(COMPONENT.format(method=method))
+    (folder / "experiment.toml").write_text(more + FRAME + TABLE)
+    return [
+        f"{finding.level.value}: {finding.what} {finding.hint}" for finding in load(folder / "experiment.toml").check()
+    ]
+
+
+@pytest.mark.parametrize(
+    "method",
+    ["on_scan(self, scan)", "on_scan(self, scan, more=1)", "on_tick(self)", "run(self)", "on_action_msg(self, m)"],
+)
+def test_a_handler_is_fine(tmp_path: Path, method: str) -> None:
+    assert findings(tmp_path, method) == []
+
+
+def test_a_name_that_nobody_calls_is_warned_of(tmp_path: Path) -> None:
+    (told,) = findings(tmp_path, "on_scans(self, scan)")
+    assert told.startswith("warning: [mine] Mine.on_scans is never called")
+    assert "'on_scan'" in told
+
+
+def test_a_message_of_ones_own_may_have_a_handler(tmp_path: Path) -> None:
+    (tmp_path / "crystal.proto").write_text('syntax = "proto3"; message PeakList { double height = 1; }')
+    assert findings(tmp_path, "on_peak_list(self, message)", 'messages = ["crystal.proto"]\n') == []
+
+
+@pytest.mark.parametrize("method", ["on_scan(scan)", "on_scan(self)", "on_problem(self, problem)", "run(self, scope)"])
+def test_one_that_can_not_be_called_is_an_error(tmp_path: Path, method: str) -> None:
+    (told,) = findings(tmp_path, method)
+    assert told.startswith("error: [mine] Mine.")
+    assert "write `def " in told
