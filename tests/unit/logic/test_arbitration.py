@@ -23,6 +23,7 @@ from afspm.logic.arbitration import (
     row_for,
 )
 from afspm.logic.diagram import edges, kind, mermaid
+from afspm.logic.words import is_routine
 from afspm.model import ControlMode, ControlResponse, ProblemNames
 
 TIP, FEEDBACK, NAMED = 1, 3, 40
@@ -273,3 +274,24 @@ def _states() -> list[Control]:
         states += [Control(m, None, 0, problems) for m in (ControlMode.MANUAL, ControlMode.AUTOMATED)]
         states += [Control(ControlMode.AUTOMATED, "a", solving, problems) for solving in (flagged or {0: ""})]
     return states
+
+
+def test_giving_control_back_and_taking_it_again_is_routine_to_the_log() -> None:
+    free, held = Control(), Control(holder="series")
+    back = Ask(Event.RELEASE_CONTROL, "series")
+    ask = Ask(Event.REQUEST_CONTROL, "series")
+    assert is_routine(held, free, back, "series")
+    assert is_routine(free, held, ask, "series")
+
+
+def test_what_says_how_the_experiment_goes_is_told() -> None:
+    free, held = Control(), Control(holder="series")
+    ask = Ask(Event.REQUEST_CONTROL, "series")
+    flagged = Control(problems={1: "classifier"})
+    assert not is_routine(free, held, ask, None)  # the first to be in control
+    assert not is_routine(free, held, ask, "corrector")  # another than before
+    assert not is_routine(held, free, Ask(Event.DEAD, "series"), "series")
+    assert not is_routine(held, flagged, Ask(Event.FLAG, "classifier", 1), "series")
+    assert not is_routine(flagged, free, Ask(Event.CLEAR, "classifier", 1), "series")
+    solving = Control(holder="corrector", solving=1, problems={1: "classifier"})
+    assert not is_routine(solving, flagged, Ask(Event.RELEASE_CONTROL, "corrector"), "corrector")
