@@ -45,15 +45,23 @@ class Region:
     frame: Frame = Frame.TIP
 
     def __post_init__(self) -> None:
-        x, y = self.center_m
-        width, height = self.size_m
-        values = (float(x), float(y), float(width), float(height), float(self.angle_rad))
+        try:
+            x, y = self.center_m
+            width, height = self.size_m
+            values = (float(x), float(y), float(width), float(height), float(self.angle_rad))
+        except (TypeError, ValueError) as error:
+            raise InvalidValue(
+                f"a region needs (x, y) and (width, height), not centre {self.center_m!r} and size {self.size_m!r}",
+                hint="numbers in metres, e.g. Region(center_m=(0, 0), size_m=(1e-6, 1e-6))",
+            ) from error
         if not all(map(math.isfinite, values)):
             raise InvalidValue(
                 f"a region needs finite numbers, not centre {self.center_m}, size {self.size_m}, angle {self.angle_rad}"
             )
         if values[2] <= 0.0 or values[3] <= 0.0:
-            raise InvalidValue(f"a region of {width:g} m x {height:g} m is empty", hint="both sizes are above zero")
+            raise InvalidValue(
+                f"a region of {values[2]:g} m x {values[3]:g} m is empty", hint="both sizes are above zero"
+            )
         object.__setattr__(self, "center_m", values[:2])
         object.__setattr__(self, "size_m", values[2:4])
         object.__setattr__(self, "angle_rad", values[4])

@@ -32,7 +32,13 @@ class ScanParameters:
     unit: str | None = None
 
     def __post_init__(self) -> None:
-        if self.shape is not None and min(self.shape) < 1:
+        if self.shape is None:
+            return
+        if not (isinstance(self.shape, tuple | list) and len(self.shape) == 2):
+            raise InvalidValue(
+                f"the shape of a scan is (rows, columns), not {self.shape!r}", hint="e.g. shape=(128, 128)"
+            )
+        if min(self.shape) < 1:
             raise InvalidValue(f"a scan of {self.shape[0]} rows and {self.shape[1]} columns has no pixels")
 
     def onto(self, current: ScanParameters) -> ScanParameters:

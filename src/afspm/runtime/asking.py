@@ -15,6 +15,19 @@ NOT_THERE_S = 1.0  # before one that can't be reached is asked again, when nothi
 SETTLED_WITHIN_S = 2.0  # what was set is published, if it changed anything
 ASK_FREE_AGAIN_S = 5.0  # should the state FREE never reach us
 
+_ASKED_FOR = {
+    ControlRequest.ACTION: "the action",
+    ControlRequest.ACTION_SUPPORT: "asking for an action",
+    ControlRequest.PARAM: "the parameter",
+    ControlRequest.SET_SCAN_PARAMS: "the region or shape of the scan",
+    ControlRequest.SET_ZCTRL_PARAMS: "the setting of the feedback",
+    ControlRequest.SET_PROBE_POS: "the position of the probe",
+    ControlRequest.REQUEST_CTRL: "control",
+    ControlRequest.ADD_EXP_PRBLM: "flagging a problem",
+    ControlRequest.RMV_EXP_PRBLM: "clearing a problem",
+    ControlRequest.SET_CONTROL_MODE: "the mode",
+    ControlRequest.END_EXPERIMENT: "ending the experiment",
+}
 _NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
 
@@ -150,4 +163,5 @@ def refused(kind: ControlRequest, response: Response, where: str) -> Refused:
     """A response as the error that it is."""
     known = response.code in ControlResponse._value2member_map_
     code = ControlResponse(response.code).name if known else str(response.code)
-    return Refused(response.code, f"{kind.name} was refused: {response.reason or code}", where=where, hint=code)
+    what = _ASKED_FOR.get(kind, kind.name)
+    return Refused(response.code, f"{what} was refused: {response.reason or code}", where=where, hint=code)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from afspm import wire
 from afspm.errors import ExperimentEnded, WireError
@@ -26,6 +26,13 @@ class Event:
     envelope: str
     message: Any
     time_ns: int | None
+
+    if not TYPE_CHECKING:  # for the type checker the attributes above are all there is
+
+        def __getattr__(self, name: str) -> Any:
+            raise AttributeError(
+                f"an event has no {name!r}: it has envelope, time_ns and message, which is the thing itself"
+            )
 
 
 class Events(Iterator[Event]):

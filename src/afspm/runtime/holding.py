@@ -107,7 +107,7 @@ class Holding:
             if until_s is not None and clock.monotonic_s() >= until_s:
                 raise ControlLost(f"control was not given in time: {told}", where=self._link.name)
         if told:
-            self._link.log.info("in control again")
+            self._link.log.info("in control")
 
     def release_inherited(self) -> None:
         """Give back control that an earlier life had and nobody wants now: others wait for it."""

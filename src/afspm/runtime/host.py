@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from afspm.clock import Clock, ExperimentClock
-from afspm.errors import AfspmError, ConfigError
-from afspm.runtime import log
+from afspm.errors import ConfigError
+from afspm.runtime import failure, log
 from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch
 from afspm.runtime.loading import load
@@ -55,7 +55,8 @@ def main() -> int:
         if parent.gone:
             logger.debug("while ending: %s", error, exc_info=True)
             return ExitCode.ORPHAN
-        logger.exception("%s", error if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}")
+        logger.error("%s", failure.told(error, launch.name))
+        logger.debug("the same with every step of ours", exc_info=True)
         return ExitCode.CRASHED
 
 

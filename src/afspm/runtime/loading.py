@@ -29,7 +29,7 @@ def load(launch: Launch) -> Process:
         raise ConfigError(
             f"{launch.class_} can't be run",
             where=launch.name,
-            hint="derive it from afspm.runtime.component.Component",
+            hint="derive it from afspm.Component",
         )
     return made
 

@@ -10,6 +10,7 @@ from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import ConfigError, ExperimentEnded
 from afspm.model import Packet
+from afspm.runtime import failure
 from afspm.runtime.backlog import Backlog
 from afspm.runtime.component import Component
 from afspm.runtime.dispatch import Dispatcher, overrides
@@ -126,8 +127,8 @@ class ComponentLoop:
                 self._component.on_end()
         except (ExperimentEnded, StopRequested):
             self._context.log.debug("on_end asked for something after the end")
-        except Exception:
-            self._context.log.exception("on_end failed")
+        except Exception as error:
+            self._context.log.error("on_end failed: %s", failure.told(error, self._context.name))
 
     def _keep(self, packet: Packet, ours: bool) -> None:
         if self._dispatcher.wants(packet):

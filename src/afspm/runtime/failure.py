@@ -1,0 +1,72 @@
+"""What a person is told of an exception: what happened, and where in their own code."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from afspm.errors import AfspmError
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def told(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
+    """An exception in words: its message on the first line, and below it the lines of code that led to it.
+
+    How we came to call somebody's component is left out; where we refused on purpose what it asked for, how we came to
+    do that as well. An error that comes from nobody's code but ours is told whole.
+
+    Args:
+        name: of the component, which whoever reads this knows already.
+        package: the folder of the code that is ours.
+    """
+    trace = traceback.TracebackException.from_exception(error)
+    is_chained = False
+    link: traceback.TracebackException | None = trace
+    seen: set[int] = set()
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
+        kept = _kept(link.stack, package, is_foreseen=link is trace and _is_foreseen(error, link.stack, package))
+        link.stack = traceback.StackSummary.from_list(kept)
+        link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
+        is_chained = is_chained or link is not None
+    what = _words(error, name) if isinstance(error, AfspmError) else "".join(trace.format_exception_only()).strip()
+    where = trace.format() if is_chained else trace.stack.format()
+    return "\n".join([what, *"".join(where).rstrip("\n").splitlines()])
+
+
+def _is_foreseen(error: BaseException, frames: Sequence[traceback.FrameSummary], package: Path) -> bool:
+    """Whether we raised it on purpose, for what was asked of us; then its message says all."""
+    last = frames[-1] if frames else None
+    return isinstance(error, AfspmError) or (
+        last is not None and _is_ours(last, package) and (last.line or "").startswith("raise ")
+    )
+
+
+def _words(error: AfspmError, name: str) -> str:
+    said = str(error)
+    return said.removeprefix(f"{name}: ") if name else said
+
+
+def _kept(
+    frames: Iterable[traceback.FrameSummary], package: Path, *, is_foreseen: bool
+) -> list[traceback.FrameSummary]:
+    everything = list(frames)
+    first = next((i for i, frame in enumerate(everything) if not _is_ours(frame, package)), None)
+    if first is None:
+        return everything
+    below = everything[first:]
+    if not is_foreseen:
+        return below
+    last = max(i for i, frame in enumerate(below) if not _is_passage(frame, package)) if below else 0
+    return [frame for frame in below[: last + 1] if not _is_ours(frame, package)]
+
+
+def _is_ours(frame: traceback.FrameSummary, package: Path) -> bool:
+    return frame.filename.startswith("<") or Path(frame.filename).is_relative_to(package)
+
+
+def _is_passage(frame: traceback.FrameSummary, package: Path) -> bool:
+    """Ours, or what Python does between two calls of ours."""
+    return _is_ours(frame, package) or Path(frame.filename).name == "contextlib.py"
