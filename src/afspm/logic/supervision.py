@@ -21,6 +21,8 @@ class Policy:
     """Whether it sends heartbeats."""
     final_codes: Collection[int] = frozenset({0, 78, 80, 81})
     """Exit codes after which it is not started again: done, bad settings, the experiment ended, asked to stop."""
+    quiet_codes: Collection[int] = frozenset({78, 80})
+    """Those of them that others tell: who gives it up for its settings, the scheduler that the experiment has ended."""
 
 
 class Beat(Protocol):
@@ -32,9 +34,6 @@ class Beat(Protocol):
     def step_age_s(self) -> float | None: ...
     @property
     def longest_step_s(self) -> float | None: ...
-
-
-CONFIG_CODE = 78
 
 
 class Phase(Enum):
@@ -132,8 +131,8 @@ class ChildWatch:
             return []
         if phase is not Phase.KILLING and code in self._policy.final_codes:
             self.phase = Phase.DONE
-            return [Log("INFO" if code != CONFIG_CODE else "ERROR", f"ended: {how}; it is not started again")]
-        return self._failed(now_s, f"ended: {how}")
+            return [Log("DEBUG" if code in self._policy.quiet_codes else "INFO", how)]
+        return self._failed(now_s, how)
 
     def start_failed(self, why: str, now_s: float) -> list[Effect]:
         """There is no process: the command is missing, the computer has no memory left …"""

@@ -34,6 +34,8 @@ class LineReader:
 
     def __init__(self) -> None:
         self._level: int = logging.WARNING
+        self.last_error = ""
+        """The first line of the last error."""
 
     def read(self, stream: Literal["stdout", "stderr"], line: str) -> tuple[int, str]:
         """The level (that of `logging`) and the text of a line."""
@@ -43,6 +45,8 @@ class LineReader:
         if match is None:
             return self._level, line
         self._level = _LEVELS[match["level"]]
+        if self._level >= logging.ERROR:
+            self.last_error = match["text"]
         return self._level, match["text"]
 
 

@@ -17,6 +17,7 @@ from afspm.errors import AfspmError
 from afspm.runtime.exit_codes import ExitCode
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
+FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
 LAST_WORDS_S = 0.3  # how long output may still come after an exit (a grandchild can hold the pipe open)
 
 Stream = Literal["stdout", "stderr"]
@@ -81,7 +82,7 @@ class ChildProcess:
 
     def close_stdin(self) -> None:
         """Ask the child to end. One that hasn't even taken its launch line is killed instead."""
-        if not self._fed.is_set():
+        if not self._fed.wait(FED_S):
             self.kill()
         elif self._popen.stdin is not None:
             with contextlib.suppress(OSError):
@@ -127,8 +128,8 @@ _IN_WORDS = {
     ExitCode.DONE: "done",
     ExitCode.CRASHED: "crashed",
     ExitCode.CONFIG: "its settings can't work",
-    ExitCode.ENDED: "the experiment has ended",
-    ExitCode.ORPHAN: "as it was asked to",
+    ExitCode.ENDED: "ended with the experiment",
+    ExitCode.ORPHAN: "ended as it was asked to",
 }
 
 

@@ -24,6 +24,9 @@ from afspm.supervisor.task import Task
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 from afspm.transport.wakeup import WakeUp
 
+# why the run ends, told at once; that it has ended as it should the summary tells in a moment
+_LEVELS = {Why.STOPPED: logging.INFO, Why.LOST: logging.CRITICAL}
+
 
 @dataclass(frozen=True)
 class Report:
@@ -63,6 +66,7 @@ class _Child:
     beat_s: float = 0.0
     given_up: bool = False
     last_exit: str = ""
+    last_error: str = ""
 
     @property
     def name(self) -> str:
@@ -153,21 +157,23 @@ class Supervisor:
 
     def _on_printed(self, child: _Child, printed: Printed) -> None:
         level, text = child.lines.read(printed.stream, printed.line)
+        child.last_error = child.lines.last_error
         self._log.write(child.name, level, text)
 
     def _on_exited(self, child: _Child, exited: Exited) -> None:
         if child.process is None or child.process.pid != exited.pid:
             return
         child.process = None
-        child.last_exit = describe_exit(exited.code)
+        how = describe_exit(exited.code)
+        child.last_exit = f"{how}: {child.last_error}" if exited.code == ExitCode.CRASHED and child.last_error else how
         if self._ending is not None:
-            self._log.write(child.name, logging.DEBUG, f"ended: {child.last_exit}")
+            self._log.write(child.name, logging.DEBUG, child.last_exit)
             return
-        self._carry_out(child, child.watch.exited(exited.code, self._clock.monotonic_s(), child.last_exit))
+        self._carry_out(child, child.watch.exited(exited.code, self._clock.monotonic_s(), how))
         if exited.code == ExitCode.ENDED:
             self._end(Why.EXPERIMENT_ENDED, "the experiment has ended")
         elif exited.code == ExitCode.CONFIG:
-            self._give_up(child, "its settings can't work, so starting it again is of no use")
+            self._give_up(child, child.last_error or "its settings can't work")
         elif exited.code == ExitCode.DONE and child.task.essential:
             self._end(Why.EXPERIMENT_ENDED, f"{child.name} is done")
 
@@ -211,7 +217,7 @@ class Supervisor:
         if self._ending is not None:
             return
         launch = replace(task.launch, sockets=replace(task.launch.sockets, heartbeat=child.heartbeat))
-        child.lines, child.up, child.beat = LineReader(), False, None
+        child.lines, child.up, child.beat, child.last_error = LineReader(), False, None, ""
         child.starts += 1
         try:
             child.process = ChildProcess(
@@ -227,7 +233,8 @@ class Supervisor:
         if child.task.essential:
             self._end(Why.LOST, f"{child.name} is given up, and the experiment can't go on without it: {why}")
         else:
-            self._log.write(SUPERVISOR, logging.CRITICAL, f"{child.name} is given up, the rest goes on: {why}")
+            told = f"{child.name} is given up, the rest goes on (Ctrl-C ends it): {why}"
+            self._log.write(SUPERVISOR, logging.CRITICAL, told)
 
     def _end(self, why: Why, text: str) -> None:
         if self._ending is None:
@@ -238,7 +245,7 @@ class Supervisor:
                 # the signal that the experiment has ended is the scheduler's, whom a translator does not listen to
                 if child.task.role is Role.TRANSLATOR and child.process:
                     child.process.close_stdin()
-            self._log.write(SUPERVISOR, logging.INFO if why is not Why.LOST else logging.CRITICAL, text)
+            self._log.write(SUPERVISOR, _LEVELS.get(why, logging.DEBUG), text)
 
     def _go_on_ending(self, ending: Ending, now_s: float) -> None:
         busy = any(child.is_busy(now_s, self._policy.liveness) for child in self._children.values())

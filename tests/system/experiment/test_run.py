@@ -94,7 +94,7 @@ def test_ctrl_c_ends_all_cleanly_within_about_two_seconds(run: Run) -> None:
     assert one.end() == 130, one.output
     assert clock.monotonic_s() - began_s < 3.0
     for name in ("microscope", "scheduler", "series", "witness"):
-        one.wait_for(f" {name} ", "ended: as it was asked to")  # by itself: nothing had to be killed
+        one.wait_for(f" {name} ", "ended as it was asked to")  # by itself: nothing had to be killed
 
 
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="waiting for the end of another's child")

@@ -124,7 +124,7 @@ def test_a_scheduler_that_is_done_ends_the_experiment(run_tasks: RunTasks) -> No
 
 def test_a_component_that_is_done_does_not(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("done", first="exit", code=0), peer("waits"))
-    running.terminal.wait_for(" done ", "ended: done")
+    running.terminal.wait_for(" done ", "done")
     assert running.stop().why is Why.STOPPED
 
 
@@ -138,8 +138,8 @@ def test_stopping_takes_about_two_seconds_at_most(run_tasks: RunTasks) -> None:
     assert clock.monotonic_s() - began_s < 2.5  # two seconds, and some for a busy computer
     assert outcome.why is Why.STOPPED
     waits, deaf = outcome.reports
-    assert waits.last_exit == "as it was asked to"  # by itself, since its stdin was closed
-    assert deaf.last_exit != "as it was asked to"
+    assert waits.last_exit == "ended as it was asked to"  # by itself, since its stdin was closed
+    assert deaf.last_exit != "ended as it was asked to"
 
 
 def test_a_second_wish_to_stop_is_not_made_to_wait(run_tasks: RunTasks) -> None:
