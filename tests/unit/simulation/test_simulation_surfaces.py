@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -141,13 +142,17 @@ def test_a_file_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         ("nanonis/ProbeFlow_nanonis.sxm", None, (160, 160)),
         ("nanonis/A151216.123306-02602.sxm", 2e-9, (128, 128)),
         ("gxsm/gxsm3/scan002-M-Xp-Topo.nc", 40e-9, (30, 40)),
+        ("gxsm/gxsm4/scan002-M-Xp-ZSmTopo.nc", 50e-9, (48, 64)),
         ("asylum/DTMicroscope_scan_0001.ibw", None, (256, 256)),
+        ("asylum/PZT_final0001.h5", 2e-6, (256, 256)),
     ],
 )
 def test_files_of_real_microscopes_are_read(name: str, width_m: float | None, shape: tuple[int, int]) -> None:
     path = DATA / name
     if not path.is_file():
         pytest.skip(f"{path} is missing")
+    if path.suffix == ".h5" or "gxsm4" in name:
+        pytest.importorskip("h5py")
     found = read(path)
     assert found.height_m.shape == shape
     assert found.size_m is not None
@@ -155,6 +160,27 @@ def test_files_of_real_microscopes_are_read(name: str, width_m: float | None, sh
     assert np.ptp(found.height_m) < 1e-5
     if width_m:
         assert found.size_m[0] == pytest.approx(width_m)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [("asylum/fmt-igor-fd_SiN_FD_plot.ibw", "no image over lengths"), ("gxsm/gxsm3/scan002-Xp-ADC1.nc", "no heights")],
+)
+def test_a_real_file_that_holds_no_heights_is_refused(name: str, why: str) -> None:
+    if not (DATA / name).is_file():
+        pytest.skip(f"{DATA / name} is missing")
+    with pytest.raises(FileError, match=why):
+        read(DATA / name)
+
+
+def test_hdf5_without_its_library_is_refused_with_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    for name in ("a.h5", "a.nc"):
+        (tmp_path / name).write_bytes(b"\x89HDF\r\n\x1a\n")
+        with pytest.raises(FileError, match="pip install"):
+            read(tmp_path / name)
 
 
 def test_a_wrong_surface_is_refused_with_the_nearest_name() -> None:

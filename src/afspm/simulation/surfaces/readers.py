@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,8 @@ class Heightmap:
 
 
 Reader = Callable[[Path], Heightmap]
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def read(path: Path) -> Heightmap:
@@ -88,15 +91,59 @@ def read_nanonis(path: Path) -> Heightmap:
 
 
 def read_netcdf(path: Path) -> Heightmap:
-    """A GXSM scan in NetCDF-3: heights and lengths are in ångström."""
+    """A GXSM scan, in NetCDF-3 or NetCDF-4 (which is HDF5): heights and lengths are in ångström."""
+    with path.open("rb") as file:
+        if file.read(len(_HDF5)) == _HDF5:
+            return _read_netcdf4(path)
     from scipy.io import netcdf_file  # type: ignore[import-untyped,unused-ignore]
 
     with netcdf_file(str(path), mmap=False) as file:
         name = "FloatField" if "FloatField" in file.variables else "H"
+        _require_heights(getattr(file.variables[name], "ZSrcUnit", b"AA"), path)
         image = np.array(file.variables[name].data[0, 0], dtype=np.float64)
         scale = float(file.variables["dz"].getValue()) * 1e-10
         size_m = tuple(float(file.variables[f"range{axis}"].getValue()) * 1e-10 for axis in "xy")
     return Heightmap(image[::-1] * scale, (size_m[0], size_m[1]))
+
+
+def _read_netcdf4(path: Path) -> Heightmap:
+    with _hdf5(path) as file:
+        _require_heights(file["FloatField"].attrs.get("ZSrcUnit", b"AA"), path)
+        image = np.array(file["FloatField"][0, 0], dtype=np.float64) * float(file["dz"][()]) * 1e-10
+        return Heightmap(image[::-1], (float(file["rangex"][()]) * 1e-10, float(file["rangey"][()]) * 1e-10))
+
+
+def _require_heights(unit: bytes, path: Path) -> None:
+    if bytes(unit) != b"AA":
+        raise FileError(f"a channel in {unit.decode('utf-8', 'replace')} and no heights", where=str(path))
+
+
+def read_hdf5(path: Path) -> Heightmap:
+    """The height image of an NSID file, as scans of Asylum's instruments are shared: [x, y], both ascending, in m."""
+    with _hdf5(path) as file:
+        nodes: list[Any] = []
+        file.visititems(lambda _, node: nodes.append(node))
+        images = {_quantity(node): node for node in nodes}
+        image = next((images[name] for name in sorted(images) if name.startswith(("Height", "ZSensor"))), None)
+        if image is None:
+            found = ", ".join(sorted(filter(None, images))) or "no images"
+            raise FileError(f"holds no image of heights: {found}", where=str(path))
+        x, y = (np.asarray(image.parent[axis][()], dtype=np.float64) for axis in "xy")
+        size_m = (float(x[-1] - x[0]), float(y[-1] - y[0]))
+        return Heightmap(np.asarray(image[()], dtype=np.float64).T, size_m)
+
+
+def _quantity(node: Any) -> str:
+    """What an image of an NSID file shows; empty for what is none."""
+    return str(node.attrs.get("quantity", "")) if len(getattr(node, "shape", ())) == 2 else ""
+
+
+def _hdf5(path: Path) -> Any:
+    try:
+        import h5py  # type: ignore[import-not-found,import-untyped,unused-ignore]
+    except ImportError:
+        raise FileError("reading HDF5 needs h5py", where=str(path), hint="pip install h5py") from None
+    return h5py.File(path, "r")
 
 
 def read_igor(path: Path) -> Heightmap:
@@ -107,6 +154,9 @@ def read_igor(path: Path) -> Heightmap:
     if version != 5 or kind not in (2, 4):
         raise FileError(f"Igor wave of version {version}, type {kind}: not a scan", where=str(path))
     shape = [int(n) for n in np.frombuffer(data, f"{order}i4", 4, 132) if n > 0]
+    units = [data[start : start + 4].strip(b"\0").decode("latin-1") for start in (216, 220)]
+    if len(shape) < 2 or units != ["m", "m"]:
+        raise FileError("an Igor wave that is no image over lengths: a curve?", where=str(path))
     steps = np.frombuffer(data, f"{order}f8", 4, 148)
     values = np.frombuffer(data, f"{order}f{2 * kind}", math.prod(shape), 384).reshape(shape, order="F")
     image = values[:, :, 0] if values.ndim == 3 else values
@@ -129,4 +179,6 @@ READERS: dict[str, Reader] = {
     ".sxm": read_nanonis,
     ".nc": read_netcdf,
     ".ibw": read_igor,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
 }
