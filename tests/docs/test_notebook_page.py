@@ -1,0 +1,42 @@
+"""The page on scripts and notebooks: its script joins its experiment while that runs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_snippets import FILE_NAME, ROOT, snippets
+
+PAGE = ROOT / "docs" / "how-to" / "use-a-notebook.md"
+AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
+DEADLINE_S = 60.0
+
+
+@pytest.mark.timeout(120)
+def test_the_script_of_the_page_measures_and_ends_the_experiment(tmp_path: Path) -> None:
+    for snippet in snippets(PAGE):
+        if name := FILE_NAME.match(snippet.text):
+            (tmp_path / name[1]).write_text(snippet.text, encoding="utf-8")
+    command = (*AFSPM, "run", "--verbose", "experiment.toml")
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+        try:
+            assert run.stdout is not None
+            assert any(" scheduler " in line and "is up" in line for line in run.stdout), "it never started"
+            script = subprocess.run(
+                [sys.executable, "look.py"],
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                timeout=DEADLINE_S,
+                check=False,
+            )
+            assert script.returncode == 0, script.stderr
+            assert "FREE 10000.0 nm/s" in script.stdout
+            assert "Bias" in script.stdout or "bias" in script.stdout
+            rest = run.stdout.read()
+            assert run.wait(DEADLINE_S) == 0, rest
+            assert "the experiment is ended by notebook" in rest
+        finally:
+            run.kill()
