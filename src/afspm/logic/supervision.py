@@ -85,7 +85,7 @@ Effect = Start | Kill | GiveUp | Log
 _WHY = {
     Vital.SLOW_START: "it sent no first heartbeat within {start_s:g} s",
     Vital.SILENT: "no heartbeat for {silence_s:g} s: it hangs",
-    Vital.FROZEN: "its step takes longer than it said that one may: it is frozen",
+    Vital.FROZEN: "a step takes longer than it said that one may: it is frozen",
     Vital.NOT_CLOSING: "it said that it is closing and was still there {closing_s:g} s later",
 }
 

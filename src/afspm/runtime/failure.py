@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from afspm.errors import AfspmError
 
 PACKAGE = Path(__file__).resolve().parents[1]
+_BELOW_START = 2  # of `python -m`: what Python itself does first
 
 
 def told(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
@@ -34,6 +36,13 @@ def told(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
     what = _words(error, name) if isinstance(error, AfspmError) else "".join(trace.format_exception_only()).strip()
     where = trace.format() if is_chained else trace.stack.format()
     return "\n".join([what, *"".join(where).rstrip("\n").splitlines()])
+
+
+def standing(thread_id: int, package: Path = PACKAGE) -> str:
+    """The lines of code that a thread is in just now, those of whoever wrote the component first."""
+    frame = sys._current_frames().get(thread_id)
+    stack = traceback.extract_stack(frame) if frame is not None else []
+    return "".join(traceback.format_list(_kept(stack[_BELOW_START:], package, is_foreseen=False))).rstrip("\n")
 
 
 def _is_foreseen(error: BaseException, frames: Sequence[traceback.FrameSummary], package: Path) -> bool:

@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -63,7 +64,7 @@ def main() -> int:
 def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
     clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
     activity = Activity(clock)
-    with _beating(launch, activity), _telling(launch, clock):
+    with _beating(launch, activity, logger), _telling(launch, clock):
         with activity.step():  # importing may take its time
             register_all(launch.messages)
             process = load(launch)
@@ -80,16 +81,35 @@ def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
 
 
 @contextmanager
-def _beating(launch: Launch, activity: Activity) -> Iterator[None]:
+def _beating(launch: Launch, activity: Activity, logger: logging.Logger) -> Iterator[None]:
     """Heartbeats while in the block. Only an end on purpose is announced: after an error the silence tells."""
     if launch.sockets.heartbeat is None:
         yield
         return
     sender = HeartbeatSender(
-        launch.sockets.heartbeat, launch.beat_period_s, activity.age_s, lambda: activity.longest_step_s
+        launch.sockets.heartbeat, launch.beat_period_s, _Watch(activity, logger).age_s, lambda: activity.longest_step_s
     )
     yield
     sender.close()
+
+
+class _Watch:
+    """Says where a step hangs, before the beat that has the process killed for it."""
+
+    def __init__(self, activity: Activity, logger: logging.Logger) -> None:
+        self._activity = activity
+        self._log = logger
+        self._told_since_s: float | None = None
+
+    def age_s(self) -> float:
+        """Called in the thread of the heartbeats."""
+        since_s, age_s = self._activity.since_s, self._activity.age_s()
+        if age_s > self._activity.longest_step_s and since_s != self._told_since_s:
+            self._told_since_s = since_s
+            where = failure.standing(threading.main_thread().ident or 0)
+            longest = f"longer than longest_step_s = {self._activity.longest_step_s:g} s"
+            self._log.error("a step takes %s, and counts as frozen; it is at\n%s", longest, where)
+        return age_s
 
 
 @contextmanager

@@ -97,6 +97,7 @@ class Supervisor:
             task.name: _Child(task, self._beats.listen(task.name), supervision.ChildWatch(policy)) for task in tasks
         }
         self._ending: Ending | None = None
+        self._has_told_waiting = False
 
     def run(self) -> Outcome:
         """Start everything; returns when nothing of it runs any more."""
@@ -248,8 +249,12 @@ class Supervisor:
             self._log.write(SUPERVISOR, _LEVELS.get(why, logging.DEBUG), text)
 
     def _go_on_ending(self, ending: Ending, now_s: float) -> None:
-        busy = any(child.is_busy(now_s, self._policy.liveness) for child in self._children.values())
-        self._ending, do = ending.step(now_s, busy=busy)
+        busy = [child.name for child in self._children.values() if child.is_busy(now_s, self._policy.liveness)]
+        self._ending, do = ending.step(now_s, busy=bool(busy))
+        if do is None and self._ending.ask_s != ending.ask_s and not self._has_told_waiting:
+            self._has_told_waiting = True
+            told = f"waiting for {', '.join(busy)} to finish; Ctrl-C ends it now"
+            self._log.write(SUPERVISOR, logging.INFO, told)
         for child in self._children.values():
             if child.process is None:
                 continue

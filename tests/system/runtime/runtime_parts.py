@@ -42,6 +42,12 @@ class Stuck(Component):
             threading.Event().wait(0.001)
 
 
+class Hanging(Stuck):
+    """Computes for longer than it says that it may."""
+
+    longest_step_s = 0.2
+
+
 class Stubborn(Component):
     """A script that swallows every error."""
 

@@ -143,6 +143,21 @@ def test_a_busy_component_beats_with_the_age_of_its_step_and_how_long_it_may_tak
         listener.close()
 
 
+def test_a_step_that_takes_too_long_is_told_with_the_line_it_is_at(host: Host) -> None:
+    listener = HeartbeatListener()
+    try:
+        address = listener.listen("hanging")
+        child = host(part("Hanging", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
+        beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.2)
+        child.let_go()
+        child.exit_code()
+        assert child.error_text.startswith("ERROR a step takes longer than longest_step_s = 0.2 s")
+        assert "threading.Event().wait(0.001)" in child.error_text
+        assert "loop.py" not in child.error_text
+    finally:
+        listener.close()
+
+
 def test_a_crash_is_not_announced_as_an_end_on_purpose(host: Host) -> None:
     listener = HeartbeatListener()
     try:

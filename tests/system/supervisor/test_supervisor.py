@@ -115,6 +115,7 @@ def test_at_the_end_of_the_experiment_one_that_is_busy_may_finish(run_tasks: Run
     running = run_tasks(busy, peer("ends", first="exit", code=80))
     running.outcome()
     running.terminal.wait_for(" busy ", "no longer busy")
+    running.terminal.wait_for("waiting for busy to finish", "Ctrl-C")
 
 
 def test_a_scheduler_that_is_done_ends_the_experiment(run_tasks: RunTasks) -> None:
