@@ -2,7 +2,8 @@
 
 On each page, in the order of the page and in one empty folder:
 
-- ```python and ```toml blocks whose first line is a comment with a file name (`# sharpness.py`) become that file;
+- ```python, ```toml and ```proto blocks whose first line is a comment with a file name (`# sharpness.py`,
+  `// peaks.proto`) become that file;
 - other ```python blocks are executed, sharing their names;
 - other ```toml blocks must be TOML;
 - ```console blocks: each line after `$ ` is run by the shell and must succeed; the lines below must come in its output,
@@ -27,7 +28,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "experiments").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FILE_NAME = re.compile(r"# ([\w./-]+\.(?:py|toml|proto))\n")
+FILE_NAME = re.compile(r"(?:#|//) ([\w./-]+\.(?:py|toml|proto))\n")
 
 
 @dataclass
@@ -49,7 +50,7 @@ def test_every_snippet_runs(page: Path, tmp_path: Path) -> None:
     for snippet in snippets(page):
         where = f"{page.relative_to(ROOT)}:{snippet.line}"
         file_name = FILE_NAME.match(snippet.text)
-        if file_name and snippet.kind in ("python", "toml"):
+        if file_name and snippet.kind in ("python", "toml", "proto"):
             (tmp_path / file_name[1]).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / file_name[1]).write_text(snippet.text, encoding="utf-8")
         elif snippet.kind == "python":
