@@ -73,7 +73,7 @@ class Service:
             raise
         except Exception as error:
             # an error of the controller, or of its own translator, must not end the process: it is the reason
-            self._log.exception("%s failed", ControlRequest(request.kind).name)
+            self._log.exception("%s failed", _named(request.kind))
             code = _failure(request)
             return Answer(Response(code, reason=f"{type(error).__name__}: {error}", id=request.id))
 
@@ -90,7 +90,7 @@ class Service:
             if request.kind == ControlRequest.PARAM:
                 return Answer(self._told(request))
             return Answer(Response(ControlResponse.SUCCESS, id=request.id))
-        reason = f"{ControlRequest(request.kind).name} is not for a translator"
+        reason = f"{_named(request.kind)} is not for a translator"
         raise Refused(ControlResponse.CMD_NOT_SUPPORTED, reason)
 
     def _told(self, request: Request) -> Response:
@@ -185,6 +185,11 @@ def _bound(function: Callable[..., None], *arguments: Any) -> Callable[[], None]
 
 def _already_said() -> None:
     """The request behind an action was written down before the action began."""
+
+
+def _named(kind: int) -> str:
+    """A request in words; there are some beyond the numbers of the wire format."""
+    return next((known.name for known in ControlRequest if known == kind), f"request {kind}")
 
 
 def _failure(request: Request) -> ControlResponse:

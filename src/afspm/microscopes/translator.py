@@ -190,7 +190,7 @@ class Translator:
     # --- requests ---
 
     def _on_request(self, frames: Sequence[bytes]) -> None:
-        if frames[:1] == [wire.CLOSE]:
+        if list(frames) == [wire.CLOSE]:
             self._end()
             return
         try:

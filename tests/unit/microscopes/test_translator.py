@@ -10,6 +10,7 @@ import pytest
 from afspm import wire
 from afspm.errors import ConfigError
 from afspm.model import (
+    CLOCK_REQUEST,
     ControlRequest,
     ControlResponse,
     Feedback,
@@ -291,6 +292,7 @@ def test_unknown_names_are_refused_with_the_nearest(bench: Any) -> None:
         ([b"\xfe"], ControlResponse.CMD_NOT_SUPPORTED),
         ([b"\0"], ControlResponse.CMD_NOT_SUPPORTED),
         ([b"\6", b"\1"], ControlResponse.CMD_NOT_SUPPORTED),
+        ([bytes([CLOCK_REQUEST])], ControlResponse.CMD_NOT_SUPPORTED),
         ([b"\3", b"\x0a\xff"], ControlResponse.FAILURE),
         ([b"\2"], PARAM_ERROR),
         ([b"\1", b"x", b"y", b"z"], ControlResponse.FAILURE),
