@@ -68,7 +68,8 @@ class Poller(Generic[S]):
                 owner.touched = False
                 touched.append(item)
         if touched:
-            found += [self._by_socket[socket] for socket, _ in zmq_poll(touched, 0)]
+            for socket, _ in zmq_poll(touched, 0):
+                found.append(self._by_socket[socket])
         woken = False
         known = self._by_descriptor
         for descriptor, _ in self._poll.poll(0 if found else timeout_ms):

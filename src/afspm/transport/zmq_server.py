@@ -77,9 +77,10 @@ class ZmqServerPort:
             first, parts = receive_small(self._socket)
             if first is None:
                 break
-            if b"" not in parts[1:]:
+            try:
+                start = parts.index(b"", 1) + 1
+            except ValueError:
                 continue  # not what REQ or DEALER peers send: there is no telling where an answer would go
-            start = parts.index(b"", 1) + 1
             if start == len(parts):
                 continue  # somebody says its name, as to a scheduler
             self._asker = parts[:start]

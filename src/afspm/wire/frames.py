@@ -73,8 +73,15 @@ def encode_subject(subject: Any) -> bytes:
     if isinstance(subject, int):
         return bytes([subject])
     if isinstance(subject, str):
-        return control_pb2.ActionMsg(action=subject).SerializeToString()
+        return _action_message(subject) if len(subject) <= LONGEST_ID else _new_action_message(subject)
     return encode(subject)[1]
+
+
+def _new_action_message(name: str) -> bytes:
+    return control_pb2.ActionMsg(action=name).SerializeToString()
+
+
+_action_message = lru_cache(256)(_new_action_message)
 
 
 def decode_request(frames: Sequence[Buffer]) -> Request:
