@@ -46,10 +46,16 @@ class _Session:
     has_ids: bool = True  # until it has asked for something without one
 
 
+KEYED = "key"
+"""Stands where the token would in ids that are the same in every life: "<name>/key/<key>/<n>"."""
+
+
 def token_of(name: str, request_id: str) -> str | None:
     """The session's token in a request id; None if the id says nothing of it (a caller's own key)."""
-    parts = request_id.split("/")
-    return parts[1] if len(parts) == 3 and parts[0] == name and parts[2].isdigit() else None
+    who, *rest = request_id.split("/")
+    if who != name or not 2 <= len(rest) <= 3 or rest[0] == KEYED:
+        return None
+    return rest[0] if all(map(str.isdigit, rest[1:])) else None  # a number, and perhaps that of an attempt
 
 
 class Sessions:

@@ -9,6 +9,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import NoResponse, WireError
+from afspm.logic.sessions import KEYED
 from afspm.model import ControlRequest, Packet, ScopeState
 from afspm.runtime.asking import Asker
 from afspm.runtime.cycle import Cycle, Outcome
@@ -101,7 +102,7 @@ class Measuring:
         if key is not None and (found := self._results.find(check_key(key), plan.facts)) is not None:
             return found
         self._link.wait_caught_up(until_s)  # what is cached must not be taken for ours
-        progress = _Progress(plan, key, f"{self._link.name}/{key}" if key else self._link.next_id(), until_s)
+        progress = _Progress(plan, key, f"{self._link.name}/{KEYED}/{key}" if key else self._link.next_id(), until_s)
         cycle = self._taken_up(progress)
         if cycle is not None and self._is_complete(progress, cycle):
             self._holding.release_inherited()

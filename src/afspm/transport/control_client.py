@@ -8,6 +8,8 @@ import zmq
 
 from afspm import wire
 from afspm.errors import WireError
+from afspm.logic.sessions import token_of
+from afspm.model import CLOCK_REQUEST, Request
 from afspm.transport.complaints import Complaints
 from afspm.transport.frames import receive_small, send
 from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
@@ -28,6 +30,7 @@ class ControlClient:
         self._scheduler_is_ours = False
         self._connected = False
         self._unanswered = b""
+        self._name, self._token = name, ""
         self.touched = True
         self.socket = network.socket(zmq.DEALER)
         self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
@@ -43,6 +46,7 @@ class ControlClient:
         if not self._connected:
             return
         asked = frames[2] if len(frames) > 2 else b""
+        self._token = (asked and token_of(self._name, asked.decode())) or self._token
         if asked and asked == self._unanswered:
             self._reconnect()
             return
@@ -88,11 +92,14 @@ class ControlClient:
         return ReplyReceived(response)
 
     def _greet(self) -> None:
-        """Say our name to a scheduler that was restarted: it may be waiting for us, who are in control.
+        """Say who we are to a scheduler that was restarted, or that has not yet seen our last connection close.
 
-        Only to ours, known by its answers: for one of version 1 a message without a request might be its last.
+        It may be waiting for us, who are in control; and what we ask next may have an id that does not say who we are.
+        Only to ours, known by its answers: for one of version 1 a request that it does not know might be its last.
         """
-        if self._scheduler_is_ours:
+        if self._scheduler_is_ours and self._token:
+            self.send(wire.encode_request(Request(CLOCK_REQUEST, id=f"{self._name}/{self._token}/0")))
+        elif self._scheduler_is_ours:
             self.send([])
 
     def close(self) -> None:

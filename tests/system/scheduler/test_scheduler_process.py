@@ -19,7 +19,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.transport.port import CaughtUp, Killed, PacketReceived
+from afspm.transport.port import CaughtUp, ControlConnected, Killed, PacketReceived
 
 REQUEST, RELEASE = ControlRequest.REQUEST_CTRL, ControlRequest.RELEASE_CTRL
 ACTION, FLAG = ControlRequest.ACTION, ControlRequest.ADD_EXP_PRBLM
@@ -176,3 +176,15 @@ def test_damaged_packets_of_the_cache_are_left_out(rig: Any, tmp_path: Any) -> N
     rig.until(lambda: any(isinstance(i, CaughtUp) for i in late.found))
     assert len(late.packets()) == 2
     assert set(late.packets()) < set(component.packets("Scan2d"))
+
+
+def test_a_component_that_connects_anew_is_known_before_it_asks_with_a_key_of_its_own(rig: Any) -> None:
+    rig.start()
+    component = rig.component("experiment")
+    assert component.ask(ControlRequest.REQUEST_CTRL, 0).ok
+    rig.answer = lambda request: None
+    key = component.send(ControlRequest.ACTION, "start-scan", "experiment/key/tile/1")
+    rig.until(lambda: rig.asked)
+    component.send(ControlRequest.ACTION, "start-scan", key)  # the same again: it connects anew
+    rig.until(lambda: sum(isinstance(i, ControlConnected) for i in component.found) == 2)
+    assert component.ask(ControlRequest.RELEASE_CTRL, key="experiment/key/tile/2").ok

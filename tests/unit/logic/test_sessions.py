@@ -9,6 +9,9 @@ ACCEPTED, TAKEN, STALE, UNCLEAR = Hearing.ACCEPTED, Hearing.TAKEN, Hearing.STALE
 
 def test_the_token_is_read_from_ids_of_our_form_only() -> None:
     assert token_of("exp", "exp/a1/7") == "a1"
+    assert token_of("exp", "exp/a1/7/2") == "a1"
+    assert token_of("exp", "exp/key/7/2") is None
+    assert token_of("exp", "exp/key/tile") is None
     assert token_of("exp", "other/a1/7") is None
     assert token_of("exp", "exp/step-17/1/start") is None
     assert token_of("exp", "my-key") is None

@@ -178,4 +178,4 @@ def test_after_a_refusal_the_same_key_is_asked_for_with_another_id(tmp_path: Pat
     lab.intercept = lambda request: "go on"
     scope.scan(None, key="tile")
     ids = [request.id for request in lab.requests if request.subject == "start-scan"]
-    assert ids == ["experiment/tile/1", "experiment/tile/2"]
+    assert ids == ["experiment/key/tile/1", "experiment/key/tile/2"]
