@@ -27,6 +27,8 @@ PUBLISHED: Final = (
     "ProbePosition",
 )
 CONTINUED: Final = ("Scan2d", "Spec1d")
+LONGEST_NAME = 100
+_NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
 
 
@@ -65,6 +67,17 @@ def check_roles(resolved: Resolved) -> None:
 def _all_loaded(resolved: Resolved) -> bool:
     """A class that can't be loaded may be the one that is looked for."""
     return all(part.command or part.name in resolved.classes for part in resolved.parts.components)
+
+
+def check_names(resolved: Resolved) -> None:
+    """A component's name is also that of files, on every system, and of a connection."""
+    for part in resolved.parts.components:
+        if not _NAME.fullmatch(part.name) or len(part.name.encode()) > LONGEST_NAME:
+            resolved.findings.error(
+                f"[{part.name}] can't be the name of a component",
+                part.place,
+                f"letters, digits, _, - and spaces, at most {LONGEST_NAME} bytes, as in [tip_corrector]",
+            )
 
 
 def check_commands(resolved: Resolved) -> None:
@@ -310,6 +323,7 @@ def check_needs(resolved: Resolved) -> None:
 
 CHECKS: Final[tuple[Callable[[Resolved], None], ...]] = (
     check_roles,
+    check_names,
     check_commands,
     check_intermediaries,
     check_addresses,

@@ -80,8 +80,21 @@ def _parse(text: str, file: Path, findings: Findings) -> dict[str, Any] | None:
             name = twice[1].replace("'", "").replace(", ", ".")
             findings.error(f"[{name}] is there twice", Place(str(file), line), "two components need two names")
         else:
-            findings.error(f"not valid TOML: {what}", Place(str(file), line))
+            findings.error(f"not valid TOML: {what}", Place(str(file), line), _python_habit(text, line))
         return None
+
+
+def _python_habit(text: str, line: int) -> str:
+    """What to write instead of a value that would be right in Python, or that lacks its quotes."""
+    written = dict(enumerate(text.splitlines(), 1)).get(line, "")
+    value = re.search(r"=\s*(.*)", written)
+    if value is None:
+        return ""
+    if re.match(r"(True|False)\b", value[1]):
+        return "true and false are written in lower case"
+    if re.match(r"None\b", value[1]):
+        return "there is no None: leave the line out"
+    return "text is written in quotes" if re.match(r"[^\W\d]", value[1]) else ""
 
 
 def _lay_over(document: Document, data: dict[str, Any], where: dict[lines.Path, Place]) -> None:

@@ -20,6 +20,27 @@ WITHOUT_SCHEDULER = FRAME[FRAME.index("[microscope]") :]
 WITHOUT_TRANSLATOR = FRAME[: FRAME.index("[microscope]")]
 
 
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("a = True", "lower case"),
+        ("a = None", "leave the line out"),
+        ("a = 2 um", ""),
+        ("a = Scheduler", "in quotes"),
+        ("a = = 3", ""),
+        ("a = [1", ""),
+    ],
+)
+def test_habits_from_python_are_told_what_toml_wants(write: Write, line: str, hint: str) -> None:
+    (finding,) = write(f"{line}\n", frame="").check()
+    assert finding.hint == hint or (hint and hint in finding.hint)
+
+
+@pytest.mark.parametrize("name", ["tip_corrector", "Tip Corrector", "a.b-c", "größe", "x" * 100])
+def test_a_name_may_be_any_words(write: Write, name: str) -> None:
+    assert write(CORRECTOR.replace("repair", f'"{name}"')).check() == []
+
+
 def test_an_experiment_that_fits_together_has_no_findings(write: Write) -> None:
     assert write(CLASSIFIER + CORRECTOR + PEAKS + CHOOSER).check() == []
 
@@ -35,6 +56,10 @@ BROKEN = {
     ),
     "two of one name": (CORRECTOR + CORRECTOR, FRAME, "[repair] is there twice"),
     "two of nearly one name": (CORRECTOR + CORRECTOR.replace("repair", "Repair"), FRAME, "the same name"),
+    "a name with a slash": (CORRECTOR.replace("repair", '"a/b"'), FRAME, "[a/b] can't be the name"),
+    "a name that leads elsewhere": (CORRECTOR.replace("repair", '"../b"'), FRAME, "[../b] can't be the name"),
+    "no name": (CORRECTOR.replace("repair", '""'), FRAME, "[] can't be the name"),
+    "a name too long": (CORRECTOR.replace("repair", "x" * 101), FRAME, "can't be the name"),
     "not TOML": ("a = = 3\n", FRAME, "not valid TOML"),
     "an unknown section": ("[limts]\nmost_pixels = 3\n", FRAME, "no section [limts]"),
     "an unknown key of a section": ("[clock]\nsped = 2\n", FRAME, "[clock] sped is not a setting"),
