@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -67,7 +68,7 @@ def run_console(text: str, folder: Path, where: str) -> None:
     for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
         command, _, expected = part.partition("\n")
         if not (folder / "experiments").exists() and "experiments/" in command:
-            (folder / "experiments").symlink_to(ROOT / "experiments")
+            shutil.copytree(ROOT / "experiments", folder / "experiments")
         done = subprocess.run(
             command, shell=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=200, check=False
         )

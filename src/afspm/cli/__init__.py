@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 
 
@@ -10,6 +11,9 @@ def main() -> None:
     from afspm.cli.app import app
     from afspm.errors import AfspmError
 
+    for stream in (sys.stdout, sys.stderr):  # a terminal that lacks a character must not cost the line
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         app()
     except AfspmError as error:

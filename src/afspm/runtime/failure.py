@@ -9,7 +9,7 @@ from pathlib import Path
 
 from afspm.errors import AfspmError
 
-PACKAGE = Path(__file__).resolve().parents[1]
+PACKAGE = Path(__file__).parents[1]  # not resolved: as the paths in tracebacks
 _BELOW_START = 2  # of `python -m`: what Python itself does first
 
 

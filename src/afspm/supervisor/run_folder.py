@@ -35,7 +35,9 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
         _replace(runs / LATEST_FILE, folder.name + "\n")
     except OSError as error:
         raise FileError(
-            f"no folder for the run can be made: {error.strerror or error}", where=str(runs), hint="choose another with --runs"
+            f"no folder for the run can be made: {error.strerror or error}",
+            where=str(runs),
+            hint="choose another with --runs",
         ) from error
     return folder
 
