@@ -13,6 +13,8 @@ from typing import Any
 
 import pydantic
 
+from afspm import units
+from afspm.errors import UnitError
 from afspm.experiment import classes
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, closest, nearest
@@ -44,6 +46,12 @@ def check(
     for name, value in settings.items():
         if name in parameters:
             annotation = kinds.get(name, Any)
+            if name not in kinds and _is_quantity(value):
+                findings.warning(
+                    f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument does not say what it is",
+                    document.place(*path, name),
+                    f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.units",
+                )
             checked[name] = _value(annotation, value, (*path, name), document, findings)
         elif takes_any:
             checked[name] = jsonable(value, document.folder_of(*path, name))
@@ -112,6 +120,18 @@ def _object(value: dict[str, Any], path: tuple[str, ...], document: Document, fi
         findings.error(f"[{path[0]}] {'.'.join(path[1:])}: {value['class']} is not a class", place)
         return {"class": value["class"]}
     return {"class": value["class"], **check(wanted, settings, path, document, findings)}
+
+
+def _is_quantity(value: Any) -> bool:
+    """Whether a text is a number with a unit that is known."""
+    if not isinstance(value, str):
+        return False
+    try:
+        number, unit = units.parse_quantity(value)
+        units.convert(number, unit, unit)
+    except UnitError:
+        return False
+    return bool(unit)
 
 
 def _is_object(value: Any) -> bool:

@@ -93,6 +93,11 @@ class Real(Microscope):
     pass
 
 
+class Untyped(Component):
+    def __init__(self, size=1e-6, label="", typed: str = ""):
+        self.size, self.label, self.typed = size, label, typed
+
+
 class NoComponent:
     pass
 """

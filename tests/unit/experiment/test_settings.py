@@ -37,6 +37,14 @@ def test_a_setting_reaches_the_process_in_si_and_as_json(write: Write, setting: 
     json.dumps(settings)
 
 
+def test_a_quantity_that_stays_a_text_is_warned_of(write: Write) -> None:
+    table = '[loose]\ncomponent = true\nclass = "parts.Untyped"\nlabel = "3 times"\ntyped = "1 um"\nsize = "1 um"\n'
+    (finding,) = write(table).check()
+    assert not finding.is_error
+    assert "[loose] size = '1 um' stays a text" in finding.what
+    assert "size: Length" in finding.hint
+
+
 def test_a_relative_file_is_one_beside_the_experiment_file(write: Write) -> None:
     experiment = write(scanner('image = "surface.png"'))
     assert Path(experiment.resolved.settings["scan"]["image"]) == experiment.folder / "surface.png"
