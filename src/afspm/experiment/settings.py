@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import typing
 from collections.abc import Callable, Collection, Mapping
@@ -20,6 +21,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, closest, nearest
 from afspm.experiment.sections import report
 
+_ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
 _KINDS_WITHOUT_NAME = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
 _TYPES = pydantic.ConfigDict(arbitrary_types_allowed=True)
 
@@ -123,15 +125,14 @@ def _object(value: dict[str, Any], path: tuple[str, ...], document: Document, fi
 
 
 def _is_quantity(value: Any) -> bool:
-    """Whether a text is a number with a unit that is known."""
+    """Whether a text is a number with a unit for which there is an annotation."""
     if not isinstance(value, str):
         return False
-    try:
-        number, unit = units.parse_quantity(value)
-        units.convert(number, unit, unit)
-    except UnitError:
-        return False
-    return bool(unit)
+    for unit in _ANNOTATED:
+        with contextlib.suppress(UnitError):
+            units.convert(*units.parse_quantity(value), unit)
+            return True
+    return False
 
 
 def _is_object(value: Any) -> bool:
