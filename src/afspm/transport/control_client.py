@@ -46,7 +46,8 @@ class ControlClient:
         if not self._connected:
             return
         asked = frames[2] if len(frames) > 2 else b""
-        self._token = (asked and token_of(self._name, asked.decode())) or self._token
+        if asked and not self._token:  # the same in all of a process's ids that have one
+            self._token = token_of(self._name, asked.decode()) or ""
         if asked and asked == self._unanswered:
             self._reconnect()
             return
