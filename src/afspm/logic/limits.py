@@ -16,12 +16,14 @@ from afspm.model import (
     ControlResponse,
     Feedback,
     Parameter,
+    PositionChange,
     ProbePosition,
     Region,
     RegionChange,
     Request,
     Response,
     ScanParameters,
+    ShapeChange,
     names,
 )
 from afspm.model.geometry import XY
@@ -128,6 +130,8 @@ class Guard:
                 self._scan = subject.onto(self._scan)
         elif isinstance(subject, ProbePosition):
             self._probe = subject.xy_m
+        elif isinstance(subject, PositionChange) and self._probe is not None:
+            self._probe = _moved(self._probe, subject)
         if isinstance(subject, ScanParameters | Feedback | ProbePosition):
             for name, value in self._values(subject):
                 self._learn(name, value, now_ns)
@@ -145,6 +149,8 @@ class Guard:
             self._check_scan(subject)
         elif isinstance(subject, ProbePosition):
             self._check_point(subject.xy_m)
+        elif isinstance(subject, PositionChange):
+            self._check_move(subject)
         elif isinstance(subject, Parameter):
             self._check_parameter_geometry(subject)
         for name, value in self._values(subject):
@@ -195,8 +201,10 @@ class Guard:
 
     def _check_scan(self, wanted: ScanParameters) -> None:
         """What is checked is the scan as it would be afterwards: a request may give only a part of it."""
-        shape, region = wanted.shape or self._scan.shape, wanted.region
-        if wanted.shape is not None and shape is not None and shape[0] * shape[1] > self._limits.most_pixels:
+        shape, region = wanted.shape, wanted.region
+        if isinstance(shape, ShapeChange):
+            shape = shape.onto(self._scan.shape if isinstance(self._scan.shape, tuple) else (1, 1))
+        if shape is not None and shape[0] * shape[1] > self._limits.most_pixels:
             raise _param_error(f"a scan of {shape[1]} x {shape[0]} pixels; the most are {self._limits.most_pixels}")
         if isinstance(region, RegionChange):
             region = self._region_after(region)
@@ -234,29 +242,26 @@ class Guard:
                 f" ({self._limits.region_source})"
             )
 
+    def _check_move(self, change: PositionChange) -> None:
+        if self._limits.region is None:
+            return
+        if self._probe is None:
+            raise _param_error("where the probe is now is not known, so a part of its place can't be checked")
+        self._check_point(_moved(self._probe, change))
+
     def _check_parameter_geometry(self, parameter: Parameter) -> None:
         """A single parameter may move or turn the scan, or make it too many pixels, as well."""
         for name, value in self._values(parameter):
             if name not in _GEOMETRY and name not in _PROBE and name not in _RESOLUTION:
                 continue
             if name in _PROBE:
-                if self._limits.region is not None:
-                    self._check_point(self._probe_after(name, value))
+                self._check_move(_PROBE[name](value))
             elif name in _RESOLUTION:
-                self._check_scan(ScanParameters(shape=self._shape_after(name, value)))
+                if value < 1 or value != int(value):
+                    raise _param_error(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
+                self._check_scan(ScanParameters(shape=_RESOLUTION[name](int(value))))
             else:
                 self._check_scan(ScanParameters(_GEOMETRY[name](value)))
-
-    def _probe_after(self, name: str, value: float) -> XY:
-        if self._probe is None:
-            raise _param_error(f"{name}: where the probe is now is not known, so its place can't be checked")
-        return (value, self._probe[1]) if name == names.PROBE_POS_X else (self._probe[0], value)
-
-    def _shape_after(self, name: str, value: float) -> tuple[int, int]:
-        if value < 1 or value != int(value):
-            raise _param_error(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
-        rows, columns = self._scan.shape or (1, 1)
-        return (rows, int(value)) if name == names.SCAN_RESOLUTION_X else (int(value), columns)
 
     # --- values ---
 
@@ -274,8 +279,11 @@ class Guard:
                 (names.ZCTRL_IGAIN, subject.integral_gain),
             )
             return [(name, _finite(name, value)) for name, value in pairs if value is not None]
-        if isinstance(subject, ProbePosition):
-            return [(names.PROBE_POS_X, subject.xy_m[0]), (names.PROBE_POS_Y, subject.xy_m[1])]
+        if isinstance(subject, ProbePosition | PositionChange):
+            x, y = subject.xy_m if isinstance(subject, ProbePosition) else (subject.x_m, subject.y_m)
+            return [
+                (name, value) for name, value in ((names.PROBE_POS_X, x), (names.PROBE_POS_Y, y)) if value is not None
+            ]
         return []
 
     def _number(self, parameter: Parameter) -> float | None:
@@ -309,8 +317,14 @@ class Guard:
             self._known[name] = _Known(value, now_ns)
 
 
-_RESOLUTION = (names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y)
-_PROBE = (names.PROBE_POS_X, names.PROBE_POS_Y)
+_RESOLUTION: dict[str, Callable[[int], ShapeChange]] = {
+    names.SCAN_RESOLUTION_X: lambda value: ShapeChange(columns=value),
+    names.SCAN_RESOLUTION_Y: lambda value: ShapeChange(rows=value),
+}
+_PROBE: dict[str, Callable[[float], PositionChange]] = {
+    names.PROBE_POS_X: lambda value: PositionChange(x_m=value),
+    names.PROBE_POS_Y: lambda value: PositionChange(y_m=value),
+}
 _GEOMETRY: dict[str, Callable[[float], RegionChange]] = {
     names.SCAN_TOP_LEFT_X: lambda value: RegionChange(left_m=value),
     names.SCAN_TOP_LEFT_Y: lambda value: RegionChange(low_m=value),
@@ -318,6 +332,10 @@ _GEOMETRY: dict[str, Callable[[float], RegionChange]] = {
     names.SCAN_SIZE_Y: lambda value: RegionChange(height_m=value),
     names.SCAN_ANGLE: lambda value: RegionChange(angle_rad=value),
 }
+
+
+def _moved(xy_m: XY, change: PositionChange) -> XY:
+    return (xy_m[0] if change.x_m is None else change.x_m, xy_m[1] if change.y_m is None else change.y_m)
 
 
 def _param_error(reason: str) -> _Breach:
@@ -353,6 +371,9 @@ def _scan_values(wanted: ScanParameters) -> list[tuple[str, float]]:
             (names.SCAN_ANGLE, region.angle_rad),
         )
         values += [(name, value) for name, value in given if value is not None]
-    if wanted.shape is not None:
-        values += [(names.SCAN_RESOLUTION_X, wanted.shape[1]), (names.SCAN_RESOLUTION_Y, wanted.shape[0])]
+    shape = wanted.shape
+    if shape is not None:
+        change = shape if isinstance(shape, ShapeChange) else ShapeChange(*shape)
+        pixels = ((names.SCAN_RESOLUTION_X, change.columns), (names.SCAN_RESOLUTION_Y, change.rows))
+        values += [(name, value) for name, value in pixels if value is not None]
     return values

@@ -14,9 +14,9 @@ from afspm.model.enums import (
 from afspm.model.geometry import Frame, Region, RegionChange
 from afspm.model.packet import Packet, PacketHeader
 from afspm.model.problems import ProblemNames
-from afspm.model.scan import Scan, ScanParameters, ScanSet
+from afspm.model.scan import Scan, ScanParameters, ScanSet, ShapeChange
 from afspm.model.spectrum import Spectrum
-from afspm.model.state import ControlState, Feedback, ProbePosition, ScopeStatus
+from afspm.model.state import ControlState, Feedback, PositionChange, ProbePosition, ScopeStatus
 
 __all__ = [
     "CLOCK_REQUEST",
@@ -29,6 +29,7 @@ __all__ = [
     "Packet",
     "PacketHeader",
     "Parameter",
+    "PositionChange",
     "ProbePosition",
     "Problem",
     "ProblemNames",
@@ -41,5 +42,6 @@ __all__ = [
     "ScanSet",
     "ScopeState",
     "ScopeStatus",
+    "ShapeChange",
     "Spectrum",
 ]

@@ -18,21 +18,39 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class ShapeChange:
+    """Part of a shape, as a request may give it: None is not to be changed."""
+
+    rows: int | None = None
+    columns: int | None = None
+
+    def onto(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """`shape` with what is given here changed."""
+        return (
+            shape[0] if self.rows is None else self.rows,
+            shape[1] if self.columns is None else self.columns,
+        )
+
+
+@dataclass(frozen=True)
 class ScanParameters:
     """Where a scan is taken and in how many pixels. In a request, None is not to be changed.
 
     Attributes:
         region: the rectangle that is scanned; in a request perhaps only a part of what describes it.
-        shape: pixels as (rows, columns), the order of numpy.
+        shape: pixels as (rows, columns), the order of numpy; in a request perhaps only one of them.
         unit: of the values of a scan; None for the microscope's own.
     """
 
     region: Region | RegionChange | None = None
-    shape: tuple[int, int] | None = None
+    shape: tuple[int, int] | ShapeChange | None = None
     unit: str | None = None
 
     def __post_init__(self) -> None:
         if self.shape is None:
+            return
+        if isinstance(self.shape, ShapeChange):
+            ScanParameters(shape=self.shape.onto((1, 1)))
             return
         if not (isinstance(self.shape, tuple | list) and len(self.shape) == 2):
             raise InvalidValue(
@@ -52,7 +70,12 @@ class ScanParameters:
             if not isinstance(current.region, Region):
                 raise InvalidValue("a part of a region was given, and there is none to change", hint="give it whole")
             region = region.onto(current.region)
-        return ScanParameters(region, self.shape or current.shape, self.unit or current.unit)
+        shape = current.shape if self.shape is None else self.shape
+        if isinstance(shape, ShapeChange):
+            if not isinstance(current.shape, tuple):
+                raise InvalidValue("pixels were given along one axis, and there are none to change", hint="give both")
+            shape = shape.onto(current.shape)
+        return ScanParameters(region, shape, self.unit or current.unit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,6 +43,14 @@ class ProbePosition:
 
 
 @dataclass(frozen=True)
+class PositionChange:
+    """Part of a probe position, as a request may give it: None is not to be changed. In m."""
+
+    x_m: float | None = None
+    y_m: float | None = None
+
+
+@dataclass(frozen=True)
 class ControlState:
     """Who is in control, and what stands in the way.
 

@@ -181,6 +181,8 @@ def _published_parameters(payload: Buffer) -> model.ScanParameters:
     if isinstance(parameters.region, model.RegionChange):  # published is what is in force: no angle means none
         whole = convert.whole_region(parameters.region)
         parameters = model.ScanParameters(whole or parameters.region, parameters.shape, parameters.unit)
+    if isinstance(parameters.shape, model.ShapeChange):
+        raise WireError("scan parameters in force with pixels along one axis only")
     return parameters
 
 

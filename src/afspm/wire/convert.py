@@ -88,7 +88,12 @@ def scan_parameters_to_wire(parameters: model.ScanParameters) -> scan_pb2.ScanPa
     if parameters.region is not None:
         message.spatial.CopyFrom(spatial_to_wire(parameters.region))
     if parameters.shape is not None:
-        message.data.shape.y, message.data.shape.x = parameters.shape
+        shape = parameters.shape
+        change = shape if isinstance(shape, model.ShapeChange) else model.ShapeChange(*shape)
+        if change.rows is not None:
+            message.data.shape.y = change.rows
+        if change.columns is not None:
+            message.data.shape.x = change.columns
     if parameters.unit is not None:
         message.data.units = parameters.unit
     return message
@@ -103,11 +108,11 @@ def scan_parameters_from_wire(message: scan_pb2.ScanParameters2d) -> model.ScanP
     change = spatial_from_wire(message.spatial)
     _finite(change)
     region = whole_region(change) if change is not None and change.angle_rad is not None else None
-    shape = None
+    shape: tuple[int, int] | model.ShapeChange | None = None
     if message.data.HasField("shape"):
-        if not (message.data.shape.HasField("x") and message.data.shape.HasField("y")):
-            raise InvalidValue("the number of pixels is given along one axis only", hint="give both")
-        shape = (message.data.shape.y, message.data.shape.x)
+        rows = message.data.shape.y if message.data.shape.HasField("y") else None
+        columns = message.data.shape.x if message.data.shape.HasField("x") else None
+        shape = model.ShapeChange(rows, columns) if rows is None or columns is None else (rows, columns)
     return model.ScanParameters(region or change, shape, message.data.units or None)
 
 
@@ -151,13 +156,31 @@ def position_to_wire(position: model.ProbePosition) -> spectroscopy_pb2.ProbePos
 
 def position_from_wire(message: spectroscopy_pb2.ProbePosition) -> model.ProbePosition:
     """Raises InvalidValue where a coordinate is missing or not finite, UnitError for units that are no lengths."""
-    if not (message.point.HasField("x") and message.point.HasField("y")):
+    change = position_change_from_wire(message)
+    if isinstance(change, model.PositionChange):
         raise InvalidValue("a probe position needs x and y")
-    unit = message.units or "m"
-    xy_m = convert(message.point.x, unit, "m"), convert(message.point.y, unit, "m")
-    if not all(map(math.isfinite, xy_m)):
-        raise InvalidValue(f"the probe position is {xy_m}")
-    return model.ProbePosition(xy_m)
+    return change
+
+
+def position_change_from_wire(
+    message: spectroscopy_pb2.ProbePosition,
+) -> model.ProbePosition | model.PositionChange:
+    """What a request says of the position: a PositionChange where that is only x or only y.
+
+    Raises:
+        InvalidValue: it says neither, or a coordinate is not finite.
+        UnitError: the unit is no length.
+    """
+    unit, point = message.units or "m", message.point
+    x_m = convert(point.x, unit, "m") if point.HasField("x") else None
+    y_m = convert(point.y, unit, "m") if point.HasField("y") else None
+    if not all(math.isfinite(value) for value in (x_m, y_m) if value is not None):
+        raise InvalidValue(f"the probe position is ({x_m}, {y_m}) m")
+    if x_m is None and y_m is None:
+        raise InvalidValue("a probe position without x and y")
+    if x_m is None or y_m is None:
+        return model.PositionChange(x_m, y_m)
+    return model.ProbePosition((x_m, y_m))
 
 
 def status_to_wire(status: model.ScopeStatus) -> control_pb2.ScopeStateMsg:

@@ -180,7 +180,7 @@ _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     ControlRequest.PARAM: lambda p: convert.parameter_from_wire(parse(control_pb2.ParameterMsg, p)),
     ControlRequest.SET_SCAN_PARAMS: lambda p: convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, p)),
     ControlRequest.SET_ZCTRL_PARAMS: lambda p: convert.feedback_from_wire(parse(feedback_pb2.ZCtrlParameters, p)),
-    ControlRequest.SET_PROBE_POS: lambda p: convert.position_from_wire(parse(spectroscopy_pb2.ProbePosition, p)),
+    ControlRequest.SET_PROBE_POS: lambda p: convert.position_change_from_wire(parse(spectroscopy_pb2.ProbePosition, p)),
     ControlRequest.REQUEST_CTRL: _number,
     ControlRequest.RELEASE_CTRL: _nothing,
     ControlRequest.ADD_EXP_PRBLM: _number,

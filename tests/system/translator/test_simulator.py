@@ -128,6 +128,20 @@ def test_feedback_is_set_in_part_and_switched(run: Any) -> None:
     assert peer.get("x-feedback-on")[0] == "false"
 
 
+def test_what_is_given_in_part_is_set_in_part(run: Any) -> None:
+    peer = run().peer().ready()
+    half = spectroscopy_pb2.ProbePosition(units="nm")
+    half.point.x = 30.0
+    assert peer.ask(5, half.SerializeToString()) == [bytes([OK])]
+    position = next(message for name, message in peer.until(FREE) if name == "ProbePosition")
+    assert (position.point.x, position.point.y) == (pytest.approx(3e-8), 0.0)
+    columns = scan_pb2.ScanParameters2d()
+    columns.data.shape.x = 24
+    assert peer.ask(3, columns.SerializeToString()) == [bytes([OK])]
+    shape = next(message.data.shape for name, message in peer.until(FREE) if name == "ScanParameters2d")
+    assert (shape.x, shape.y) == (24, 8)
+
+
 def test_every_base_parameter_is_told_and_can_be_set_to_what_it_is(run: Any) -> None:
     from afspm.model import names
 

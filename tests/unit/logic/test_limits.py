@@ -12,11 +12,13 @@ from afspm.model import (
     ControlResponse,
     Feedback,
     Parameter,
+    PositionChange,
     ProbePosition,
     Region,
     RegionChange,
     Request,
     ScanParameters,
+    ShapeChange,
 )
 
 NS = 10**9
@@ -32,7 +34,7 @@ def set_(value: str, unit: str | None = None, name: str = BIAS) -> Request:
     return Request(int(ControlRequest.PARAM), Parameter(name, value, unit), id="i")
 
 
-def scan(region: Region | RegionChange | None = None, shape: tuple[int, int] | None = None) -> Request:
+def scan(region: Region | RegionChange | None = None, shape: tuple[int, int] | ShapeChange | None = None) -> Request:
     return Request(int(ControlRequest.SET_SCAN_PARAMS), ScanParameters(region, shape))
 
 
@@ -191,6 +193,24 @@ def test_absurd_numbers_of_pixels_are_refused() -> None:
     assert why(g, set_("10000", None, "scan-resolution-x"))
     for value in ("0", "-4", "1.5"):
         assert why(g, set_(value, None, "scan-resolution-x"))
+
+
+def test_a_part_of_a_position_is_checked_with_the_rest_of_it() -> None:
+    limits = Guard(Limits(region=STAGE))
+    half = Request(int(ControlRequest.SET_PROBE_POS), PositionChange(x_m=4e-6))
+    assert "not known" in why(limits, half)
+    limits.published(ProbePosition((0.0, 4.9e-6)), 0)
+    assert why(limits, half) == ""
+    limits.carried_out(half, 0)
+    beyond = Request(int(ControlRequest.SET_PROBE_POS), PositionChange(y_m=5.1e-6))
+    assert "(4e-06, 5.1e-06)" in why(limits, beyond)
+
+
+def test_pixels_along_one_axis_are_counted_with_those_along_the_other() -> None:
+    limits = Guard(Limits(most_pixels=1000))
+    limits.published(ScanParameters(STAGE, (100, 5)), 0)
+    assert why(limits, scan(shape=ShapeChange(columns=10))) == ""
+    assert "11 x 100" in why(limits, scan(shape=ShapeChange(columns=11)))
 
 
 def test_an_angle_without_a_unit_is_in_degrees() -> None:

@@ -17,6 +17,7 @@ from afspm.model import (
     ControlResponse,
     Feedback,
     Parameter,
+    PositionChange,
     ProbePosition,
     Region,
     RegionChange,
@@ -24,6 +25,7 @@ from afspm.model import (
     Response,
     Scan,
     ScanParameters,
+    ShapeChange,
     Spectrum,
 )
 from afspm.wire.frames import encode_subject
@@ -92,6 +94,19 @@ def test_only_the_fields_that_are_present_are_set() -> None:
     assert changed.region.size_m == (3e-6, 1e-6)
     assert changed.region.top_left_m == pytest.approx(SCAN.region.top_left_m)
     assert (changed.region.angle_rad, changed.shape) == (0.25, (3, 4))
+
+
+def test_one_coordinate_or_one_number_of_pixels_alone_can_be_asked_for() -> None:
+    from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as Message
+
+    message = Message(units="um")
+    message.point.y = 2.0
+    request = wire.decode_request([bytes([ControlRequest.SET_PROBE_POS]), message.SerializeToString()])
+    assert request.subject == PositionChange(None, 2e-6)
+    payload = encode_subject(ScanParameters(shape=ShapeChange(columns=64)))
+    request = wire.decode_request([bytes([ControlRequest.SET_SCAN_PARAMS]), payload])
+    assert request.subject.shape == ShapeChange(None, 64)
+    assert request.subject.onto(ScanParameters(SCAN.region, (3, 4), "m")).shape == (3, 64)
 
 
 @pytest.mark.parametrize(
