@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from afspm.transport.log_link import LogLine
 
 
+REST_S = 0.8  # real: what is waited for others' last words
+
+
 class LogCollector(Component):
     """Writes what every process of the experiment logs to one file, wherever it runs.
 
@@ -57,12 +60,16 @@ class LogCollector(Component):
         self.log.info("collecting log lines at %s", self.receiver.address)
 
     def on_tick(self) -> None:
-        lines = [told(line) for line in self.receiver.take() if line.level >= self.level]
+        self._write(self.receiver.take())
+
+    def _write(self, found: list[LogLine]) -> None:
+        lines = [told(line) for line in found if line.level >= self.level]
         if lines:
             self._lines.append(lines)
 
     def on_end(self) -> None:
-        self.on_tick()
+        # everybody ends now, and has more to say than what has come; we ourselves stay connected
+        self._write(self.receiver.take_rest(REST_S, self.clock, staying=1))
 
 
 def told(line: LogLine) -> str:

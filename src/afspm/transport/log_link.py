@@ -6,8 +6,11 @@ from typing import NamedTuple
 
 import zmq
 
+from afspm.clock import Clock
 from afspm.transport.frames import readable
+from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
+from afspm.transport.polling import milliseconds
 
 LONGEST_LINE_BYTES = 64 * 1024
 
@@ -56,6 +59,8 @@ class LogReceiver:
         self._network = network
         self._socket = network.socket(zmq.SUB)
         self._socket.setsockopt(zmq.SUBSCRIBE, b"")
+        self._monitor = Monitor(network, self._socket, ACCEPTED | DISCONNECTED)
+        self._connected: set[int] = set()
         self.address = network.bind(self._socket, address)
 
     def take(self) -> list[LogLine]:
@@ -66,6 +71,24 @@ class LogReceiver:
             if line is not None:
                 lines.append(line)
         return lines
+
+    def take_rest(self, timeout_s: float, clock: Clock, *, staying: int = 0) -> list[LogLine]:
+        """What comes until all but `staying` senders have gone, for at most `timeout_s`: the last words of an experiment."""
+        until_s = clock.monotonic_s() + timeout_s
+        poller = zmq.Poller()
+        for socket in (self._socket, self._monitor.socket):
+            poller.register(socket, zmq.POLLIN)
+        lines = self.take()
+        while self._count() > staying and (left_s := until_s - clock.monotonic_s()) > 0.0:
+            poller.poll(milliseconds(left_s))
+            lines += self.take()
+        return lines + self.take()
+
+    def _count(self) -> int:
+        """How many senders there are."""
+        for kind, descriptor in self._monitor.drain():
+            (self._connected.add if kind == ACCEPTED else self._connected.discard)(descriptor)
+        return len(self._connected)
 
     def close(self) -> None:
         self._network.close()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from pathlib import Path
 
 from runtime_lab import Lab, run
 
+from afspm.clock import ExperimentClock
 from afspm.components.log_collector import LogCollector, told
 from afspm.transport.log_link import LogLine, LogReceiver, LogSender, read_line
 from afspm.transport.network import Network
@@ -46,3 +48,28 @@ def test_the_component_writes_what_comes_until_the_end(tmp_path: Path) -> None:
     lab.at(3.0, lab.kill)
     run(collector, lab, run_dir=str(tmp_path))
     assert (tmp_path / "log-all.txt").read_text() == "1970-01-01T00:00:00.000000Z WARNING  tip              bad\n"
+
+
+def test_the_last_words_of_those_that_end_are_waited_for() -> None:
+    receiver = LogReceiver(Network(), "tcp://127.0.0.1:0")
+    senders = [LogSender(Network(), receiver.address, name) for name in ("scheduler", "series")]
+    deadline_s = time.monotonic() + 10.0
+    heard: set[str] = set()
+    while len(heard) < 2 and time.monotonic() < deadline_s:
+        for sender in senders:
+            sender.send(logging.INFO, 5, "here")
+        heard |= {line.name for line in receiver.take()}
+
+    def end() -> None:
+        for sender in senders:
+            sender.send(logging.INFO, 6, "the end")
+            sender.close()
+
+    ending = threading.Timer(0.05, end)
+    ending.start()
+    began_s = time.monotonic()
+    rest = receiver.take_rest(10.0, ExperimentClock.real())
+    assert time.monotonic() - began_s < 5.0, "it waits although nobody is there any more"
+    assert {line.name for line in rest if line.text == "the end"} == {"scheduler", "series"}
+    ending.join()
+    receiver.close()
