@@ -73,7 +73,7 @@ class LogReceiver:
         return lines
 
     def take_rest(self, timeout_s: float, clock: Clock, *, staying: int = 0) -> list[LogLine]:
-        """What comes until all but `staying` senders have gone, for at most `timeout_s`: the last words of an experiment."""
+        """What comes until all but `staying` senders have gone, for at most `timeout_s`: the last words of a night."""
         until_s = clock.monotonic_s() + timeout_s
         poller = zmq.Poller()
         for socket in (self._socket, self._monitor.socket):
