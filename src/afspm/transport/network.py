@@ -18,11 +18,15 @@ MAX_PACKET_BYTES = 256 * 1024 * 1024
 MAX_REQUEST_BYTES = 1024 * 1024
 """Of each frame of a request or response, and of a subscription."""
 QUEUE_LENGTH = 4000
-"""Messages waiting for one peer; a publisher drops what is more, so that nobody who stands still fills our memory."""
+"""Messages waiting for one peer; a publisher drops what is more."""
 
 _LINGER_MS = 200
 # A peer that is frozen or cut off is found within seconds and not when the system gives up on it after hours.
 _ALIVE_CHECK_MS, _ALIVE_TIMEOUT_MS = 2_000, 8_000
+# That is asked behind what waits for the peer, so one that takes nothing more is never asked. It is disconnected after
+# this time, and what waited for it is dropped: 4,000 scans may be more than any memory. Back again it asks for what it
+# missed. (Linux and Windows.)
+_STALLED_MS = 5_000
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
 _HANDSHAKE_MS = 5_000
 
@@ -72,6 +76,7 @@ class Network:
             (zmq.HEARTBEAT_IVL, _ALIVE_CHECK_MS),
             (zmq.HEARTBEAT_TIMEOUT, _ALIVE_TIMEOUT_MS),
             (zmq.HEARTBEAT_TTL, _ALIVE_TIMEOUT_MS),
+            (zmq.TCP_MAXRT, _STALLED_MS),
             (zmq.RECONNECT_IVL, _RECONNECT_MS),
             (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
             (zmq.HANDSHAKE_IVL, _HANDSHAKE_MS),

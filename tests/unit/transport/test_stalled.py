@@ -1,0 +1,101 @@
+"""A subscriber that takes nothing any more: what waits for it is dropped, and once it goes on it gets everything."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import pytest
+import zmq
+
+from afspm.clock import ExperimentClock
+from afspm.transport import network
+from afspm.transport.history import Published
+from afspm.transport.monitor import DISCONNECTED, Monitor
+from afspm.transport.network import Network
+from afspm.transport.port import PacketReceived
+from afspm.transport.publisher import Publisher
+from afspm.transport.zmq_port import ZmqPort
+
+pytestmark = pytest.mark.skipif(sys.platform == "darwin", reason="the system can't tell that a peer takes nothing")
+ANY = "tcp://127.0.0.1:0"
+CLOCK = ExperimentClock.real()
+SCAN = bytes(4_000_000)
+SCANS = 40
+SOON_S = 6.0  # earlier than anything else disconnects it
+
+
+@pytest.fixture
+def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
+    """One that waits for a peer for half a second and remembers its last packet alone."""
+    monkeypatch.setattr(network, "_STALLED_MS", 500)
+    published = Published(CLOCK, most_packets=2 * SCANS, most_bytes=2 * SCANS * len(SCAN))
+
+    class Lab:
+        def __init__(self) -> None:
+            self.network = Network()
+            self.publisher = Publisher(self.network, ANY, published)
+            self.monitor = Monitor(self.network, self.publisher.socket, DISCONNECTED)
+            self.address = self.publisher.address
+
+        def poll(self, timeout_s: float) -> list[int]:
+            if self.publisher.socket.poll(int(timeout_s * 1000)):
+                self.publisher.serve()
+            return [event.kind for event in self.monitor.drain()]
+
+        def publish(self, payload: bytes) -> None:
+            self.publisher.publish(published.stamp("Scan2d", payload))
+
+        def close(self) -> None:
+            self.network.close()
+
+    return open_(Lab())
+
+
+def test_what_waits_for_one_that_stands_still_is_dropped_and_others_miss_nothing(
+    publisher: Any, plain: Any, open_: Any, until: Any
+) -> None:
+    stalled = plain(zmq.SUB)
+    stalled.setsockopt(zmq.RCVHWM, 1)
+    stalled.subscribe(b"")
+    stalled.connect(publisher.address)
+    healthy, got, happened = open_(ZmqPort(Network(), "Healthy", CLOCK, subscribe=[publisher.address])), [], []
+    publisher.publish(b"for both")
+    until(lambda: stalled.poll(0) and any(isinstance(i, PacketReceived) for i in got), (publisher, []), (healthy, got))
+    got.clear()
+    payload = bytes(len(SCAN))
+    kept = sys.getrefcount(payload)
+    for _ in range(SCANS):
+        publisher.publisher.socket.send_multipart([b"Scan2d", payload, b""], copy=False)
+    received = lambda: sum(isinstance(i, PacketReceived) for i in got)  # noqa: E731
+    until(lambda: received() == SCANS, (publisher, happened), (healthy, got))
+    waiting = sys.getrefcount(payload) - kept
+    assert waiting > SCANS // 2 or DISCONNECTED in happened
+    until(lambda: DISCONNECTED in happened, (publisher, happened), timeout_s=SOON_S)
+    until(lambda: sys.getrefcount(payload) - kept <= 1, (publisher, happened))
+
+
+def test_one_that_goes_on_after_standing_still_gets_everything_once(
+    publisher: Any, open_: Any, until: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Network.socket
+
+    def socket(self: Network, kind: int, **options: int) -> Any:
+        found = made(self, kind, **options)
+        if kind == zmq.XSUB:
+            found.setsockopt(zmq.RCVHWM, 1)  # else the library reads for it
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Network, "socket", socket)
+        stalled = open_(ZmqPort(Network(), "Stalled", CLOCK, subscribe=[publisher.address]))
+    got: list[Any] = []
+    publisher.publish(b"first")
+    until(lambda: any(isinstance(i, PacketReceived) for i in got), (publisher, []), (stalled, got))
+    for number in range(SCANS):
+        publisher.publish(number.to_bytes() + SCAN)
+    happened: list[Any] = []
+    until(lambda: DISCONNECTED in happened, (publisher, happened), timeout_s=SOON_S)
+    numbers = lambda: [i.packet.payload[0] for i in got if isinstance(i, PacketReceived)][1:]  # noqa: E731
+    until(lambda: len(numbers()) >= SCANS, (publisher, happened), (stalled, got))
+    assert numbers() == list(range(SCANS))
