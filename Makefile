@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo test check bench soak simulate clean
+.PHONY: demo test check bench soak chaos simulate clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -34,6 +34,12 @@ bench: $(SETUP)
 ## a million malformed requests and packets
 soak: $(SETUP)
 	@$(BIN)/python -m benchmarks.soak
+
+## nights with tip repair in which processes are killed and frozen: make chaos NIGHTS=100 CHAOS_SEED=1
+NIGHTS ?= 20
+CHAOS_SEED ?= $(shell date +%s)
+chaos: $(SETUP)
+	@$(BIN)/python -m benchmarks.chaos --nights $(NIGHTS) --seed $(CHAOS_SEED)
 
 ## a long deterministic simulation: make simulate HOURS=100000 SEED=1
 HOURS ?= 20000

@@ -47,13 +47,33 @@ class Roles(ExitStack):
             state_dir=folder,
             log_level="ERROR",
         )
+        self._host(launch)
+        return publish, serve
+
+    def microscope(self, **settings: Any) -> str:
+        """The real translator of a simulated microscope; returns the address where it is asked."""
+        folder = self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
+        serve = PORTS.address()
+        launch = Launch(
+            "microscope",
+            "afspm.microscopes.simulator.Simulator",
+            settings,
+            sockets=Sockets(PORTS.address(), serve=serve),
+            run_dir=folder,
+            state_dir=f"{folder}/state",
+            log_level="CRITICAL",
+            simulated=True,
+        )
+        self._host(launch)
+        return serve
+
+    def _host(self, launch: Launch) -> None:
         process = subprocess.Popen([sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE)
         self.processes.append(process)
         self.callback(_end, process)
         assert process.stdin is not None
         process.stdin.write(launch.to_json().encode() + b"\n")
         process.stdin.flush()
-        return publish, serve
 
 
 @contextmanager

@@ -1,8 +1,9 @@
 """`python -m benchmarks.soak [COUNT]`: malformed requests and packets (default: a million) against real processes.
 
-A scheduler, a translator's server and a component, each in a process of its own, are sent what no well-meaning peer
-would: truncated and overlong messages, wrong numbers of frames, unknown numbers, random bytes, bytes that are not even
-ZeroMQ, under known and unknown names. After every batch each must answer as before, and in the end none may have grown.
+A scheduler, a translator with its simulated microscope and a component, each in a process of its own, are sent what no
+well-meaning peer would: truncated and overlong messages, wrong numbers of frames, unknown numbers, random bytes, bytes
+that are not even ZeroMQ, frames that are said to be gigabytes, connections that never finish to greet, under known
+names and ever new ones. After every batch each must answer as before, and in the end none may have grown.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import random
 import socket
 import sys
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,11 @@ from benchmarks.processes import CLOCK, Roles, roles
 BATCH = 2_000
 GROWTH_MB = 64.0
 """How much a process may grow from the first tenth to the end."""
+MOST_UNFINISHED = 300
+"""Connections held open at a time that never finish to greet."""
+GREETING = b"\xff" + bytes(8) + b"\x7f\3\0NULL".ljust(55, b"\0")
+READY = b"\4\x1c\5READY\x0bSocket-Type\0\0\0\6DEALER"
+"""What a peer of ZeroMQ says first, and then."""
 NAMES = (b"Experiment", b"Tip Corrector", b"", b"\xff\xfe", b"x" * 255, b"scheduler")
 
 
@@ -49,8 +56,9 @@ class Malice:
 
     def request(self) -> list[bytes]:
         frames = self._spoilt(self._requests)
-        # whoever may end the experiment is asked not to
-        return [b"\6" if frame == bytes([ControlRequest.END_EXPERIMENT]) else frame for frame in frames]
+        # whoever may end the experiment, or tell the translator that it has ended, is asked not to
+        ending = (bytes([ControlRequest.END_EXPERIMENT]), wire.CLOSE)
+        return [b"\6" if frame in ending else frame for frame in frames]
 
     def packet(self) -> list[bytes]:
         frames = self._spoilt(self._packets)
@@ -89,7 +97,7 @@ class Soak:
         self._random = random.Random(seed)
         self._context: Any = processes.enter_context(zmq.Context())
         self._context.setsockopt(zmq.LINGER, 0)
-        serve = processes.start("translator").split()[1]
+        serve = processes.microscope(initial={"scan-resolution-x": 16, "scan-resolution-y": 16})
         self._noise = self._context.socket(zmq.PUB)
         self._noise.setsockopt(zmq.SNDHWM, 0)
         noise = f"tcp://127.0.0.1:{self._noise.bind_to_random_port('tcp://127.0.0.1')}"
@@ -104,6 +112,8 @@ class Soak:
         processes.callback(self._translators_friend.close)
         self._pids = [process.pid for process in processes.processes]
         self._asked = 0
+        self._unfinished: deque[socket.socket] = deque()
+        processes.callback(self._close_unfinished)
 
     def batch(self, count: int) -> None:
         """So many messages to each of the three, in a third each; then all must still serve."""
@@ -111,7 +121,7 @@ class Soak:
         for target in (self._scheduler, self._translator):
             dealer = self._context.socket(zmq.DEALER)
             dealer.setsockopt(zmq.SNDHWM, 0)
-            if name := self._random.choice(NAMES):
+            if name := self._random.choice((*NAMES, b"somebody new %d" % self._random.randrange(10**9))):
                 dealer.setsockopt(zmq.ROUTING_ID, name)
             dealer.connect(target)
             targets.append(dealer)
@@ -131,6 +141,14 @@ class Soak:
         for address in (self._scheduler, self._translator, self._scheduler_publish):
             with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as raw:
                 raw.sendall(self._random.randbytes(200))
+            with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as raw:
+                raw.sendall(GREETING)
+                raw.sendall(READY + b"\2" + (1 << 40).to_bytes(8, "big") + b"the beginning of a terabyte")
+            unfinished = socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2])))
+            unfinished.sendall(GREETING[: self._random.randrange(len(GREETING))])
+            self._unfinished.append(unfinished)
+        while len(self._unfinished) > MOST_UNFINISHED:
+            self._unfinished.popleft().close()
         large = self._context.socket(zmq.DEALER)
         large.connect(self._random.choice((self._scheduler, self._translator)))
         large.send_multipart([b"", b"\1", bytes(3_000_000)])
@@ -141,6 +159,10 @@ class Soak:
             subscriber.send(self._random.randbytes(10) or b"\1")
         large.close(linger=100)
         subscriber.close(linger=100)
+
+    def _close_unfinished(self) -> None:
+        for connection in self._unfinished:
+            connection.close()
 
     def check(self) -> None:
         """Scheduler, translator and component must answer as before. Raises TimeoutError."""
