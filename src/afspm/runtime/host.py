@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
 
 FAREWELL_S = 1.0  # that exit handlers and threads of libraries have, once everything of ours is done
+MOST_FILES = 65_536  # more than anybody needs; some programs that are started by ours walk through all that may be
 MEASURED = frozenset({"Scan2d", "Spec1d"})
 
 
@@ -41,6 +42,7 @@ def main() -> int:
         log.set_up("host", "INFO").error("%s", error)
         return ExitCode.CONFIG
     logger = log.set_up(launch.name, launch.log_level)
+    _allow_many_connections()
     parent = Parent(ExitCode.ORPHAN)
     parent.watch()
     signal.signal(signal.SIGTERM, lambda *_: parent.let_go())
@@ -138,6 +140,20 @@ def _open_port(launch: Launch, clock: Clock, parent: Parent) -> Port:
     port = open_port(launch, clock)
     parent.when_gone(lambda: port.wake_up(ParentGone()))
     return port
+
+
+def _allow_many_connections() -> None:
+    """As many open files as the system lets us have: by default a thousand, which strangers that connect use up; then
+    nothing could be written to disk any more."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MOST_FILES if hard == resource.RLIM_INFINITY else min(MOST_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _detach_stdin() -> None:

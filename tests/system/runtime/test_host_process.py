@@ -12,6 +12,7 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.host import MOST_FILES
 from afspm.runtime.launch import Launch, Sockets
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 
@@ -61,6 +62,21 @@ def test_a_wish_to_terminate_is_followed_cleanly(host: Host) -> None:
     child.popen.terminate()
     child.expect("end")
     assert child.exit_code() == ExitCode.ORPHAN
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asking for another's limits")
+def test_a_process_may_have_as_many_connections_as_the_system_allows(host: Host) -> None:
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MOST_FILES if hard == resource.RLIM_INFINITY else min(MOST_FILES, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most // 2, hard))
+    try:
+        child = host(part("Diary"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    child.expect("start")
+    assert resource.prlimit(child.popen.pid, resource.RLIMIT_NOFILE)[0] == most
 
 
 @pytest.mark.parametrize(
