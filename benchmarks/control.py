@@ -45,8 +45,8 @@ def control_round_trip() -> Iterator[Row]:
                         assert incoming.response.ok, incoming
                         return
 
-        def ask_bare() -> None:
-            requester.send_multipart([b"\1", payload])
+        def ask_bare() -> None:  # the same frames, there and back, as ours
+            requester.send_multipart([b"\1", payload, b"Client/benchmark/%d" % next(numbers)])
             requester.recv_multipart()
 
         payload = wire.encode_subject("start-scan")

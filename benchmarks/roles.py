@@ -45,8 +45,8 @@ def bare_rep(back: str) -> None:
     socket.connect(back)
     ready()
     while True:
-        socket.recv_multipart()
-        socket.send(b"\0")
+        _, _, request_id = socket.recv_multipart()
+        socket.send_multipart([b"\0", b"", b"", request_id])
 
 
 def translator() -> None:
