@@ -106,6 +106,10 @@ class ChildWatch:
         """It runs no more and will not be started again."""
         return self.phase in (Phase.DONE, Phase.GIVEN_UP)
 
+    def died(self, code: int) -> bool:
+        """Whether a process that ended with this code had not finished."""
+        return code not in self._policy.final_codes
+
     def begin(self, now_s: float) -> list[Effect]:
         """Start it, the first time or after it was over."""
         if self.phase not in (Phase.IDLE, Phase.DONE, Phase.GIVEN_UP):

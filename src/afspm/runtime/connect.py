@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError, FileError, NoResponse
+from afspm.errors import ConfigError, ExperimentEnded, FileError, NoResponse
 from afspm.model import ProblemNames
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
@@ -40,6 +40,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         FileError: there is no such run.
         ConfigError: it has nobody to connect to.
         NoResponse: its scheduler is not running.
+        ExperimentEnded: it has just ended.
     """
     folder = find_run(Path(where))
     launch = guest_of(folder, name)
@@ -55,7 +56,12 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         request_retries=launch.request_retries,
         log=logging.getLogger(f"afspm.{name}"),
     )
-    if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
+    try:
+        joined = link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S))
+    except ExperimentEnded:
+        port.close()
+        raise
+    if not joined:
         port.close()
         raise NoResponse("nobody is there", where=str(folder), hint="is the experiment still running?")
     scope = Scope(link, ProblemNames(launch.problems), folder / "state")

@@ -106,7 +106,7 @@ class Scheduler:
         shell = Shell(core, sockets, clock, state, journal, complaints, log)
         try:
             shell.start()
-            while not (shell.ended or stopping.is_set()):
+            while not (shell.over or stopping.is_set()):
                 ready = shell.wait()
                 with context.activity.step():
                     shell.handle(ready)

@@ -29,10 +29,13 @@ _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
+FAREWELL_S = 3.0
+"""How long (real) after the end whoever comes late, or is started again, is still given what was measured and told that
+it is over."""
 
 
 class Shell:
-    """One scheduler at work: `start`, then `handle` what `wait` returns until it has `ended`."""
+    """One scheduler at work: `start`, then `handle` what `wait` returns until it is `over`."""
 
     def __init__(
         self,
@@ -54,6 +57,7 @@ class Shell:
         self._replay: tuple[Packet, ...] = ()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
+        self._leave_at_s = math.inf
         sockets.publisher.history = self._history
 
     def start(self) -> None:
@@ -61,11 +65,19 @@ class Shell:
 
     def wait(self) -> list[Source]:
         """Wait for whatever comes first, a message or a deadline."""
-        timeout_s = self._look_at_s - self._clock.monotonic_s()
+        timeout_s = (self._leave_at_s if self.ended else self._look_at_s) - self._clock.monotonic_s()
         return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
+
+    @property
+    def over(self) -> bool:
+        """The experiment has ended, and nobody is waited for any more."""
+        return self._clock.monotonic_s() >= self._leave_at_s
 
     def handle(self, ready: list[Source]) -> None:
         """See to what has come, and to the deadlines."""
+        if self.ended:
+            self._handle_late(ready)
+            return
         sockets = self._sockets
         for source in ready:
             if source is sockets.router:
@@ -89,6 +101,30 @@ class Shell:
             self._deadlines(now_s)
         elif now_s + _LATE_S < self._look_at_s:
             self._look_at_s = now_s + _LATE_S  # what has come may have set an earlier one
+
+    def _handle_late(self, ready: list[Source]) -> None:
+        """After the end: nothing happens any more, but whoever comes is told so."""
+        sockets = self._sockets
+        for source in ready:
+            if source is sockets.publisher:
+                if sockets.publisher.serve():
+                    sockets.publisher.kill()
+            elif source is sockets.router or source is sockets.router.monitor:
+                for event in sockets.router.receive() if source is sockets.router else sockets.router.follow():
+                    if isinstance(event, PeerAsked) and event.frames:
+                        response = Response(
+                            ControlResponse.FAILURE, reason="the experiment has ended", id=_id_of(event)
+                        )
+                        sockets.router.reply(event.connection, wire.encode_response(response))
+            elif source is sockets.link:
+                sockets.link.receive()
+            elif source is sockets.link.monitor:
+                if any(isinstance(change, LinkUp) for change in sockets.link.follow()):
+                    sockets.link.send(0, [wire.CLOSE])
+            elif source is sockets.subscriber:
+                sockets.subscriber.receive()
+            else:
+                sockets.subscriber.follow()
 
     def close(self) -> None:
         """Write down what is cached, unless the experiment is over."""
@@ -186,6 +222,7 @@ class Shell:
                     sockets.publisher.kill()
                     sockets.link.send(0, [wire.CLOSE])  # the translator subscribes to nobody
                     self.ended = True
+                    self._leave_at_s = self._clock.monotonic_s() + FAREWELL_S
 
 
 def _id_of(asked: PeerAsked) -> str:

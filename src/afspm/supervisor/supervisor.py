@@ -28,6 +28,9 @@ from afspm.transport.wakeup import WakeUp
 _LEVELS = {Why.STOPPED: logging.INFO, Why.LOST: logging.CRITICAL}
 
 
+START_AT_THE_END_S = 15.0  # what is started again at the end has so long to come up
+
+
 @dataclass(frozen=True)
 class Report:
     """What became of one process: how often it was started, whether it was given up, how it ended last."""
@@ -61,6 +64,8 @@ class _Child:
     process: ChildProcess | None = None
     lines: LineReader = field(default_factory=LineReader)
     starts: int = 0
+    started_s: float = 0.0
+    rescued: bool = False
     up: bool = False
     beat: Heartbeat | None = None
     beat_s: float = 0.0
@@ -78,6 +83,23 @@ class _Child:
             return False
         longest_s = self.beat.longest_step_s or liveness.longest_step_s
         return now_s - self.beat_s < liveness.silence_s and self.beat.step_age_s <= longest_s
+
+    def may_still_finish(self, now_s: float, liveness: LivenessPolicy) -> bool:
+        """Whether it is too early to say that it has nothing left to do: it starts, has not beaten for a moment, or is
+        frozen and can be started again."""
+        if self.process is None or not self.task.beats or self.task.role is not Role.COMPONENT:
+            return False
+        if not self.up:
+            return now_s - self.started_s < START_AT_THE_END_S
+        silent_s = now_s - self.beat_s
+        closing = self.beat is not None and self.beat.closing
+        given_up = self.rescued and self.is_silent(now_s, liveness)
+        return not closing and not given_up and silent_s > 1.5 * liveness.beat_period_s
+
+    def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
+        """Whether it should have beaten long ago."""
+        beating = self.process is not None and self.up and self.beat is not None and not self.beat.closing
+        return beating and now_s - self.beat_s >= liveness.silence_s
 
     @property
     def over(self) -> bool:
@@ -168,7 +190,11 @@ class Supervisor:
         how = describe_exit(exited.code)
         child.last_exit = f"{how}: {child.last_error}" if exited.code == ExitCode.CRASHED and child.last_error else how
         if self._ending is not None:
-            self._log.write(child.name, logging.DEBUG, child.last_exit)
+            if child.watch.died(exited.code) and self._may_be_rescued(child):
+                self._log.write(child.name, logging.WARNING, f"{how}; it is started again, to finish")
+                self._rescue(child)
+            else:
+                self._log.write(child.name, logging.DEBUG, child.last_exit)
             return
         self._carry_out(child, child.watch.exited(exited.code, self._clock.monotonic_s(), how))
         if exited.code == ExitCode.ENDED:
@@ -214,12 +240,13 @@ class Supervisor:
                     self._give_up(child, why)
 
     def _start(self, child: _Child) -> None:
-        task = child.task
-        if self._ending is not None:
+        if self._ending is not None and not child.rescued:
             return
+        task = child.task
         launch = replace(task.launch, sockets=replace(task.launch.sockets, heartbeat=child.heartbeat))
         child.lines, child.up, child.beat, child.last_error = LineReader(), False, None, ""
         child.starts += 1
+        child.started_s = self._clock.monotonic_s()
         try:
             child.process = ChildProcess(
                 task.name, task.command, launch.to_json(), self._wakeup.post, task.environment, task.folder
@@ -242,14 +269,52 @@ class Supervisor:
             now_s = self._clock.monotonic_s()
             self._ending = Ending.begin(why, text, now_s)
             for child in self._children.values():
+                is_missing = child.process is None and child.watch.phase is supervision.Phase.WAITING
                 child.watch.stop(now_s)
+                if is_missing and self._may_be_rescued(child):
+                    self._rescue(child)
                 # the signal that the experiment has ended is the scheduler's, whom a translator does not listen to
                 if child.task.role is Role.TRANSLATOR and child.process:
                     child.process.close_stdin()
             self._log.write(SUPERVISOR, _LEVELS.get(why, logging.DEBUG), text)
 
+    def _look_after_the_last(self, now_s: float) -> None:
+        """At the end of the experiment: kill who is frozen, and let the scheduler go once nobody needs it any more."""
+        left = [child for child in self._children.values() if child.process is not None]
+        for child in left:
+            if child.task.role is Role.SCHEDULER and all(other.task.role is Role.SCHEDULER for other in left):
+                assert child.process is not None
+                child.process.close_stdin()
+            elif self._may_be_rescued(child) and child.is_silent(now_s, self._policy.liveness):
+                assert child.process is not None
+                child.process.kill()
+
+    def _may_be_rescued(self, child: _Child) -> bool:
+        """Whether it is started once more though the experiment has ended: it had not finished when it died."""
+        ending = self._ending
+        return (
+            ending is not None
+            and ending.why is Why.EXPERIMENT_ENDED
+            and ending.last is None
+            and child.task.beats
+            and child.task.role is Role.COMPONENT
+            and not child.rescued
+        )
+
+    def _rescue(self, child: _Child) -> None:
+        child.rescued = True
+        self._start(child)
+
     def _go_on_ending(self, ending: Ending, now_s: float) -> None:
-        busy = [child.name for child in self._children.values() if child.is_busy(now_s, self._policy.liveness)]
+        if ending.last is None and ending.why is Why.EXPERIMENT_ENDED:
+            self._look_after_the_last(now_s)
+        liveness = self._policy.liveness
+        busy = [
+            child.name
+            for child in self._children.values()
+            if child.is_busy(now_s, liveness)
+            or (child.may_still_finish(now_s, liveness) and ending.why is Why.EXPERIMENT_ENDED)
+        ]
         self._ending, do = ending.step(now_s, busy=bool(busy))
         if do is None and self._ending.ask_s != ending.ask_s and not self._has_told_waiting:
             self._has_told_waiting = True

@@ -55,6 +55,7 @@ history = {{ Scan2d = 20 }}
 WITNESS = '''
 """Writes down every scan that it gets, and ends the experiment when it has had all of them."""
 
+import threading
 from collections import Counter
 
 from afspm.model import ScopeState
@@ -75,6 +76,18 @@ class Witness(Component):
         self.log.info("state %s", status.state.name)
         if status.state is ScopeState.FREE and self.seen and min(self.seen.values()) >= self.scans:
             self.scope.end_experiment()
+
+
+class Finisher(Component):
+    """Has something to finish at the end, which takes for ever in its first life."""
+
+    def on_end(self):
+        first = not (self.run_dir / "finishing.txt").exists()
+        (self.run_dir / "finishing.txt").touch()
+        self.log.info("finishing")
+        if first:
+            threading.Event().wait()
+        (self.run_dir / "finished.txt").touch()
 '''
 
 

@@ -70,6 +70,18 @@ def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Ru
     require_each_row_once(one, 5)
 
 
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run, fault: signal.Signals) -> None:
+    one = run(more=MORE + '[finisher]\ncomponent = true\nclass = "witness.Finisher"\n')
+    one.wait_for(" finisher ", "finishing")
+    one.wait_for(" afspm ", "the experiment has ended$")
+    one.signal("finisher", fault)
+    one.wait_for(" finisher ", "it is started again, to finish")
+    assert one.end() == 0, one.output
+    assert (one.folder / "finished.txt").exists(), one.output
+    require_each_once(one, 4)
+
+
 def test_a_component_that_always_crashes_does_not_keep_the_rest_from_ending(run: Run) -> None:
     more = """
 [hopeless]

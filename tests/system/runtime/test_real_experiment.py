@@ -118,6 +118,14 @@ def test_the_end_of_the_experiment_ends_every_process(experiment: Experiment) ->
     assert experiment.scheduler.exit_code() == ExitCode.ENDED
 
 
+def test_one_that_comes_as_the_experiment_ends_hears_of_it(experiment: Experiment) -> None:
+    ends = experiment.start("ends", "EndsEverything")
+    assert ends.exit_code() == ExitCode.ENDED, ends.error_text
+    late = experiment.start("diary", "Diary")
+    late.expect("start")
+    assert late.exit_code() == ExitCode.ENDED
+
+
 def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment) -> None:
     facts = {"name": "x", "guest": guest_facts(experiment.component_launch("some"))}
     (experiment.folder / "run.json").write_text(json.dumps(facts))
@@ -135,6 +143,7 @@ def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment) -> No
         scope.end_experiment()
         with pytest.raises(ExperimentEnded):
             scope.wait_until(lambda: False, timeout_s=20.0)
+    experiment.scheduler.exit_code()  # it stays for a moment, to tell those who come late
     with pytest.raises(NoResponse, match="still running"):
         afspm.connect(experiment.folder)
 

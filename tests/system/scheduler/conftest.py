@@ -14,7 +14,7 @@ import zmq
 
 from afspm import wire
 from afspm.clock import ExperimentClock
-from afspm.model import ControlResponse, Request, Response
+from afspm.model import ControlRequest, ControlResponse, Request, Response
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys
@@ -123,6 +123,11 @@ class Rig:
         self.components.append(component)
         self.until(component.connected)
         return component
+
+    def linked(self, component: Component) -> None:
+        """Wait until the scheduler has found its translator: before, what is asked is refused."""
+        self.until(lambda: component.ask(ControlRequest.ACTION_SUPPORT, "start-scan").ok)
+        self.asked.clear()
 
     def pump(self) -> None:
         """Let everything that is played by the test see to what has come."""

@@ -39,6 +39,7 @@ def control_states(component: Any) -> list[ControlState]:
 def test_a_request_reaches_the_translator_only_from_who_is_in_control(rig: Any) -> None:
     rig.start()
     one, two = rig.component("One"), rig.component("Two")
+    rig.linked(one)
     assert one.ask(ACTION, START).code == ControlResponse.NOT_IN_CONTROL
     assert one.ask(REQUEST, 0).ok
     assert two.ask(REQUEST, 0).code == ControlResponse.ALREADY_UNDER_CONTROL
@@ -88,6 +89,7 @@ def test_killed_and_restarted_it_knows_mode_holder_problems_and_cache_and_misses
     assert [payload for _, payload in late.packets("Scan2d")] == [scan(1), scan(2)]
     assert control_states(late)[-1] == before == ControlState(ControlMode.AUTOMATED, "Holder", (1,))
     assert late.ask(REQUEST, 1).code == ControlResponse.ALREADY_UNDER_CONTROL
+    rig.linked(holder)
     assert holder.ask(ACTION, START).ok
 
 
@@ -111,6 +113,7 @@ def test_while_the_translator_is_slow_everyone_else_is_served_and_its_late_reply
     rig.start()
     holder, other = rig.component("Holder"), rig.component("Other")
     assert holder.ask(REQUEST, 0).ok
+    rig.linked(holder)
     slow = holder.send(ACTION, "slow")
     rig.until(lambda: rig.asked)
     assert other.ask(FLAG, int(Problem.THERMAL_DRIFT)).ok
@@ -123,6 +126,7 @@ def test_without_a_translator_a_request_is_refused_at_once_and_it_goes_on_when_t
     rig.start()
     component = rig.component("Component")
     assert component.ask(REQUEST, 0).ok
+    rig.linked(component)
     assert component.ask(ACTION, START).ok
     rig.translator.close()
     rig.translator = None
@@ -182,6 +186,7 @@ def test_a_component_that_connects_anew_is_known_before_it_asks_with_a_key_of_it
     rig.start()
     component = rig.component("experiment")
     assert component.ask(ControlRequest.REQUEST_CTRL, 0).ok
+    rig.linked(component)
     rig.answer = lambda request: None
     key = component.send(ControlRequest.ACTION, "start-scan", "experiment/key/tile/1")
     rig.until(lambda: rig.asked)

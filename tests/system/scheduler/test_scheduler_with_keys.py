@@ -14,6 +14,7 @@ def test_with_keys_everything_works_as_without(locked_rig: Any) -> None:
     locked_rig.start()
     experiment = locked_rig.component("Experiment")
     assert experiment.ask(ControlRequest.REQUEST_CTRL, 0).ok
+    locked_rig.linked(experiment)
     assert experiment.ask(ControlRequest.ACTION, "start-scan").ok
     locked_rig.publish_packet(*encode(ScopeStatus(ScopeState.FREE)))
     locked_rig.until(lambda: experiment.packets("ScopeStateMsg"))
