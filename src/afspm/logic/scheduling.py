@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -49,6 +50,7 @@ from afspm.model import (
     Packet,
     PacketHeader,
     ProbePosition,
+    Request,
     Response,
     ScanParameters,
     ScopeStatus,
@@ -60,6 +62,7 @@ CONTROL_STATE = "ControlState"
 
 _TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
 """Messages from which we learn what the microscope is in. All others pass unread."""
+_MOST_HELD = 1000
 
 _CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): Event.REQUEST_CONTROL,
@@ -96,6 +99,9 @@ class SchedulerCore:
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
         self._started_s = 0.0
         self._announce_at_s: float | None = None
+        self._is_restarted = False
+        self._held: deque[RequestIn] = deque()
+        self._held_due_s: float | None = None
         self._recent: list[tuple[int, int]] = []
         self._missed_again_s = -math.inf
         self._told: set[str] = set()
@@ -134,6 +140,7 @@ class SchedulerCore:
         """Take in what happened; `now_s` is real and monotonic, `now_ns` the experiment's time."""
         self._effects = self._desk.effects = []
         self._handlers[type(event)](event, now_s, now_ns)
+        self._held_due_s = now_s if self._held and self._announce_at_s is None else None
         if self._forwarder.outbox:
             self._effects += self._forwarder.outbox
             self._forwarder.outbox.clear()
@@ -142,7 +149,8 @@ class SchedulerCore:
     def deadline_s(self) -> float | None:
         """When, in real monotonic time, a Tick is due at the latest; None: no deadline."""
         soonest_s = self._forwarder.deadline_s()
-        for deadline_s in (self._holder_dead_at_s(), self._announce_at_s, self._desk.unclear_until_s()):
+        others_s = (self._holder_dead_at_s(), self._announce_at_s, self._desk.unclear_until_s(), self._held_due_s)
+        for deadline_s in others_s:
             if deadline_s is not None and (soonest_s is None or deadline_s < soonest_s):
                 soonest_s = deadline_s
         return soonest_s
@@ -168,6 +176,7 @@ class SchedulerCore:
         Raises:
             KeyError, TypeError, ValueError: it is not what `snapshot` writes.
         """
+        self._is_restarted = True
         self._control = Control.from_dict(state["control"])
         self._cache.not_before(int(state["last_ns"]))
         self._watchdog.restore(map(str, state["wanted"]))
@@ -227,6 +236,9 @@ class SchedulerCore:
 
     def _on_request(self, event: RequestIn, now_s: float, now_ns: int) -> None:
         name, request = event.name, event.request
+        if self._is_too_early(request):
+            self._held.append(event)
+            return
         if not self._desk.take(event, now_s):
             return
         kind = request.kind
@@ -244,6 +256,12 @@ class SchedulerCore:
             self._arbitrate(Ask(Event.READ, name), event, now_s, now_ns)
         else:
             self._arbitrate(Ask(Event.COMMAND, name), event, now_s, now_ns)
+
+    def _is_too_early(self, request: Request) -> bool:
+        """Whether it would change control while what was published before a restart may still come again: that would
+        get a time after the change, and be taken for something new."""
+        catching_up = self._is_restarted and self._announce_at_s is not None
+        return catching_up and request.kind in _CONTROL_EVENTS and len(self._held) < _MOST_HELD
 
     def _tell_time(self, event: RequestIn, now_ns: int) -> None:
         """What time it is, and how it passes: all parts of an experiment go by the scheduler's clock."""
@@ -380,6 +398,9 @@ class SchedulerCore:
     def _on_tick(self, event: Tick, now_s: float, now_ns: int) -> None:
         if self._announce_at_s is not None and now_s >= self._announce_at_s:
             self._publish_control(now_ns)
+        elif self._held and self._announce_at_s is None:
+            self._on_request(self._held.popleft(), now_s, now_ns)  # one in a step: saved before the next is decided
+            return
         dead_at_s, holder = self._holder_dead_at_s(), self._control.holder
         if holder is not None and dead_at_s is not None and now_s >= dead_at_s:
             self._arbitrate(Ask(Event.DEAD, holder), None, now_s, now_ns)

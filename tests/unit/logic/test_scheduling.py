@@ -415,8 +415,33 @@ def test_killed_and_restarted_it_has_mode_problems_and_holder_back(lab: Lab) -> 
     lab.take_control("corrector", TIP)
     after = restarted(lab)
     assert after.core.control == lab.core.control
+    after.step(TranslatorCaughtUp())
     assert after.take_control("experiment") is ControlResponse.WRONG_EXP_PROBLEM
     assert after.clear("corrector", TIP) is OK
+    assert after.holder is None
+
+
+@pytest.mark.parametrize("translator", ["comes", "stays away"])
+def test_after_a_restart_control_changes_once_what_was_published_before_has_come_again(
+    lab: Lab, translator: str
+) -> None:
+    lab.take_control("experiment")
+    saved = json.loads(json.dumps(lab.core.snapshot()))
+    scan_ns = lab.now_ns + 5000  # published, and not written down any more when the scheduler was killed
+    (first,) = published(lab.publish("Scan2d", "a scan", scan_ns))
+    after = Lab(state=saved)
+    after.later(experiment_s=60.0)
+    assert replies(after.ask("experiment", ControlRequest.RELEASE_CTRL)) == []
+    assert after.holder == "experiment"
+    if translator == "comes":
+        (again,) = published(after.publish("Scan2d", "a scan", scan_ns))
+        assert again.time_ns == first.time_ns
+        after.step(TranslatorCaughtUp())
+    else:
+        after.later(1.0)
+        after.step(Tick())
+    assert after.core.deadline_s() == after.now_s
+    assert [reply.response.code for reply in replies(after.step(Tick()))] == [OK]
     assert after.holder is None
 
 
