@@ -44,6 +44,14 @@ def test_the_long_run_tells_what_it_did(capsys: pytest.CaptureFixture[str]) -> N
     assert "every invariant held" in capsys.readouterr().out
 
 
+def test_two_changes_of_control_at_the_end_of_an_outage_are_told_one_after_the_other() -> None:
+    """The scheduler comes back, says who is in control, and finds at the same moment that its lease has run out."""
+    faults = (Fault("outage", "scheduler", 0.6640625, 5.0), Fault("freeze", "scheduler", 0.84375, 5.0))
+    cast = tuple(CAST)
+    night = Plan(0, hours=2.0, speed=200.0, cast=cast, impostor=False, ids_known=False, lease_s=900.0)
+    Night(replace(night, faults=(*faults, Fault("cut", "scheduler", 0.0, 40.0)), dies_in_step=0.0, doubles=0.05)).run()
+
+
 _targets = st.sampled_from(["scheduler", "translator", *CAST])
 _faults = st.builds(
     Fault,

@@ -396,10 +396,12 @@ class SchedulerCore:
     # --- time ---
 
     def _on_tick(self, event: Tick, now_s: float, now_ns: int) -> None:
+        # one change of control in a step: it is saved and told before the next is decided
         if self._announce_at_s is not None and now_s >= self._announce_at_s:
             self._publish_control(now_ns)
-        elif self._held and self._announce_at_s is None:
-            self._on_request(self._held.popleft(), now_s, now_ns)  # one in a step: saved before the next is decided
+            return
+        if self._held and self._announce_at_s is None:
+            self._on_request(self._held.popleft(), now_s, now_ns)
             return
         dead_at_s, holder = self._holder_dead_at_s(), self._control.holder
         if holder is not None and dead_at_s is not None and now_s >= dead_at_s:
