@@ -31,12 +31,12 @@ def split(buffer: bytes | memoryview, field: int) -> tuple[bytes, list[memoryvie
     end, at, kept_from = len(view), 0, 0
     while at < end:
         start = at
-        tag, at = _varint(view, at)
+        tag, at = varint(view, at)
         wire_type = tag & 7
         if wire_type == _LENGTH:
-            length, at = _varint(view, at)
+            length, at = varint(view, at)
         elif wire_type == _VARINT:
-            _, stop = _varint(view, at)
+            _, stop = varint(view, at)
             length = stop - at
         elif wire_type == _FIXED64:
             length = 8
@@ -74,15 +74,15 @@ def doubles(chunks: list[memoryview]) -> NDArray[np.float64]:
 def packed(values: NDArray[np.float64], field: int) -> tuple[bytes, memoryview]:
     """An array as the field number `field`: its tag and length, and its values as bytes (a view where possible)."""
     data = np.ascontiguousarray(values, "<f8").reshape(-1).data.cast("B")
-    return bytes([field << 3 | _LENGTH]) + _as_varint(len(data)), data
+    return bytes([field << 3 | _LENGTH]) + as_varint(len(data)), data
 
 
 def nested(payload: bytes, field: int) -> bytes:
     """A serialised message as the field number `field` of another."""
-    return bytes([field << 3 | _LENGTH]) + _as_varint(len(payload)) + payload
+    return bytes([field << 3 | _LENGTH]) + as_varint(len(payload)) + payload
 
 
-def _varint(view: memoryview, at: int) -> tuple[int, int]:
+def varint(view: memoryview | bytes, at: int) -> tuple[int, int]:
     """The number at byte `at`, and where the next thing begins."""
     value = shift = 0
     end = len(view)
@@ -96,7 +96,8 @@ def _varint(view: memoryview, at: int) -> tuple[int, int]:
     raise WireError("the message breaks off in a number")
 
 
-def _as_varint(value: int) -> bytes:
+def as_varint(value: int) -> bytes:
+    """A number that is not negative, as it stands in a message."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)

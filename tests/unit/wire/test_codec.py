@@ -7,6 +7,8 @@ import contextlib
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
+from google.protobuf.timestamp_pb2 import Timestamp
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,7 +30,7 @@ from afspm.model import (
     ShapeChange,
     Spectrum,
 )
-from afspm.wire.frames import encode_subject
+from afspm.wire.frames import decode_time, encode_subject, encode_time
 
 SCAN = Scan(
     Region((1e-6, -2e-6), (2e-6, 1e-6), 0.25), "Height", "m", np.arange(12.0).reshape(3, 4), 1_700_000_000_000_000_001
@@ -187,6 +189,24 @@ def test_users_may_add_a_message_type() -> None:
 def test_what_is_no_message_cannot_be_sent() -> None:
     with pytest.raises(InvalidValue, match="dict"):
         wire.encode({})
+
+
+@given(st.integers(-(10**18), 10**19))
+def test_a_time_is_the_timestamp_that_the_library_makes(time_ns: int) -> None:
+    library = Timestamp(seconds=time_ns // 10**9, nanos=time_ns % 10**9).SerializeToString(deterministic=True)
+    assert encode_time(time_ns) == library
+    assert decode_time(library) == decode_time(memoryview(library)) == time_ns
+
+
+@given(st.binary(max_size=24))
+def test_any_bytes_are_the_time_that_the_library_reads_or_a_wire_error(data: bytes) -> None:
+    try:
+        read = decode_time(data)
+    except WireError:
+        return
+    with contextlib.suppress(DecodeError):
+        library = Timestamp.FromString(data)
+        assert read == library.seconds * 10**9 + library.nanos
 
 
 @given(st.binary(max_size=300))
