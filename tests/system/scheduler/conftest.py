@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import zmq
 
 from afspm import wire
 from afspm.clock import ExperimentClock
@@ -181,20 +180,3 @@ def locked_rig(tmp_path: Path) -> Iterator[Rig]:
     made = Rig(tmp_path, tmp_path / "keys")
     yield made
     made.close()
-
-
-@pytest.fixture
-def plain() -> Iterator[Callable[..., Any]]:
-    """`plain(zmq.SUB)`: a socket as a peer of version 1 has it, with nothing of ours."""
-    context: zmq.Context[Any] = zmq.Context()
-    sockets = []
-
-    def socket(kind: int) -> Any:
-        made = context.socket(kind)
-        made.setsockopt(zmq.LINGER, 0)
-        made.setsockopt(zmq.RCVTIMEO, 10_000)
-        sockets.append(made)
-        return made
-
-    yield socket
-    context.destroy(linger=0)

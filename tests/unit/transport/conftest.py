@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from typing import Any
 
 import pytest
-import zmq
 
 
 @pytest.fixture
@@ -21,23 +20,6 @@ def open_() -> Iterator[Callable[[Any], Any]]:
             return thing
 
         yield opened
-
-
-@pytest.fixture
-def plain() -> Iterator[Callable[..., Any]]:
-    """`plain(zmq.SUB)`: a socket as a peer of version 1 has it, with nothing of ours."""
-    context: zmq.Context[Any] = zmq.Context()
-    sockets = []
-
-    def socket(kind: int) -> Any:
-        made = context.socket(kind)
-        made.setsockopt(zmq.LINGER, 0)
-        made.setsockopt(zmq.RCVTIMEO, 5000)
-        sockets.append(made)
-        return made
-
-    yield socket
-    context.destroy(linger=0)
 
 
 @pytest.fixture
