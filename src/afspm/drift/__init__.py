@@ -1,0 +1,8 @@
+"""Drift, pure: register two scans, track over time, map between tip and sample coordinates.
+
+The sign, once and for all: drift D(t) is the displacement of the sample under the tip since the start, so a feature at
+`x_sample` is found at `x_tip = x_sample + D(t)`; the mapping M_tot from tip to sample coordinates is the translation by
+-D(t) (paper, "Drift Correction Algorithm").
+"""
+
+from __future__ import annotations

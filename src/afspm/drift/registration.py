@@ -1,0 +1,141 @@
+"""What is registered, and what comes of it: the one interface of all estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+from afspm.model import Region
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DriftScan:
+    """One channel of a scan as drift sees it.
+
+    Attributes:
+        values: [y, x], both ascending; NaN where nothing was measured.
+        region: in tip coordinates. Its first and last pixels lie on its border.
+        start_s, end_s: experiment time of its first and last row.
+        upwards: whether small y was scanned first; None: not known.
+        key: by which the caller knows it again.
+    """
+
+    values: Array
+    region: Region
+    start_s: float
+    end_s: float
+    upwards: bool | None = None
+    key: str = ""
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or min(self.values.shape) < 2:
+            raise InvalidValue(f"a scan of shape {self.values.shape} can't be registered", hint="2 x 2 pixels at least")
+        if not (np.isfinite((self.start_s, self.end_s)).all() and self.end_s >= self.start_s):
+            raise InvalidValue(f"a scan from {self.start_s} s to {self.end_s} s can't be")
+
+    @property
+    def mid_s(self) -> float:
+        """The time that its position stands for."""
+        return (self.start_s + self.end_s) / 2
+
+    @property
+    def duration_s(self) -> float:
+        return self.end_s - self.start_s
+
+    @property
+    def pixel_m(self) -> tuple[float, float]:
+        """Distance of pixels (x, y)."""
+        ny, nx = self.values.shape
+        return (self.region.size_m[0] / (nx - 1), self.region.size_m[1] / (ny - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known of a displacement before the scans are looked at.
+
+    Attributes:
+        mean_m: (2,) expected displacement.
+        covariance_m2: (2, 2) of it.
+        velocity_difference_m_s: (2,) expected drift velocity during the scan minus that during the reference: it shears
+            one against the other.
+        velocity_sd_m_s: standard deviation of each component of it; None: not known, so any shear is possible.
+    """
+
+    mean_m: Array
+    covariance_m2: Array
+    velocity_difference_m_s: Array = field(default_factory=lambda: np.zeros(2))
+    velocity_sd_m_s: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Feature pairs, for those who draw them. Positions (n, 2) are (x, y) in tip coordinates, m.
+
+    Attributes:
+        inlier: (n,) whether the estimate rests on the pair.
+    """
+
+    reference_m: Array
+    scan_m: Array
+    inlier: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A feature at `x` of the reference is found at `x + displacement_m + linear @ (x - center_m)` in the scan, both in
+    tip coordinates.
+
+    Attributes:
+        accepted: whether it may be used; if not, the numbers are the best guess, or NaN where there is none.
+        reason: why it was refused, for a person; empty if it was accepted.
+        displacement_m: (2,) at `center_m`.
+        covariance_m2: (2, 2) of it.
+        linear: (2, 2) what rotation, scale and shear there is besides, zero for a pure translation.
+        center_m: (2,) where the displacement holds, in tip coordinates of the reference: the middle of the overlap.
+        quality: figures of merit by name (overlap, correlation, …), for a person and for studies.
+        matches: of estimators that match features.
+    """
+
+    accepted: bool
+    reason: str
+    displacement_m: Array
+    covariance_m2: Array
+    linear: Array
+    center_m: Array
+    quality: Table[str, float] = field(default_factory=dict)
+    matches: Matches | None = None
+
+    @classmethod
+    def refused(cls, reason: str, quality: Table[str, float] | None = None) -> Registration:
+        """Nothing could be estimated."""
+        none, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
+        return cls(
+            accepted=False,
+            reason=reason,
+            displacement_m=none,
+            covariance_m2=unknown,
+            linear=np.zeros((2, 2)),
+            center_m=none,
+            quality=quality or {},
+        )
+
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation of the displacement along the axis where it is largest."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2)[-1]))
+
+
+class Estimator(Protocol):
+    """Registers two scans of the same channel. It keeps nothing from call to call."""
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        """Where the features of `reference` are in `scan`. Never raises for what is in the scans: what can't be
+        registered (nothing measured, constant, no common features, ambiguous) is refused with the reason."""
+        ...

@@ -1,0 +1,98 @@
+"""What a tracker says and is told: the one interface of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.mapping import Mapping
+from afspm.drift.registration import DriftScan, Registration
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where sample coordinates lie at one time.
+
+    Attributes:
+        time_s: experiment time.
+        mapping: from tip to sample coordinates.
+        covariance_m2: (2, 2) of the translation of the mapping.
+        rate_m_s: (2,) velocity of the sample in tip coordinates.
+        rate_covariance: (2, 2) of it, (m/s)².
+    """
+
+    time_s: float
+    mapping: Mapping
+    covariance_m2: Array
+    rate_m_s: Array
+    rate_covariance: Array
+
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation of a position along the axis where it is largest."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance_m2)[-1], 0.0)))
+
+
+class Forecast(Protocol):
+    """What a tracker knows, for whoever asks it at other times: small, immutable, JSON-able, without the scans."""
+
+    def at(self, time_s: float) -> Prediction:
+        """The prediction for any time (before the newest scan too: the estimate for the newest scan, moved back)."""
+        ...
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain JSON, for `forecast_from_dict`."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What came of one scan.
+
+    Attributes:
+        key: the scan's.
+        before: what had been predicted for the middle of the scan.
+        after: what is known now of the same time.
+        matched: whether any reference could be registered with it (the first scan of all counts as matched).
+        reason: why not, for a person.
+        lost: the tracker does not know any more where it is.
+        registrations: by the key of the reference.
+        forecast: of what is known now.
+    """
+
+    key: str
+    before: Prediction
+    after: Prediction
+    matched: bool
+    reason: str
+    lost: bool
+    registrations: Table[str, Registration]
+    forecast: Forecast
+    quality: Table[str, float] = field(default_factory=dict)
+
+
+class Tracker(Protocol):
+    """Follows the drift from scan to scan. Deterministic: the same scans give the same numbers."""
+
+    @property
+    def forecast(self) -> Forecast:
+        """What is known now."""
+        ...
+
+    def add(self, scan: DriftScan) -> Update:
+        """Take a scan in (in the order of time; one that is older than the newest is refused with InvalidValue)."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """All that must survive a kill: numbers, texts, lists and dicts of JSON, and numpy arrays."""
+        ...
+
+    def restore(self, state: Table[str, Any]) -> None:
+        """Take up what `state` gave."""
+        ...
