@@ -45,6 +45,9 @@ class ZmqServerPort:
         self._published = Published(clock)
         self._publisher = None if publish is None else Publisher(network, publish, self._published)
         self._socket = network.socket(zmq.ROUTER)
+        # A name belongs to its newest connection, else who connects anew before the old connection is found dead is
+        # never heard. And what it says is never freed: the library keeps the queues of those that it does not hear.
+        self._socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
         self.serve_address = network.bind(self._socket, serve)
         self._poller = poller(self._wake_up)
         self._poller.register(self._socket, self._request, self)

@@ -42,6 +42,18 @@ def test_a_plain_req_socket_asks_our_server(open_: Any, plain: Any, until: Any) 
         assert requester.recv_multipart() == response
 
 
+def test_a_name_that_is_in_use_is_heard_by_its_newest_connection(open_: Any, plain: Any, until: Any) -> None:
+    server = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None))
+    for _ in range(3):  # of which none is closed: who crashed with its computer is not found dead for seconds
+        requester, asked = plain(zmq.REQ), []
+        requester.setsockopt(zmq.ROUTING_ID, b"scheduler")
+        requester.connect(server.serve_address)
+        requester.send_multipart(REQUESTS[0])
+        until(lambda asked=asked: asked, (server, asked))
+        server.reply(RESPONSES[0])
+        assert requester.recv_multipart() == RESPONSES[0]
+
+
 def test_our_component_asks_a_plain_router(open_: Any, plain: Any, until: Any) -> None:
     router, found = plain(zmq.ROUTER), []
     port = open_(ZmqPort(Network(), "Component", CLOCK, control=random_port(router)))
