@@ -1,0 +1,61 @@
+"""Around any estimator: whatever goes wrong in it is a refusal with the reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from afspm.drift.registration import DriftScan, Estimator, Prior, Registration
+
+
+class Guarded:
+    """Runs an estimator so that nobody else needs to be careful.
+
+    An exception, a result that is none, of wrong shapes, or accepted with values that can't be, comes out as refused.
+    The estimator gets copies: what it does to them can't reach those who compare the same scans later.
+    """
+
+    def __init__(self, inner: Estimator, name: str) -> None:
+        self.inner = inner
+        self.name = name
+
+    def __repr__(self) -> str:
+        return f"<estimator {self.name}: {self.inner!r}>"
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        """See `Estimator`."""
+        try:
+            found = self.inner.register(_copied(reference), _copied(scan), prior)
+        except Exception as error:  # anybody's code may stumble in any way
+            return Registration.refused(f"{self.name} failed: {type(error).__name__}: {error}")
+        wrong = _wrong(found)
+        return Registration.refused(f"{self.name} failed: {wrong}") if wrong else found
+
+
+def _copied(scan: DriftScan) -> DriftScan:
+    return replace(scan, values=np.array(scan.values, dtype=np.float64))
+
+
+def _wrong(found: object) -> str:
+    """What makes a result unusable; empty for nothing."""
+    if not isinstance(found, Registration):
+        return f"its result is a {type(found).__name__} and no Registration"
+    arrays = {
+        "displacement_m": (found.displacement_m, (2,)),
+        "covariance_m2": (found.covariance_m2, (2, 2)),
+        "linear": (found.linear, (2, 2)),
+        "center_m": (found.center_m, (2,)),
+    }
+    for name, (value, shape) in arrays.items():
+        if not (isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.shape == shape):
+            return f"{name} is no array of floats of shape {shape}: {value!r}"
+        if found.accepted and not np.isfinite(value).all():
+            return f"accepted with {name} = {value.tolist()}"
+    if not found.accepted:
+        return "" if found.reason else "refused without a reason"
+    covariance = found.covariance_m2
+    largest = np.abs(covariance).max()
+    if np.abs(covariance - covariance.T).max() > 1e-6 * largest or np.linalg.eigvalsh(covariance)[0] <= 0.0:
+        return f"accepted with a covariance that can't be: {covariance.tolist()}"
+    return ""

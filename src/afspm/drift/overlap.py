@@ -1,0 +1,120 @@
+"""Which pairs of scans can be compared: how much their regions share, and how alike their resolutions are (paper,
+"Overarching workflow": intersection_ratio and sr_norm)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from afspm.errors import InvalidValue
+from afspm.model import Region
+
+Array = NDArray[np.float64]
+
+
+def intersection_m(first: Region, second: Region) -> Array:
+    """The polygon that two turned rectangles share.
+
+    Clips one against each side of the other (Sutherland and Hodgman 1974), which is exact for convex ones.
+
+    Returns:
+        Its corners (n, 2), counter-clockwise; none where at most a border is shared.
+
+    Raises:
+        InvalidValue: they are in different frames.
+    """
+    if first.frame is not second.frame:
+        raise InvalidValue(f"a region in {first.frame.value} and one in {second.frame.value} coordinates can't overlap")
+    # About one centre, in units of one size: far from the origin the digits of the corners would be used up.
+    origin, unit = np.array(first.center_m), max(*first.size_m, *second.size_m)
+    polygon = (first.corners_m() - origin) / unit
+    sides = (second.corners_m() - origin) / unit
+    for start, end in zip(sides, np.roll(sides, -1, axis=0), strict=True):
+        polygon = _clipped(polygon, start, end)
+    return polygon * unit + origin if _area(polygon) > 0.0 else np.empty((0, 2))
+
+
+def intersection_area_m2(first: Region, second: Region) -> float:
+    """How much two regions share, m². Raises InvalidValue as `intersection_m` does."""
+    polygon = intersection_m(first, second)
+    return _area(polygon - polygon[0]) if len(polygon) else 0.0
+
+
+def intersection_ratio(first: Region, second: Region) -> float:
+    """What two regions share, of the smaller of them: 0 to 1. Raises InvalidValue as `intersection_m` does."""
+    smaller_m2 = min(region.size_m[0] * region.size_m[1] for region in (first, second))
+    return min(intersection_area_m2(first, second) / smaller_m2, 1.0)
+
+
+def intersection_center_m(first: Region, second: Region) -> Array | None:
+    """The centre of mass (2,) of what two regions share, None where they share nothing. Raises InvalidValue as
+    `intersection_m` does."""
+    polygon = intersection_m(first, second)
+    if not len(polygon):
+        return None
+    corners = polygon - polygon[0]
+    after = np.roll(corners, -1, axis=0)
+    twice = corners[:, 0] * after[:, 1] - after[:, 0] * corners[:, 1]
+    center: Array = ((corners + after) * twice[:, None]).sum(axis=0) / (3.0 * twice.sum()) + polygon[0]
+    return center
+
+
+def overlap_center_m(reference: Region, scan: Region, displacement_m: ArrayLike) -> Array | None:
+    """The middle (2,) of what both have seen if features of the reference are found `displacement_m` further in the
+    scan; in the coordinates of the reference. None where that is nothing. Raises InvalidValue as `intersection_m`."""
+    x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
+    center = intersection_center_m(_moved(reference, x_m, y_m), scan)
+    return None if center is None else center - (x_m, y_m)
+
+
+def overlap_ratio(reference: Region, scan: Region, displacement_m: ArrayLike) -> float:
+    """How much of the smaller one both have seen, if features of the reference are found `displacement_m` further in
+    the scan: 0 to 1. Raises InvalidValue as `intersection_m` does."""
+    x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
+    return intersection_ratio(_moved(reference, x_m, y_m), scan)
+
+
+def sr_norm(first: Region, first_shape: tuple[int, int], second: Region, second_shape: tuple[int, int]) -> float:
+    """How alike two spatial resolutions are: min/max of pixels per length, of the axis where they differ most.
+
+    A pair is good enough where this is at least sr_norm,min (the paper's "<=" is reversed).
+
+    Args:
+        first_shape, second_shape: pixels (ny, nx).
+
+    Returns:
+        Above 0, and 1 for the same.
+    """
+    per_m = [
+        np.array([nx / region.size_m[0], ny / region.size_m[1]])
+        for region, (ny, nx) in ((first, first_shape), (second, second_shape))
+    ]
+    return float((np.minimum(*per_m) / np.maximum(*per_m)).min())
+
+
+def _moved(region: Region, x_m: float, y_m: float) -> Region:
+    return region.moved_to((region.center_m[0] + x_m, region.center_m[1] + y_m))
+
+
+def _clipped(polygon: Array, start: Array, end: Array) -> Array:
+    """What of a polygon lies left of the line from `start` to `end`."""
+    if not len(polygon):
+        return polygon
+    along = end - start
+    left = along[0] * (polygon[:, 1] - start[1]) - along[1] * (polygon[:, 0] - start[0])
+    kept = []
+    for corner, side, before, side_before in zip(
+        polygon, left, np.roll(polygon, 1, axis=0), np.roll(left, 1), strict=True
+    ):
+        if side * side_before < 0.0:
+            kept.append(before + (corner - before) * (side_before / (side_before - side)))
+        if side >= 0.0:
+            kept.append(corner)
+    return np.array(kept) if kept else np.empty((0, 2))
+
+
+def _area(polygon: Array) -> float:
+    if len(polygon) < 3:
+        return 0.0
+    x, y = polygon.T
+    return max(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2, 0.0)

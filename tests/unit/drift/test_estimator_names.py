@@ -1,0 +1,125 @@
+"""Estimators by name, users' own, and that none of them can do harm."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from afspm.drift.estimators import READY_MADE, Guarded, estimator
+from afspm.drift.registration import DriftScan, Prior, Registration
+from afspm.errors import ConfigError
+from afspm.model import Region
+
+FOUND = Registration(
+    accepted=True,
+    reason="",
+    displacement_m=np.array([1e-9, 2e-9]),
+    covariance_m2=np.eye(2) * 1e-20,
+    linear=np.zeros((2, 2)),
+    center_m=np.zeros(2),
+)
+
+
+class Told:
+    """An estimator that says what it was told to."""
+
+    def __init__(self, answer: Any = FOUND, gain: float = 1.0) -> None:
+        if gain < 0.0:
+            raise ValueError("the gain is negative")
+        self.answer = answer
+        self.gain = gain
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Any:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        reference.values[:] = 0.0
+        return self.answer
+
+
+def a_scan() -> DriftScan:
+    return DriftScan(np.ones((4, 5)), Region((0, 0), (1e-6, 1e-6)), 0.0, 1.0)
+
+
+def said(answer: Any) -> Registration:
+    return estimator(Told(answer)).register(a_scan(), a_scan())
+
+
+def test_what_is_right_passes_untouched() -> None:
+    assert said(FOUND) is FOUND
+    refused = Registration.refused("nothing in common")
+    assert said(refused) is refused
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        (ZeroDivisionError("oh"), "ZeroDivisionError: oh"),
+        (MemoryError(), "MemoryError"),
+        (None, "NoneType"),
+        (replace(FOUND, displacement_m=np.array([np.nan, 0.0])), "displacement_m"),
+        (replace(FOUND, center_m=np.array([np.inf, 0.0])), "center_m"),
+        (replace(FOUND, displacement_m=np.zeros(3)), "shape"),
+        (replace(FOUND, linear=(0, 0)), "linear"),
+        (replace(FOUND, covariance_m2=np.zeros((2, 2))), "covariance"),
+        (replace(FOUND, covariance_m2=np.diag([1e-20, -1e-20])), "covariance"),
+        (replace(FOUND, covariance_m2=np.array([[1e-20, 9e-21], [0.0, 1e-20]])), "covariance"),
+        (replace(Registration.refused("x"), reason=""), "without a reason"),
+    ],
+)
+def test_what_an_estimator_gets_wrong_is_refused_with_the_reason(answer: Any, reason: str) -> None:
+    found = said(answer)
+    assert not found.accepted
+    assert "Told" in found.reason
+    assert reason in found.reason
+
+
+def test_an_estimator_can_not_change_the_scans_it_is_given() -> None:
+    reference = a_scan()
+    estimator(Told()).register(reference, a_scan())
+    assert (reference.values == 1.0).all()
+
+
+def test_a_users_own_is_named_by_its_class_and_gets_its_settings() -> None:
+    made = estimator({"class": f"{__name__}.Told", "gain": 3.0})
+    assert isinstance(made, Guarded)
+    assert isinstance(made.inner, Told)
+    assert made.inner.gain == 3.0
+    assert isinstance(estimator(f"{__name__}.Told"), Guarded)
+    assert estimator(made) is made
+
+
+@pytest.mark.parametrize(
+    ("spec", "says"),
+    [
+        ("breif", "did you mean 'brief'"),
+        ("Least-Squares", "did you mean 'least-squares'"),
+        ("zzz", "least-squares, brief, orb, sift, correlation"),
+        ({"class": 3}, "text"),
+        ({"class": f"{__name__}.Tolt"}, "did you mean 'Told'"),
+        ({"class": "no_such_module.Thing"}, "is it installed"),
+        ({"class": f"{__name__}.Told", "gian": 1.0}, "did you mean 'gain'"),
+        ({"class": f"{__name__}.Told", "gain": -1.0}, "the gain is negative"),
+        ({"class": "pathlib.PurePath"}, "is no estimator"),
+        (object(), "is no estimator"),
+    ],
+)
+def test_what_is_not_there_is_refused_with_what_is(spec: Any, says: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        estimator(spec)
+    assert says in str(refused.value)
+
+
+def test_a_missing_library_is_told_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "skimage" else real(name))
+    with pytest.raises(ConfigError) as refused:
+        estimator("sift")
+    assert 'pip install "afspm[features]"' in str(refused.value)
+
+
+def test_every_name_brings_its_library_by_an_extra() -> None:
+    assert {entry.extra for entry in READY_MADE.values()} == {"drift", "features"}
