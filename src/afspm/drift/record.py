@@ -1,0 +1,144 @@
+"""The table of a run: what drift did, scan by scan. Made by on-line runs and off-line analysis alike, kept as CSV."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.registration import DriftScan
+from afspm.drift.tracking import Update
+from afspm.errors import FileError
+
+Array = NDArray[np.float64]
+
+COLUMNS = (
+    "scan", "time_s", "center_x_m", "center_y_m", "drift_x_m", "drift_y_m", "var_x_m2", "var_y_m2", "cov_xy_m2",
+    "rate_x_m_s", "rate_y_m_s", "matched", "reason",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class DriftRecord:
+    """n scans in the order of time; positions in tip coordinates.
+
+    Attributes:
+        keys: the name of each scan.
+        time_s: (n,) middle of each scan.
+        center_m: (n, 2) centre of its region.
+        drift_m: (n, 2) displacement of the sample under the tip since the start, known after the scan.
+        covariance_m2: (n, 2, 2) of it.
+        rate_m_s: (n, 2) velocity of the sample then.
+        matched: (n,) whether the scan could be registered; where not, the drift is predicted.
+        reasons: why it could not, for a person.
+    """
+
+    keys: tuple[str, ...]
+    time_s: Array
+    center_m: Array
+    drift_m: Array
+    covariance_m2: Array
+    rate_m_s: Array
+    matched: NDArray[np.bool_]
+    reasons: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __getitem__(self, part: slice) -> DriftRecord:
+        """Some of the scans."""
+        return DriftRecord(
+            self.keys[part], self.time_s[part], self.center_m[part], self.drift_m[part], self.covariance_m2[part],
+            self.rate_m_s[part], self.matched[part], self.reasons[part],
+        )  # fmt: skip
+
+    @property
+    def sd_m(self) -> Array:
+        """(n, 2) standard deviations of x and y of the drift."""
+        return np.sqrt(np.diagonal(self.covariance_m2, axis1=1, axis2=2))
+
+    @property
+    def misplacement_m(self) -> Array:
+        """(n, 2) by how much the features lie elsewhere in a scan than in the first: what correction left over."""
+        followed = self.center_m - self.center_m[:1]
+        misplaced: Array = self.drift_m - self.drift_m[:1] - followed
+        return misplaced
+
+    @classmethod
+    def of(cls, scans: Sequence[DriftScan], updates: Sequence[Update]) -> DriftRecord:
+        """From what a tracker said of each scan."""
+        after = [update.after for update in updates]
+        return cls(
+            keys=tuple(scan.key for scan in scans),
+            time_s=np.array([scan.mid_s for scan in scans]),
+            center_m=np.array([scan.region.center_m for scan in scans]).reshape(-1, 2),
+            drift_m=np.array(
+                [drift_at(one.mapping.matrix, scan.region.center_m) for one, scan in zip(after, scans, strict=True)]
+            ).reshape(-1, 2),
+            covariance_m2=np.array([one.covariance_m2 for one in after]).reshape(-1, 2, 2),
+            rate_m_s=np.array([one.rate_m_s for one in after]).reshape(-1, 2),
+            matched=np.array([update.matched for update in updates], dtype=bool),
+            reasons=tuple(update.reason for update in updates),
+        )
+
+    def write(self, path: Path) -> None:
+        """As CSV, in SI units.
+
+        Raises:
+            FileError: it can't be written.
+        """
+        try:
+            with path.open("w", newline="", encoding="utf-8") as file:
+                table = csv.writer(file)
+                table.writerow(COLUMNS)
+                table.writerows(self._rows())
+        except OSError as error:
+            raise FileError(f"can't be written: {error}", where=str(path)) from error
+
+    def _rows(self) -> Iterable[list[str]]:
+        for k, key in enumerate(self.keys):
+            (xx, xy), (_, yy) = self.covariance_m2[k]
+            numbers = (*self.center_m[k], *self.drift_m[k], xx, yy, xy, *self.rate_m_s[k])
+            told = [f"{self.time_s[k]:.6f}", *(f"{number:.9g}" for number in numbers)]
+            yield [key, *told, "yes" if self.matched[k] else "no", self.reasons[k]]
+
+    @classmethod
+    def read(cls, path: Path) -> DriftRecord:
+        """What `write` wrote; further columns are left aside.
+
+        Raises:
+            FileError: missing, or not such a table.
+        """
+        try:
+            with path.open(newline="", encoding="utf-8") as file:
+                rows = list(csv.DictReader(file))
+        except OSError as error:
+            raise FileError(f"can't be read: {error}", where=str(path)) from error
+
+        def numbers(*names: str) -> Array:
+            return np.array([[float(row[name]) for name in names] for row in rows]).reshape(-1, len(names))
+
+        try:
+            return cls(
+                keys=tuple(row["scan"] for row in rows),
+                time_s=numbers("time_s")[:, 0],
+                center_m=numbers("center_x_m", "center_y_m"),
+                drift_m=numbers("drift_x_m", "drift_y_m"),
+                covariance_m2=numbers("var_x_m2", "cov_xy_m2", "cov_xy_m2", "var_y_m2").reshape(-1, 2, 2),
+                rate_m_s=numbers("rate_x_m_s", "rate_y_m_s"),
+                matched=np.array([row["matched"] == "yes" for row in rows], dtype=bool),
+                reasons=tuple(row["reason"] for row in rows),
+            )
+        except (KeyError, ValueError, TypeError) as error:
+            raise FileError(f"is not a table of drift: {error}", where=str(path)) from error
+
+
+def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
+    """(2,) by how much the sample is displaced where the tip is: x_tip - x_sample."""
+    at = np.asarray(center_m, dtype=np.float64)
+    drift: Array = at - (matrix[:2, :2] @ at + matrix[:2, 2])
+    return drift
