@@ -1,0 +1,110 @@
+"""What the microscope does to an image: named mixtures of noise, drift and what else happens between two scans.
+
+Noise is in units of the standard deviation of the image without any.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """How two scans are taken.
+
+    Attributes:
+        white: noise of each pixel by itself.
+        row_offset: offset of each row by itself.
+        one_over_f: noise of the whole scan as a time series, power as 1 / frequency.
+        scars: share of the rows with a stretch where something disturbs the tip.
+        tilt: up to this much rise over the image.
+        flatten: the straight line fitted to each row is taken away (Flatten1).
+        gain: the contrast of the second scan lies between 1 / gain and gain.
+        bend: contrast is not linear: up to this much of z² / 2 is added to z.
+        drift_px: standard deviation of each component of the drift during a scan; scans are independent of each other.
+        rotation_deg: the second scan is turned by up to this much.
+        overlap: least and most.
+        second_tip_px: distance of a second apex that the second scan has.
+        elsewhere: the scans show two places of the sample that have nothing in common.
+    """
+
+    white: float
+    row_offset: float = 0.0
+    one_over_f: float = 0.0
+    scars: float = 0.0
+    tilt: float = 0.0
+    flatten: bool = False
+    gain: float = 1.0
+    bend: float = 0.0
+    drift_px: float = 0.0
+    rotation_deg: float = 0.0
+    overlap: tuple[float, float] = (0.8, 1.0)
+    second_tip_px: float = 0.0
+    elsewhere: bool = False
+
+
+_REAL = {
+    "white": 1 / 20, "row_offset": 0.2, "one_over_f": 0.15, "scars": 0.02, "tilt": 1.0, "flatten": True, "gain": 1.1,
+    "drift_px": 0.7, "overlap": (0.75, 1.0),
+}  # fmt: skip
+_HARD = {
+    "white": 1 / 10, "row_offset": 0.5, "one_over_f": 0.3, "scars": 0.06, "tilt": 1.0, "flatten": True, "gain": 1.7,
+    "bend": 0.2, "drift_px": 1.4, "rotation_deg": 1.0, "overlap": (0.5, 0.7),
+}  # fmt: skip
+
+CONDITIONS: dict[str, Condition] = {
+    "white100": Condition(1 / 100),
+    "white30": Condition(1 / 30),
+    "white10": Condition(1 / 10),
+    "white3": Condition(1 / 3),
+    "flat30": Condition(1 / 30, row_offset=0.3, tilt=1.0, flatten=True),
+    "real": Condition(**_REAL),  # type: ignore[arg-type]
+    "hard": Condition(**_HARD),  # type: ignore[arg-type]
+    "dtip": Condition(**_REAL, second_tip_px=2.5),  # type: ignore[arg-type]
+    "null": Condition(**_REAL, elsewhere=True),  # type: ignore[arg-type]
+    "nullh": Condition(**_HARD, elsewhere=True),  # type: ignore[arg-type]
+}
+
+
+def measured(image: Array, condition: Condition, random: np.random.Generator, gain: float = 1.0) -> Array:
+    """An image, [y, x] of unit rms, as the microscope gives it."""
+    ny, nx = image.shape
+    bend = condition.bend * random.uniform(-1.0, 1.0)
+    level = image - image.mean()
+    seen = gain * (level + bend / 2 * level**2)
+    seen += condition.white * random.standard_normal(image.shape)
+    seen += condition.row_offset * random.standard_normal((ny, 1))
+    if condition.one_over_f:
+        seen += condition.one_over_f * _one_over_f(ny * nx * 2, random).reshape(ny, 2 * nx)[:, :nx]
+    for row in np.flatnonzero(np.less(random.random(ny), condition.scars)):
+        start, length = random.integers(nx), 1 + int(random.exponential(0.4 * nx))
+        seen[row, start : start + length] += random.choice((-1.0, 1.0)) * abs(random.normal(1.0, 0.4))
+    slope = condition.tilt * random.uniform(-1.0, 1.0, 2)
+    seen += slope[0] * np.linspace(-0.5, 0.5, nx) + slope[1] * np.linspace(-0.5, 0.5, ny)[:, None]
+    return flattened(seen) if condition.flatten else seen
+
+
+def flattened(image: Array) -> Array:
+    """Each row less the straight line fitted to it (Flatten1)."""
+    x = np.linspace(-1.0, 1.0, image.shape[1])
+    level = image - image.mean(axis=1, keepdims=True)
+    return np.asarray(level - np.outer(level @ x / (x @ x), x))
+
+
+def one_over_f_power(count: int) -> Array:
+    """Variance that each frequency k / count, k from 1 to count / 2, brings to a series of unit variance."""
+    k = np.arange(1, count // 2 + 1)
+    return np.asarray(1 / k / np.sum(1 / k))
+
+
+def _one_over_f(count: int, random: np.random.Generator) -> Array:
+    """A time series of even length, unit rms on average, zero mean and a power spectrum as 1 / frequency."""
+    amplitude = np.sqrt(one_over_f_power(count)) * count / 2
+    spectrum = np.zeros(count // 2 + 1, dtype=np.complex128)
+    spectrum[1:] = amplitude * (random.standard_normal(count // 2) + 1j * random.standard_normal(count // 2))
+    return np.asarray(np.fft.irfft(spectrum, count))

@@ -1,0 +1,249 @@
+"""Pairs of scans whose drift is known exactly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+from afspm.drift.registration import DriftScan, Prior
+from afspm.model import Region
+from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured
+from benchmarks.drift.surfaces import SURFACES, Grid, imaged
+
+PIXEL_M = 2e-6 / 128
+HEIGHT_M = 5e-9  # rms of the images
+ROW_S = 2.0
+MARGIN_PX = 4.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How one scan lies on the sample: pixel offsets `q` from its middle show the sample at `origin + matrix @ q`.
+
+    All in standard pixels.
+    """
+
+    shape: tuple[int, int]
+    step_px: tuple[float, float]
+    origin_px: Array
+    matrix: Array
+
+    @property
+    def width_px(self) -> Array:
+        """(x, y) from the first to the last pixel."""
+        ny, nx = self.shape
+        return np.array([(nx - 1) * self.step_px[0], (ny - 1) * self.step_px[1]])
+
+    def offsets_px(self) -> Array:
+        """q of all pixels, shape (2, ny, nx)."""
+        ny, nx = self.shape
+        x = (np.arange(nx) - (nx - 1) / 2) * self.step_px[0]
+        y = (np.arange(ny) - (ny - 1) / 2) * self.step_px[1]
+        return np.stack(np.meshgrid(x, y))
+
+    def sample_px(self, q_px: Array) -> Array:
+        """Where in the sample offsets, shape (2, …), lie."""
+        middle: Array = self.origin_px.reshape(2, *[1] * (q_px.ndim - 1))
+        moved: Array = middle + np.einsum("ij,j...->i...", self.matrix, q_px)
+        return moved
+
+
+@dataclass(frozen=True)
+class View:
+    """A tip's image of a sample, wherever one wants to know it (cubic B-spline on a fine grid)."""
+
+    grid: Grid
+    coefficients: Array
+
+    @classmethod
+    def of(cls, grid: Grid, image: Array) -> View:
+        return cls(grid, ndimage.spline_filter(image, order=3, mode="nearest"))
+
+    def at(self, sample_px: Array) -> Array:
+        """Values at positions (2, …) in the sample."""
+        return np.asarray(ndimage.map_coordinates(self.coefficients, self.grid.index(sample_px), order=3,
+                                                  mode="nearest", prefilter=False))  # fmt: skip
+
+    def gradient(self, sample_px: Array) -> Array:
+        """Derivatives along x and y at positions (2, …): shape (2, …), per standard pixel."""
+        h = 0.02
+        shifts = h * np.eye(2).reshape(2, 2, *[1] * (sample_px.ndim - 1))
+        return np.stack([(self.at(sample_px + s) - self.at(sample_px - s)) / (2 * h) for s in shifts])
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A feature at `x` of the reference is at `x + displacement_m + linear @ (x - center_m)` in the scan.
+
+    Attributes:
+        displacement_m, linear, center_m: as in `afspm.drift.registration.Registration`; the centre is that of the
+            overlap.
+        overlap: area in common over the smaller area.
+    """
+
+    displacement_m: Array
+    linear: Array
+    center_m: Array
+    overlap: float
+
+    def at(self, xy_m: Array) -> Array:
+        """The displacement of a feature at a position of the reference."""
+        return np.asarray(self.displacement_m + self.linear @ (xy_m - self.center_m))
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two scans and what is known about them.
+
+    Attributes:
+        truth: None when the scans have nothing in common.
+        prior: what a tracker that is right could know: set by `pair(prior_sd_px=…)`.
+        frames, view: where the scans lie in the ideal image of the sample, which has unit rms in the reference.
+        gain: of the second scan.
+    """
+
+    surface: str
+    condition: Condition
+    reference: DriftScan
+    scan: DriftScan
+    truth: Truth | None
+    prior: Prior | None
+    frames: tuple[Frame, Frame]
+    view: View
+    gain: float
+
+    @cached_property
+    def overlap(self) -> float:
+        """Area in common over the smaller area; 0 when there is none."""
+        return 0.0 if self.truth is None else self.truth.overlap
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Pixels of one scan, (ny, nx), and how far apart they are along x and y in standard pixels."""
+
+    shape: tuple[int, int] = (128, 128)
+    step_px: tuple[float, float] = (1.0, 1.0)
+
+    @classmethod
+    def square(cls, size: int, step_px: float = 1.0) -> Sampling:
+        return cls((size, size), (step_px, step_px))
+
+
+def pair(
+    surface: str,
+    condition: str,
+    seed: int,
+    size: int = 128,
+    *,
+    samplings: tuple[Sampling, Sampling] | None = None,
+    prior_sd_px: float | None = None,
+) -> Pair:
+    """A pair that depends on nothing but the arguments.
+
+    Args:
+        surface: one of `SURFACES`.
+        condition: one of `CONDITIONS`.
+        size: pixels of both scans in each direction.
+        samplings: of both scans, in place of `size`.
+        prior_sd_px: give a prior about the true displacement, wrong by so much (for a pair without one: about the
+            displacement that it would have if it had an overlap).
+    """
+    how = CONDITIONS[condition]
+    random = np.random.default_rng([seed, list(SURFACES).index(surface), list(CONDITIONS).index(condition)])
+    first, second = samplings or (Sampling.square(size),) * 2
+    frames = _frames(first, second, how, random)
+    views = _views(surface, frames, how, seed, random)
+    scale = 1.0 / float(views[0].at(frames[0].sample_px(frames[0].offsets_px())).std())
+    gain = math.exp(random.uniform(-1.0, 1.0) * math.log(how.gain))
+    centers_m = [random.uniform(-20.0, 20.0, 2) * PIXEL_M for _ in frames]
+    scans = [
+        DriftScan(
+            values=HEIGHT_M * measured(scale * view.at(f.sample_px(f.offsets_px())), how, random, k_gain),
+            region=Region(tuple(center_m), tuple(f.width_px * PIXEL_M)),
+            start_s=k * 900.0,
+            end_s=k * 900.0 + ROW_S * f.shape[0],
+            upwards=True,
+            key=f"{surface}-{condition}-{seed}-{k}",
+        )
+        for k, (f, view, center_m, k_gain) in enumerate(zip(frames, views, centers_m, (1.0, gain), strict=True))
+    ]
+    truth = _truth(frames, centers_m)
+    known = None if prior_sd_px is None else _prior(truth, prior_sd_px, how, first.shape[0], random)
+    unit_view = View(views[0].grid, scale * views[0].coefficients)
+    return Pair(surface, how, scans[0], scans[1], None if how.elsewhere else truth, known, frames, unit_view, gain)
+
+
+def _frames(first: Sampling, second: Sampling, how: Condition, random: np.random.Generator) -> tuple[Frame, Frame]:
+    """Two frames that overlap as the condition says, the middle of the overlap at the origin of the sample."""
+    widths = [np.array([(n - 1) * s for n, s in zip(g.shape[::-1], g.step_px, strict=True)]) for g in (first, second)]
+    smaller, larger = np.minimum(*widths), np.maximum(*widths)
+    overlap, share = random.uniform(*how.overlap), random.random()
+    shift = smaller * (1.0 - overlap ** np.array([share, 1.0 - share]))
+    shift = (shift + random.random(2) * (larger - smaller) / 2) * random.choice((-1.0, 1.0), 2)
+    low, high = np.maximum(-widths[0] / 2, -widths[1] / 2 + shift), np.minimum(widths[0] / 2, widths[1] / 2 + shift)
+    middle = (low + high) / 2
+    angles = (0.0, math.radians(how.rotation_deg) * random.uniform(-1.0, 1.0))
+    frames = []
+    for sampling, origin, angle in zip((first, second), (-middle, shift - middle), angles, strict=True):
+        # The sample moves by `drift` while the rows are scanned: a row at q_y sees what lies drift q_y / height before.
+        drift = how.drift_px * random.standard_normal(2)
+        shear = np.eye(2) - np.outer(drift, (0.0, 1.0 / ((sampling.shape[0] - 1) * sampling.step_px[1])))
+        turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        frames.append(Frame(sampling.shape, sampling.step_px, origin, turn @ shear))
+    return frames[0], frames[1]
+
+
+def _views(
+    surface: str, frames: tuple[Frame, Frame], how: Condition, seed: int, random: np.random.Generator
+) -> tuple[View, View]:
+    """What the tip sees of the sample in each scan; once if it is the same."""
+    corners = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
+    reach = max(np.abs(f.sample_px(corners * f.width_px[:, None])).max() for f in frames)
+    grid = Grid(reach + MARGIN_PX)
+    second_tip = None
+    if how.second_tip_px:
+        direction = random.uniform(0.0, 2 * math.pi)
+        second_tip = (how.second_tip_px * math.cos(direction), how.second_tip_px * math.sin(direction))
+    number = list(SURFACES).index(surface)
+
+    def relief(place: int) -> Array:
+        specimen = np.random.default_rng([seed, number, 1])
+        height = SURFACES[surface](grid, specimen, np.random.default_rng([seed, number, 2, place]))
+        level: Array = (height - height.mean()) / height.std()
+        return level
+
+    height = relief(0)
+    first = View.of(grid, imaged(height))
+    if not (how.elsewhere or second_tip):
+        return first, first
+    return first, View.of(grid, imaged(relief(1) if how.elsewhere else height, second_tip))
+
+
+def _truth(frames: tuple[Frame, Frame], centers_m: list[Array]) -> Truth:
+    first, second = frames
+    back = np.linalg.inv(second.matrix)
+    middle = np.linalg.solve(first.matrix, -first.origin_px)  # of the overlap, which is the origin of the sample
+    there = back @ -second.origin_px
+    low = np.maximum(-first.width_px / 2, -second.width_px / 2 - (there - middle))
+    high = np.minimum(first.width_px / 2, second.width_px / 2 - (there - middle))
+    area = np.prod(np.maximum(high - low, 0.0)) / min(np.prod(first.width_px), np.prod(second.width_px))
+    return Truth(
+        displacement_m=centers_m[1] - centers_m[0] + (there - middle) * PIXEL_M,
+        linear=back @ first.matrix - np.eye(2),
+        center_m=centers_m[0] + middle * PIXEL_M,
+        overlap=float(area),
+    )
+
+
+def _prior(truth: Truth, sd_px: float, how: Condition, rows: int, random: np.random.Generator) -> Prior:
+    sd_m = sd_px * PIXEL_M
+    return Prior(
+        mean_m=truth.displacement_m + sd_m * random.standard_normal(2),
+        covariance_m2=sd_m**2 * np.eye(2),
+        velocity_sd_m_s=math.sqrt(2) * how.drift_px * PIXEL_M / (rows * ROW_S),
+    )

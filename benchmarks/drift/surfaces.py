@@ -1,0 +1,193 @@
+"""Five kinds of surface, on a grid four times finer than the pixels of a scan, as a tip sees them.
+
+Lengths are in pixels of the standard scan (128 of them are 2 µm). A surface has two random sources: `specimen` is what
+any two places of one sample share (the direction of a lattice), `place` is what lies here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+Array = NDArray[np.float64]
+Random = np.random.Generator
+
+OVERSAMPLING = 4
+TIP_PX = 1.5  # so far from its apex the parabolic tip is one rms height of the sample above it
+BAND_PX = 0.5  # Gaussian that limits the band, as feedback and probe do
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A square of fine points about the origin, of `half_px` in each direction at least."""
+
+    half_px: float
+
+    @property
+    def count(self) -> int:
+        return 2 * math.ceil(self.half_px * OVERSAMPLING) + 1
+
+    @property
+    def axis_px(self) -> Array:
+        return (np.arange(self.count) - self.count // 2) / OVERSAMPLING
+
+    def index(self, xy_px: Array) -> Array:
+        """Where positions, shape (2, …) as (x, y), lie in an array over the grid: shape (2, …) as (row, column)."""
+        return xy_px[::-1] * OVERSAMPLING + self.count // 2
+
+
+def stamper(grid: Grid, specimen: Random, place: Random) -> Array:
+    """Bumps on tracks 102 px apart, 32 px wide, 3 to 11 bits of 17.8 px long; one ends near the origin."""
+    pitch, half_width, bit, flank = 102.0, 16.0, 17.8, 6.0
+    x, y = grid.axis_px[None, :], grid.axis_px[:, None]
+    angle = math.radians(specimen.uniform(-15.0, 15.0))
+    along = x * math.cos(angle) + y * math.sin(angle) + place.uniform(-15.0, 15.0)
+    across = y * math.cos(angle) - x * math.sin(angle) + place.uniform(-20.0, 20.0)
+    track = np.round(across / pitch)
+    height = np.zeros(along.shape)
+    for number in np.unique(track):
+        enough = 2 * math.ceil((1.5 * grid.half_px + 200.0) / (3 * bit))
+        runs = bit * np.minimum(3 + place.geometric(0.33, enough) - 1, 11)
+        edges = np.cumsum(runs)
+        edges -= edges[len(edges) // 2] + (0.0 if number == 0 else place.uniform(0.0, 8 * bit))
+        here = track == number
+        run = np.searchsorted(edges, along[here])
+        to_end = np.minimum(along[here] - edges[run - 1], edges[run] - along[here]) * np.where(run % 2, 1.0, -1.0)
+        past = np.maximum(half_width - to_end, 0.0)
+        inside = half_width - np.hypot(past, across[here] - number * pitch)
+        height[here] = _smooth_step(inside / flank + 0.5)
+    return height + 0.01 * _self_affine(grid, place, longest_px=6.0)
+
+
+def rough(grid: Grid, specimen: Random, place: Random) -> Array:
+    """Self-affine ground of Hurst exponent 0.8 up to 40 px."""
+    return _self_affine(grid, place, longest_px=40.0)
+
+
+def particles(grid: Grid, specimen: Random, place: Random) -> Array:
+    """Spheres of 2 to 9 px radius, one on 400 square px, on almost flat ground."""
+    height = 0.15 * _self_affine(grid, place, longest_px=10.0)
+    count = place.poisson((2 * grid.half_px) ** 2 / 400)
+    radii = np.clip(4.5 * np.exp(0.35 * place.standard_normal(count)), 2.0, 9.0)
+    for radius, center in zip(radii, place.uniform(-grid.half_px, grid.half_px, (count, 2)), strict=True):
+        for window, square in _around(grid, center, radius):
+            np.maximum(height[window], radius + np.sqrt(np.maximum(radius**2 - square, 0.0)), out=height[window],
+                       where=square < radius**2)  # fmt: skip
+    return height
+
+
+def lattice(grid: Grid, specimen: Random, place: Random) -> Array:
+    """Atoms 8 px apart in a hexagonal lattice, about seven vacancies and adatoms on 128 x 128 px."""
+    spacing, angle = 8.0, specimen.uniform(0.0, math.pi / 3)
+    x, y = grid.axis_px[None, :], grid.axis_px[:, None]
+    shift = place.uniform(0.0, spacing, 2)
+    height = np.zeros((grid.count, grid.count))
+    wave = 4 * math.pi / (math.sqrt(3) * spacing)
+    for k in range(3):
+        cos, sin = math.cos(angle + k * math.pi / 3), math.sin(angle + k * math.pi / 3)
+        # cos(a + b) of a column and a row, without a cosine for every point
+        column, row = wave * sin * (y - shift[1]), wave * cos * (x - shift[0])
+        height += np.cos(column) * np.cos(row) - np.sin(column) * np.sin(row)
+    cell = spacing * np.array([[1.0, 0.5], [0.0, math.sqrt(0.75)]])
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    # the rows of atoms are at right angles to the waves
+    axes = turn @ np.array([[math.cos(math.pi / 6), -0.5], [0.5, math.cos(math.pi / 6)]]) @ cell
+    for _ in range(place.poisson(7 / 128**2 * (2 * grid.half_px) ** 2)):
+        wanted = place.uniform(-grid.half_px, grid.half_px, 2)
+        site = axes @ np.round(np.linalg.solve(axes, wanted - shift)) + shift
+        depth, width = (-4.0, 2.6) if place.random() < 0.6 else (4.0, 3.0)
+        for window, square in _around(grid, site, 5 * width):
+            height[window] += depth * np.exp(-square / (2 * width**2))
+    return height
+
+
+def steps(grid: Grid, specimen: Random, place: Random) -> Array:
+    """Terraces about 80 px wide between meandering steps, levelled as a whole."""
+    terrace, edge = 80.0, 2.5
+    angle = math.radians(specimen.uniform(0.0, 360.0))
+    x, y = grid.axis_px[None, :], grid.axis_px[:, None]
+    plane = (x * math.cos(angle) + y * math.sin(angle)) / terrace
+    wander = _smooth(grid, place, 50.0) + 0.06 * _smooth(grid, place, 5.0)
+    height = plane + 0.4 * wander + place.random()
+    step = np.round(height)
+    return step - 0.5 + _smooth_step((height - step) * terrace / edge + 0.5) - plane
+
+
+SURFACES: dict[str, Callable[[Grid, Random, Random], Array]] = {
+    "stamper": stamper,
+    "rough": rough,
+    "particles": particles,
+    "lattice": lattice,
+    "steps": steps,
+}
+
+
+def imaged(height: Array, second_tip_px: tuple[float, float] | None = None) -> Array:
+    """What a tip makes of a surface of unit rms: dilated by a parabola, and of limited band.
+
+    Args:
+        second_tip_px: (x, y) of a second apex as sharp as the first, a quarter of the rms height shorter.
+    """
+    reach = math.ceil(TIP_PX * OVERSAMPLING * math.sqrt(max(np.ptp(height), 1e-9)))
+    reach = min(reach, 6 * OVERSAMPLING)
+    tip = -((np.arange(-reach, reach + 1) / (TIP_PX * OVERSAMPLING)) ** 2)
+    touched = height
+    for axis in (0, 1):  # the dilation by a parabola of revolution is that along x after that along y
+        touched = _dilated(touched, tip, axis)
+    if second_tip_px is not None:
+        dx, dy = (round(d * OVERSAMPLING) for d in second_tip_px)
+        touched = np.maximum(touched, np.roll(touched, (dy, dx), axis=(0, 1)) - 0.25)
+    return np.asarray(ndimage.gaussian_filter(touched, BAND_PX * OVERSAMPLING, mode="nearest", truncate=5.0))
+
+
+def _dilated(height: Array, tip: Array, axis: int) -> Array:
+    """Grey dilation of one axis by an even function."""
+    padded = np.moveaxis(height, axis, 0)
+    reach = len(tip) // 2
+    padded = np.pad(padded, ((reach, reach), (0, 0)), mode="edge")
+    highest = np.full((padded.shape[0] - 2 * reach, padded.shape[1]), -np.inf)
+    for k, below in enumerate(tip):
+        np.maximum(highest, padded[k : k + len(highest)] + below, out=highest)
+    return np.moveaxis(highest, 0, axis)
+
+
+def _smooth_step(t: Array) -> Array:
+    t = np.clip(t, 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _around(grid: Grid, center: Array, reach_px: float) -> Iterator[tuple[tuple[slice, slice], Array]]:
+    """The window of the grid within reach of a point, if there is one, and the squared distances in it."""
+    axis = grid.axis_px
+    (x0, x1), (y0, y1) = (np.searchsorted(axis, (c - reach_px, c + reach_px)) for c in center)
+    if x0 < x1 and y0 < y1:
+        yield (
+            (slice(y0, y1), slice(x0, x1)),
+            ((axis[None, x0:x1] - center[0]) ** 2 + (axis[y0:y1, None] - center[1]) ** 2),
+        )
+
+
+def _self_affine(grid: Grid, random: Random, *, longest_px: float, hurst: float = 0.8) -> Array:
+    """A Gaussian field of unit rms, spectral density as f^-2(hurst + 1), constant below 1 / longest_px."""
+    return _field(grid, random, lambda f2: np.maximum(f2, longest_px**-2) ** (-(hurst + 1) / 2))
+
+
+def _smooth(grid: Grid, random: Random, length_px: float) -> Array:
+    """A Gaussian field of unit rms and correlation length."""
+    return _field(grid, random, lambda f2: np.exp(-f2 * (math.pi * length_px) ** 2 / 2))
+
+
+def _field(grid: Grid, random: Random, amplitude: Callable[[Array], Array]) -> Array:
+    """A periodic Gaussian field of unit rms with a spectral amplitude, a function of the squared frequency in 1/px²."""
+    count = fft.next_fast_len(grid.count, real=True)
+    fx, fy = fft.rfftfreq(count, 1 / OVERSAMPLING), fft.fftfreq(count, 1 / OVERSAMPLING)
+    shape = amplitude(fx[None, :] ** 2 + fy[:, None] ** 2)
+    shape[0, 0] = 0.0
+    noise = random.standard_normal((count, len(fx))) + 1j * random.standard_normal((count, len(fx)))
+    field = fft.irfft2(noise * shape, s=(count, count))[: grid.count, : grid.count]
+    return np.asarray(field / field.std())
