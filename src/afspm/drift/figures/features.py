@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from numpy.typing import NDArray
 
-from afspm.drift.figures.style import BLUE, ORANGE, Array, figure, letter, show_scan, styled
+from afspm.drift.figures.style import MAGENTA, ORANGE, Array, figure, letter, show_scan, styled
 from afspm.drift.registration import DriftScan, Matches
 from afspm.errors import InvalidValue
 
@@ -16,7 +16,7 @@ _INCHES = 2.6
 
 
 def draw(reference: DriftScan, scan: DriftScan, matches: Matches | None) -> Figure:
-    """a: both scans with the matched keypoints in orange; b: the pairs joined, inliers in colour, outliers in grey.
+    """a: both scans with the matched keypoints in orange; b: the pairs joined, inliers in colour, outliers dotted.
 
     Raises:
         InvalidValue: an estimator that matches no features.
@@ -61,7 +61,7 @@ def _join(made: Figure, axes: Array, points: list[Array], which: NDArray[np.bool
     if len(chosen) > _MOST_LINES:
         chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_LINES).round().astype(int)]
     for rank, index in enumerate(chosen):
-        colour = BLUE if colours is None else colormaps[colours](rank / max(len(chosen) - 1, 1))
+        colour = MAGENTA if colours is None else colormaps[colours](rank / max(len(chosen) - 1, 1))
         line = ConnectionPatch(
             points[0][index], points[1][index], "data", "data", axesA=axes[0], axesB=axes[1], color=colour,
             linewidth=0.6, linestyle=":" if colours is None else "-",

@@ -17,7 +17,7 @@ from afspm.drift.registration import DriftScan
 Array = NDArray[np.float64]
 
 WIDTH_IN = 7.2  # two columns of a journal
-ORANGE, BLUE, GREEN, PURPLE, GREY = "#EE7733", "#0077BB", "#009988", "#AA3377", "#999999"  # Paul Tol's vibrant scheme
+ORANGE, BLUE, GREEN, MAGENTA, GREY = "#EE7733", "#0077BB", "#009988", "#EE3377", "#999999"  # P. Tol's vibrant scheme
 TIME_COLOURS = "viridis"  # of even lightness: also told apart in grey
 DPI = 200
 HOUR_S = 3600.0
