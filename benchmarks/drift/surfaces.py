@@ -107,12 +107,12 @@ def lattice(grid: Grid, specimen: Random, place: Random) -> Array:
 
 
 def steps(grid: Grid, specimen: Random, place: Random) -> Array:
-    """Terraces about 80 px wide between meandering steps, levelled as a whole."""
-    terrace, edge = 80.0, 2.5
+    """Terraces about 60 px wide between meandering steps, levelled as a whole."""
+    terrace, edge = 60.0, 3.0
     angle = math.radians(specimen.uniform(0.0, 360.0))
     x, y = grid.axis_px[None, :], grid.axis_px[:, None]
     plane = (x * math.cos(angle) + y * math.sin(angle)) / terrace
-    wander = _smooth(grid, place, 50.0) + 0.06 * _smooth(grid, place, 5.0)
+    wander = _smooth(grid, place, 40.0) + 0.08 * _smooth(grid, place, 5.0)
     height = plane + 0.4 * wander + place.random()
     step = np.round(height)
     return step - 0.5 + _smooth_step((height - step) * terrace / edge + 0.5) - plane
