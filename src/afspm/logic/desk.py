@@ -9,9 +9,11 @@ from typing import Any
 from afspm.logic.arbitration import Cause
 from afspm.logic.errands import Errands
 from afspm.logic.events import Codec, Effect, Log, Reply, RequestIn, SaveState
-from afspm.logic.forwarding import UNKNOWN, End, Forwarder, Job, Settled
+from afspm.logic.forwarding import NOT_SENT, UNKNOWN, End, Forwarder, Job, Settled
+from afspm.logic.frame import CoordinateFrame, Mapped
 from afspm.logic.lease import Lease
 from afspm.logic.limits import Guard
+from afspm.logic.moves import Mover
 from afspm.logic.once import Fate, OnceTable, fingerprint
 from afspm.logic.sessions import Hearing, Sessions
 from afspm.logic.settings import SchedulerSettings
@@ -22,6 +24,8 @@ _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
 _SENT_REMEMBERED = 100
 _UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
+OwnEnd = Callable[[Response, float, int], None]
+"""Told of the answer to a request of the scheduler's own, with now_s and now_ns."""
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 
 
@@ -34,6 +38,7 @@ class Desk:
     Args:
         holder: says who is in control.
         save: says what is to be saved.
+        frame: the coordinates of components, where they are not those of the microscope.
     """
 
     def __init__(
@@ -44,18 +49,22 @@ class Desk:
         lease: Lease,
         holder: Callable[[], str | None],
         save: Callable[[], SaveState],
+        frame: CoordinateFrame | None = None,
     ) -> None:
         self.effects: list[Effect] = []
         self.sessions = Sessions(settings.takeover_s)
         self.forwarder = Forwarder(settings.request_timeout_s, settings.patience_s, settings.longest_queue)
         self.guard = Guard(settings.limits)
         self.errands = Errands(self.forwarder, watchdog, codec)
+        self.mover = Mover(self.forwarder, watchdog)
         self._once = OnceTable()
         self._codec = codec
         self._watchdog = watchdog
         self._lease = lease
         self._holder = holder
         self._save = save
+        self._frame = frame
+        self._asked_by_us: dict[int, OwnEnd] = {}
         self._ids_known: bool | None = None
         # actions that only we know of: a translator of version 1 would do them again
         self._sent: deque[tuple[str, str, int]] = deque(maxlen=_SENT_REMEMBERED)
@@ -156,6 +165,9 @@ class Desk:
         for job in self.forwarder.call_back(lambda job: job.command and job.client == former):
             reason = f"control was taken before this was sent: {cause.value if cause else ''}"
             self._finish(job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))
+        if (event := self.mover.call_back(former)) is not None:
+            reason = f"control was taken before this was sent: {cause.value if cause else ''}"
+            self.answer_late(event, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason))
 
     def action_in_flight(self) -> str | None:
         """The action that is with the translator."""
@@ -165,26 +177,90 @@ class Desk:
     def forward(self, event: RequestIn, now_s: float, now_ns: int, *, command: bool) -> None:
         """Pass a request on to the translator, unless a limit, or the watchdog, stands in the way."""
         name, request = event.name, event.request
+        mapped = None
+        if self._frame is not None:
+            outgoing = self._frame.outgoing(name, request, now_ns)
+            if isinstance(outgoing, Response):
+                self._refused_by_us(event, outgoing)
+                return
+            mapped = outgoing
         if command:
             if self._watchdog.wants_retract and self.forwarder.up:
                 self.answer(event, ControlResponse.NOT_FREE, "the tip is being retracted, since a holder died")
                 return
-            refusal = self.guard.check(name, request, now_ns)
-            if refusal is not None:
-                self._log("WARNING", f"refused {name}: {refusal.reason}")
-                self._once.note(name, request, refusal)
-                self.effects.append(Reply(event.connection, name, refusal))
+            if not self._is_within_limits(event, mapped, now_ns):
                 return
             self._lease.used(now_ns)
-        job = Job(name, request, command, connection=event.connection, states_seen=self._watchdog.states_seen)
+            if self._frame is not None and request.kind == _ACTION and self._moves_first(event, now_s, now_ns):
+                return
+        self._send(event, mapped, now_s, command=command)
+
+    def _is_within_limits(self, event: RequestIn, mapped: Mapped | None, now_ns: int) -> bool:
+        """What goes to the microscope is within the limits; if not, the asker is told."""
+        if mapped is None:
+            refusal = self.guard.check(event.name, event.request, now_ns)
+        else:
+            refusal = self.guard.check(event.name, mapped.request, now_ns, mapped.names)
+            if refusal is not None:
+                refusal.reason = f"{refusal.reason}; {mapped.said}"
+        if refusal is None:
+            return True
+        self._refused_by_us(event, refusal)
+        return False
+
+    def _refused_by_us(self, event: RequestIn, refusal: Response) -> None:
+        refusal.id = event.request.id
+        self._log("WARNING", f"refused {event.name}: {refusal.reason}")
+        self._once.note(event.name, event.request, refusal)
+        self.effects.append(Reply(event.connection, event.name, refusal))
+
+    def _moves_first(self, event: RequestIn, now_s: float, now_ns: int) -> bool:
+        """Whether the microscope has to be moved before an action; then it is, or the action is answered."""
+        assert self._frame is not None
+        move = self._frame.move_before(str(event.request.subject), now_ns)
+        if move is None:
+            return False
+        if self.mover.busy:
+            self.answer(event, ControlResponse.NOT_FREE, "the microscope is being moved for another action")
+            return True
+        if not self._is_within_limits(event, move, now_ns):
+            return True
+        if not self.mover.begin(event, move, now_s):
+            return False  # nobody is there to be moved, as the action will be told
+        self._once.note(event.name, event.request, Fate.PENDING)
+        return True
+
+    def act_when_moved(self, now_s: float) -> None:
+        """Send the action that waited for the microscope to be moved, if it is."""
+        if (ready := self.mover.ready(now_s)) is not None:
+            event, deadline_s = ready
+            self._send(event, None, now_s, command=True, deadline_s=deadline_s)
+
+    def _send(
+        self, event: RequestIn, mapped: Mapped | None, now_s: float, *, command: bool, deadline_s: float = 0.0
+    ) -> None:
+        name, request = event.name, event.request
+        seen = self._watchdog.states_seen
+        job = Job(name, request, command, 0, deadline_s, connection=event.connection, states_seen=seen, mapped=mapped)
         refused = self.forwarder.ask(job, now_s)
         if refused is not None:
+            self._once.forget(name, request)
             self.effects.append(Reply(event.connection, name, refused.response))
-        elif request.id:
+            return
+        if request.id:
             self._once.note(name, request, Fate.PENDING)
             if request.kind == _ACTION and not self._ids_known:
                 self._sent.append((name, request.id, fingerprint(request)))
                 self.effects.append(self._save())
+            elif mapped is not None:
+                self.effects.append(self._save())  # with what it was mapped to: asked again, it is sent the same
+
+    def ask_own(self, request: Request, now_s: float, ended: OwnEnd) -> bool:
+        """Ask the microscope in the scheduler's own name; False: it can't be asked now."""
+        job = self.forwarder.ask_own(request, now_s)
+        if job is not None:
+            self._asked_by_us[job.number] = ended
+        return job is not None
 
     def settle_all(self, settled: Iterable[Settled], now_s: float, now_ns: int) -> None:
         """Requests have come to their ends."""
@@ -201,7 +277,7 @@ class Desk:
             if response.code == _SUCCESS and (job.command or job.request.kind == _PARAM):
                 self._learn(job, response, now_ns)
         if not job.client:
-            self._errand_ended(job, end, response, now_s)
+            self._own_ended(job, end, response, now_s, now_ns)
         elif end is End.ANSWERED:
             self._finish(job, response)
         elif end is End.LATE:
@@ -230,16 +306,40 @@ class Desk:
         """What a success changed, or told."""
         request = job.request
         told = self._codec.decode_parameter(response.payload) if request.kind == _PARAM and response.payload else None
-        self.guard.carried_out(request, now_ns, told)
+        sent, used = (request, None) if job.mapped is None else (job.mapped.request, job.mapped.names)
+        self.guard.carried_out(sent, now_ns, told, used)
+        if self._frame is not None:
+            self._frame.carried_out(sent, told, now_ns)
+            if request.kind == _PARAM and (mapped := self._frame.answer(request, told, now_ns)) is not None:
+                response.payload = self._codec.encode_parameter(mapped)
         if request.kind == _ACTION:
             self._watchdog.started(str(request.subject), job.states_seen)
         if job.command and job.client == self._holder():
             self._lease.used(now_ns)
 
-    def _errand_ended(self, job: Job, end: End, response: Response, now_s: float) -> None:
+    def _own_ended(self, job: Job, end: End, response: Response, now_s: float, now_ns: int) -> None:
+        """A request of the scheduler's own came to its end."""
+        if self.mover.owns(job):
+            if (event := self.mover.ended(job, response, now_s)) is not None:
+                self.answer_late(event, response)
+            self.act_when_moved(now_s)
+            return
+        if (ended := self._asked_by_us.pop(job.number, None)) is not None:
+            ended(response, now_s, now_ns)
+            return
         told = self.errands.ended(job, end, response, now_s)
         if told is not None:
             self.effects += [told, self._save()]
+
+    def answer_late(self, event: RequestIn, response: Response) -> None:
+        """Answer an action that waited for a move, and was not sent."""
+        answer = Response(response.code, b"", response.reason, event.request.id)
+        if response.code == ControlResponse.NO_RESPONSE:
+            answer.reason = NOT_SENT + response.reason.removeprefix(NOT_SENT).removeprefix(UNKNOWN)
+            self._once.forget(event.name, event.request)
+        else:
+            self._once.note(event.name, event.request, answer)
+        self._reply_to(Job(event.name, event.request, command=True, connection=event.connection), answer)
 
     def _log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))

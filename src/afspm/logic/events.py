@@ -108,6 +108,27 @@ class ComponentDied:
 
 
 @dataclass(frozen=True, slots=True)
+class ProblemSeen:
+    """The scheduler itself sees that a problem has come, or gone.
+
+    Attributes:
+        name: in whose name it is flagged.
+    """
+
+    problem: int
+    flagged: bool
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Announced:
+    """The scheduler itself has something to publish."""
+
+    envelope: str
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """Nothing happened, but a deadline (`SchedulerCore.wait_s`) has come."""
 
@@ -124,6 +145,8 @@ Input = (
     | TranslatorCaughtUp
     | TranslatorReply
     | ComponentDied
+    | ProblemSeen
+    | Announced
     | Tick
 )
 
@@ -204,6 +227,9 @@ class Codec(Protocol):
 
     def encode_action(self, name: str) -> bytes:
         """An ActionMsg as the payload of a request."""
+
+    def encode_parameter(self, parameter: Parameter) -> bytes:
+        """A ParameterMsg as the payload of a response."""
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         """A ParameterMsg out of a response; None if it is not one."""

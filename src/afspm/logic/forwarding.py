@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from afspm.logic.events import Forward
+from afspm.logic.frame import Mapped
 from afspm.model import ControlResponse, Request, Response
 
 NOT_SENT = "not sent: "
@@ -33,6 +34,7 @@ class Job:
         sent_s: when it was sent; None while it waits.
         answered: the client has been told that there was no response in time.
         states_seen: how many states the microscope had told when it was sent on its way.
+        mapped: what is sent in place of `request`, where the microscope has other coordinates; None: that itself.
     """
 
     client: str
@@ -44,6 +46,12 @@ class Job:
     answered: bool = False
     connection: int = -1
     states_seen: int = 0
+    mapped: Mapped | None = None
+
+    @property
+    def outgoing(self) -> Request:
+        """What the microscope is asked."""
+        return self.request if self.mapped is None else self.mapped.request
 
 
 class End(Enum):
@@ -106,9 +114,12 @@ class Forwarder:
         return settled + [_not_sent(job, "the translator is not connected") for job in waiting]
 
     def ask(self, job: Job, now_s: float) -> Settled | None:
-        """Send a client's request, now or when its turn comes. Returns what it was refused with, if it was."""
+        """Send a client's request, now or when its turn comes. Returns what it was refused with, if it was.
+
+        One that has a deadline already, since it waited for something else before, keeps it.
+        """
         self.number += 1
-        job.number, job.deadline_s = self.number, now_s + self.timeout_s
+        job.number, job.deadline_s = self.number, job.deadline_s or now_s + self.timeout_s
         if not self.up:
             return _not_sent(job, "the translator is not connected")
         if self.flight is None:
@@ -116,7 +127,10 @@ class Forwarder:
         elif len(self._queue) >= self.longest_queue:
             return _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
         else:
-            self._queue.append(job)
+            at = len(self._queue)
+            while at and self._queue[at - 1].deadline_s > job.deadline_s:
+                at -= 1
+            self._queue.insert(at, job)
         return None
 
     def ask_own(self, request: Request, now_s: float) -> Job | None:
@@ -184,7 +198,7 @@ class Forwarder:
     def _send(self, job: Job, now_s: float) -> None:
         job.sent_s = now_s
         self.flight = job
-        self.outbox.append(Forward(job.number, job.request))
+        self.outbox.append(Forward(job.number, job.outgoing))
 
     def _patience_ends_s(self, job: Job) -> float:
         assert job.sent_s is not None

@@ -102,15 +102,21 @@ class Guard:
         self._scan = ScanParameters()
         self._probe: XY | None = None
 
-    def check(self, who: str, request: Request, now_ns: int) -> Response | None:
-        """The refusal of a request that breaks a limit or has no meaning; None: it may be sent."""
+    def check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> Response | None:
+        """The refusal of a request that breaks a limit or has no meaning; None: it may be sent.
+
+        Args:
+            used: the parameters that `who` means to set; the others of the request only change with them. None: all.
+        """
         try:
-            self._check(who, request, now_ns)
+            self._check(who, request, now_ns, used)
         except _Breach as breach:
             return Response(int(breach.code), b"", breach.reason, request.id)
         return None
 
-    def carried_out(self, request: Request, now_ns: int, told: Parameter | None = None) -> None:
+    def carried_out(
+        self, request: Request, now_ns: int, told: Parameter | None = None, used: Collection[str] | None = None
+    ) -> None:
         """A request that was checked succeeded; `told` is the parameter as the translator answered it."""
         subject = told if told is not None and told.value is not None else request.subject
         if isinstance(subject, str):
@@ -119,7 +125,7 @@ class Guard:
         sets = not isinstance(request.subject, Parameter) or request.subject.value is not None
         for name, value in self._values(subject):
             self._learn(name, value, now_ns)
-            if sets:
+            if sets and (used is None or name in used):
                 self._last_ns[name] = now_ns
         self.published(subject, now_ns)
 
@@ -138,7 +144,7 @@ class Guard:
 
     # --- checks ---
 
-    def _check(self, who: str, request: Request, now_ns: int) -> None:
+    def _check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None) -> None:
         subject = request.subject
         if request.kind == ControlRequest.ACTION:
             self._check_use(who, str(subject), self._limits.actions.get(str(subject)), now_ns, "action")
@@ -155,7 +161,8 @@ class Guard:
             self._check_parameter_geometry(subject)
         for name, value in self._values(subject):
             limit = self._limits.parameters.get(name)
-            self._check_use(who, name, limit, now_ns, "parameter")
+            if used is None or name in used:
+                self._check_use(who, name, limit, now_ns, "parameter")
             if limit is not None:
                 self._check_value(name, value, limit, now_ns)
 

@@ -12,8 +12,9 @@ from afspm.errors import AfspmError
 from afspm.logic import arbitration
 from afspm.logic.arbitration import Ask, Cause, Control, Do, Event
 from afspm.logic.cache import Cache
-from afspm.logic.desk import Desk, reads
+from afspm.logic.desk import Desk, OwnEnd, reads
 from afspm.logic.events import (
+    Announced,
     Codec,
     ComponentDied,
     Connected,
@@ -24,6 +25,7 @@ from afspm.logic.events import (
     Kill,
     Log,
     PacketIn,
+    ProblemSeen,
     Publish,
     Replay,
     Reply,
@@ -36,6 +38,7 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
+from afspm.logic.frame import CoordinateFrame
 from afspm.logic.lease import Lease
 from afspm.logic.sessions import token_of
 from afspm.logic.settings import SchedulerSettings
@@ -84,9 +87,12 @@ class SchedulerCore:
 
     Whoever hosts it carries out the effects in their order, and steps with `Tick()` when `deadline_s` or
     `deadline_ns` has come, however much else there is to do.
+
+    Args:
+        frame: the coordinates that components speak of, where they are not those of the microscope.
     """
 
-    def __init__(self, settings: SchedulerSettings, codec: Codec) -> None:
+    def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame | None = None) -> None:
         self._settings = settings
         self._codec = codec
         self._rules = settings.rules
@@ -95,7 +101,8 @@ class SchedulerCore:
         self._cache = Cache(settings.envelopes, settings.cache_bytes)
         self._lease = Lease(None if settings.lease_s is None else round(settings.lease_s * 1e9))
         self._watchdog = Watchdog(settings.watchdog)
-        self._desk = desk = Desk(settings, codec, self._watchdog, self._lease, self._holder, self._save)
+        self._frame = frame
+        self._desk = desk = Desk(settings, codec, self._watchdog, self._lease, self._holder, self._save, frame)
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
         self._started_s = 0.0
         self._announce_at_s: float | None = None
@@ -119,6 +126,8 @@ class SchedulerCore:
             TranslatorDown: self._on_translator_down,
             TranslatorCaughtUp: self._on_translator_caught_up,
             ComponentDied: self._on_died,
+            ProblemSeen: self._on_problem,
+            Announced: self._on_announced,
             Tick: self._on_tick,
         }
 
@@ -141,6 +150,9 @@ class SchedulerCore:
         self._effects = self._desk.effects = []
         self._handlers[type(event)](event, now_s, now_ns)
         self._held_due_s = now_s if self._held and self._announce_at_s is None else None
+        return self._with_forwards()
+
+    def _with_forwards(self) -> list[Effect]:
         if self._forwarder.outbox:
             self._effects += self._forwarder.outbox
             self._forwarder.outbox.clear()
@@ -149,7 +161,13 @@ class SchedulerCore:
     def deadline_s(self) -> float | None:
         """When, in real monotonic time, a Tick is due at the latest; None: no deadline."""
         soonest_s = self._forwarder.deadline_s()
-        others_s = (self._holder_dead_at_s(), self._announce_at_s, self._desk.unclear_until_s(), self._held_due_s)
+        others_s = (
+            self._holder_dead_at_s(),
+            self._announce_at_s,
+            self._desk.unclear_until_s(),
+            self._desk.mover.due_s(),
+            self._held_due_s,
+        )
         for deadline_s in others_s:
             if deadline_s is not None and (soonest_s is None or deadline_s < soonest_s):
                 soonest_s = deadline_s
@@ -168,6 +186,7 @@ class SchedulerCore:
             "wanted": list(self._watchdog.wanted),
             "granted_to": self._granted_to,
             **self._desk.snapshot(),
+            **({} if self._frame is None else {"frame": self._frame.snapshot()}),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -183,6 +202,8 @@ class SchedulerCore:
         self._granted_to = state.get("granted_to")
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
         self._desk.restore(state)
+        if self._frame is not None and "frame" in state:
+            self._frame.restore(state["frame"])
 
     def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
         """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
@@ -191,6 +212,12 @@ class SchedulerCore:
     def cached(self) -> Iterable[tuple[Packet, int | None]]:
         """What is cached now (with `source_ns`), oldest first: for whoever tidies the journal."""
         return self._cache
+
+    def ask_own(self, request: Request, now_s: float, ended: OwnEnd) -> list[Effect]:
+        """Ask the microscope in the scheduler's own name, if it is there."""
+        self._effects = self._desk.effects = []
+        self._desk.ask_own(request, now_s, ended)
+        return self._with_forwards()
 
     @property
     def newest_source_ns(self) -> int:
@@ -228,6 +255,14 @@ class SchedulerCore:
 
     def _on_died(self, event: ComponentDied, now_s: float, now_ns: int) -> None:
         self._arbitrate(Ask(Event.DEAD, event.name), None, now_s, now_ns)
+
+    def _on_problem(self, event: ProblemSeen, now_s: float, now_ns: int) -> None:
+        what = Event.FLAG if event.flagged else Event.CLEAR
+        self._arbitrate(Ask(what, event.name, event.problem), None, now_s, now_ns)
+
+    def _on_announced(self, event: Announced, now_s: float, now_ns: int) -> None:
+        packet, cached = self._cache.stamp(event.envelope, event.payload, now_ns)
+        self._effects.append(Publish(packet, None, cached))
 
     def _on_subscriber(self, event: SubscriberJoined, now_s: float, now_ns: int) -> None:
         self._effects.append(Replay(event.subscriber, self._cache.replay(event.prefixes, event.since_ns)))
@@ -368,8 +403,10 @@ class SchedulerCore:
         if message == CONTROL_STATE:
             self._tell_once("WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
             return
-        source_ns = event.packet.time_ns
-        taken = self._take(event.packet, event.header, now_ns)
+        packet, source_ns = event.packet, event.packet.time_ns
+        if self._frame is not None:
+            packet = self._frame.incoming(packet, event.header, now_ns)
+        taken = self._take(packet, event.header, now_ns)
         if taken is None:
             return
         self._effects.append(Publish(taken[0], source_ns, taken[1]))
@@ -388,6 +425,8 @@ class SchedulerCore:
             self._watchdog.scope_is(told.state)
             self._lease.scope_is(told.state, now_ns)
             self._desk.errands.send(now_s)
+            if self._desk.mover.busy:
+                self._desk.act_when_moved(now_s)
         elif isinstance(told, Feedback):
             self._watchdog.feedback_is(told)
         if isinstance(told, Feedback | ScanParameters | ProbePosition):
@@ -410,6 +449,7 @@ class SchedulerCore:
         if holder is not None and lease_ns is not None and now_ns >= lease_ns:
             self._arbitrate(Ask(Event.IDLE, holder), None, now_s, now_ns)
         self._desk.refuse_unclear(now_s)
+        self._desk.act_when_moved(now_s)
         self._desk.settle_all(self._forwarder.expire(now_s), now_s, now_ns)
 
     # --- telling people ---

@@ -18,6 +18,9 @@ class WireCodec:
     def encode_action(self, name: str) -> bytes:
         return wire.encode_subject(name)
 
+    def encode_parameter(self, parameter: Parameter) -> bytes:
+        return wire.encode(parameter)[1]
+
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         try:
             return wire.decode_parameter(payload)

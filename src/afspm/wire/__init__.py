@@ -19,6 +19,7 @@ from afspm.wire.frames import (
     encode_time,
 )
 from afspm.wire.messages import known_messages, message_of, message_type, register
+from afspm.wire.places import encode_place, place_in, relocated
 
 __all__ = [
     "BEAT",
@@ -33,6 +34,7 @@ __all__ = [
     "decode_response",
     "encode",
     "encode_packet",
+    "encode_place",
     "encode_request",
     "encode_response",
     "encode_subject",
@@ -41,5 +43,7 @@ __all__ = [
     "known_messages",
     "message_of",
     "message_type",
+    "place_in",
     "register",
+    "relocated",
 ]

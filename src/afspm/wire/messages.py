@@ -15,6 +15,7 @@ from afspm.wire.generated.analysis_pb2 import (
     SpatialROIWithScoreList,
 )
 from afspm.wire.generated.control_pb2 import ActionMsg, ControlState, ParameterMsg, ScopeStateMsg
+from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis, ZCtrlParameters
 from afspm.wire.generated.geometry_pb2 import (
     Point2d,
@@ -35,10 +36,10 @@ M = TypeVar("M", bound=Message)
 _messages: dict[str, type[Message]] = {
     message.DESCRIPTOR.name: message
     for message in (
-        ActionMsg, ControlState, DataAspects, FeedbackAnalysis, ParameterMsg, Point2d, Point2u, ProbePosition, Rect2d,
-        Rect2i, RotRect2d, RotRect2i, Scan2d, ScanParameters2d, ScopeStateMsg, Size2d, Size2u, Size3u, SpatialAspects,
-        SpatialPoint, SpatialPointWithScore, SpatialPointWithScoreList, SpatialROIWithScore, SpatialROIWithScoreList,
-        Spec1d, SpecData, ZCtrlParameters,
+        ActionMsg, ControlState, DataAspects, DriftMapping, DriftRescan, FeedbackAnalysis, ParameterMsg, Point2d,
+        Point2u, ProbePosition, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d, ScanParameters2d, ScopeStateMsg, Size2d,
+        Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore, SpatialPointWithScoreList,
+        SpatialROIWithScore, SpatialROIWithScoreList, Spec1d, SpecData, ZCtrlParameters,
     )
 }  # fmt: skip
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from afspm.errors import WireError
 
+Chunks = list[memoryview]
+
 _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 
 
@@ -75,6 +77,12 @@ def packed(values: NDArray[np.float64], field: int) -> tuple[bytes, memoryview]:
     """An array as the field number `field`: its tag and length, and its values as bytes (a view where possible)."""
     data = np.ascontiguousarray(values, "<f8").reshape(-1).data.cast("B")
     return bytes([field << 3 | _LENGTH]) + as_varint(len(data)), data
+
+
+def packed_chunks(chunks: Chunks, field: int) -> Chunks:
+    """The contents of a `repeated double` as the field number `field` again, in one piece."""
+    length = sum(map(len, chunks))
+    return [memoryview(bytes([field << 3 | _LENGTH]) + as_varint(length)), *chunks]
 
 
 def nested(payload: bytes, field: int) -> bytes:

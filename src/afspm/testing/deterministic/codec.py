@@ -30,6 +30,9 @@ class TableCodec:
     def encode_action(self, name: str) -> bytes:
         return self.encode(name)
 
+    def encode_parameter(self, parameter: Parameter) -> bytes:
+        return self.encode(parameter)
+
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         thing = self.decode(payload)
         return thing if isinstance(thing, Parameter) else None
