@@ -1,0 +1,115 @@
+"""Two images, each warped half-way to the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.estimators.least_squares.prepare import Image
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """An image as cubic splines, evaluated at pixel coordinates (x, y) from its centre."""
+
+    coefficients: Array
+    known: Mask | None
+
+    @classmethod
+    def of(cls, image: Image) -> Spline:
+        """Its values are met exactly at the pixels."""
+        from scipy.ndimage import binary_erosion, spline_filter
+
+        known = None if image.known.all() else binary_erosion(image.known, iterations=2, border_value=1)
+        return cls(spline_filter(image.values, mode="mirror"), known)
+
+    def at(self, x: Array, y: Array) -> tuple[Array, Mask]:
+        """The values, and where they are known."""
+        from scipy.ndimage import map_coordinates
+
+        ny, nx = self.coefficients.shape
+        at = np.stack([y + (ny - 1) / 2, x + (nx - 1) / 2])
+        values = map_coordinates(self.coefficients, at, order=3, mode="mirror", prefilter=False)
+        known = (np.abs(x) <= (nx - 1) / 2 + 1e-6) & (np.abs(y) <= (ny - 1) / 2 + 1e-6)
+        if self.known is not None:
+            rounded = np.rint(at).astype(int)
+            known &= self.known[np.clip(rounded[0], 0, ny - 1), np.clip(rounded[1], 0, nx - 1)]
+        return values, known
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """The pixels of the mid grid, (x, y) from the centres: the rectangle in which two shifted images overlap."""
+
+    x: Array
+    y: Array
+
+    @classmethod
+    def of_overlap(cls, shape1: tuple[int, int], shape2: tuple[int, int], shift_px: Array) -> Box | None:
+        """None: there is less than 8 x 8 pixels of it."""
+        axes = []
+        for axis, shift in ((1, shift_px[0]), (0, shift_px[1])):
+            half1, half2 = (shape1[axis] - 1) / 2, (shape2[axis] - 1) / 2
+            low, high = max(-half1 + shift / 2, -half2 - shift / 2), min(half1 + shift / 2, half2 - shift / 2)
+            parity = half1 % 1.0
+            axes.append(np.arange(np.ceil(low - parity - 1e-6), np.floor(high - parity + 1e-6) + 1) + parity)
+        return cls(*axes) if min(axis.size for axis in axes) >= 8 else None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.y.size, self.x.size
+
+    @property
+    def center(self) -> Array:
+        """(2,)"""
+        return np.array([self.x.mean(), self.y.mean()])
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two images on a box. Parameters are theta = (ux, uy, g, axx, axy, ayx, ayy): shift u px and linear map A about
+    the centre of the box, d(q) = u + A (q - centre), and logarithm g of the gain of the second over the first."""
+
+    first: Spline
+    second: Spline
+    box: Box
+
+    def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
+        """e^(g/2) I1(q - d/2), e^(-g/2) I2(q + d/2), and where both are known.
+
+        Both are moved by half: so both carry equal interpolation noise, the gradient of their mean is not correlated
+        with the noise of their difference, and the shift is not pulled towards whole pixels.
+        """
+        cx, cy = self.box.center
+        x, y = np.meshgrid(self.box.x, self.box.y)
+        dx = theta[0] + theta[3] * (x - cx) + theta[4] * (y - cy)
+        dy = theta[1] + theta[5] * (x - cx) + theta[6] * (y - cy)
+        one, known1 = self.first.at(x - dx / 2, y - dy / 2)
+        two, known2 = self.second.at(x + dx / 2, y + dy / 2)
+        return np.exp(theta[2] / 2) * one, np.exp(-theta[2] / 2) * two, known1 & known2
+
+    def linearised(self, theta: Array) -> tuple[Array, Mask]:
+        """What Gauss-Newton needs.
+
+        Returns:
+            [y, 8, x]: the derivatives of the residual by theta, then the residual r = second - first; and where known.
+        """
+        one, two, known = self.warped(theta)
+        mean = (one + two) / 2
+        cx, cy = self.box.center
+        x, y = self.box.x[None, :] - cx, self.box.y[:, None] - cy
+        gx, gy = derivative(mean, axis=1), derivative(mean, axis=0)
+        return np.stack([gx, gy, -mean, gx * x, gx * y, gy * x, gy * y, two - one], axis=1), known
+
+
+def derivative(values: Array, axis: int) -> Array:
+    """Per pixel, from five points (three next to the border, two on it)."""
+    d: Array = np.gradient(values, axis=axis)
+    v, out = np.moveaxis(values, axis, 0), np.moveaxis(d, axis, 0)
+    out[2:-2] = (v[:-4] - 8.0 * v[1:-3] + 8.0 * v[3:-1] - v[4:]) / 12.0
+    return d
