@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import zmq
 from zmq.backend import Socket as _Library
+from zmq.backend import zmq_poll
 
 if TYPE_CHECKING:
     Socket = zmq.Socket[bytes]
@@ -19,8 +20,7 @@ _LARGE = 32 * 1024
 # the sending and receiving itself.
 _send: Any = _Library.send
 _receive: Any = _Library.recv
-_get: Any = _Library.get
-_NOBLOCK, _SNDMORE, _EVENTS, _POLLIN = int(zmq.NOBLOCK), int(zmq.SNDMORE), int(zmq.EVENTS), int(zmq.POLLIN)
+_NOBLOCK, _SNDMORE, _POLLIN = int(zmq.NOBLOCK), int(zmq.SNDMORE), int(zmq.POLLIN)
 _SRCFD, _NOBLOCK_MORE = int(zmq.SRCFD), int(zmq.NOBLOCK | zmq.SNDMORE)
 # (the argument `copy`: a frame costs less than bytes, since it knows whether more frames follow)
 _AS_FRAME = False
@@ -28,20 +28,25 @@ _AS_FRAME = False
 
 def readable(socket: Socket) -> bool:
     """Whether a message can be received at once."""
-    return bool(_get(socket, _EVENTS) & _POLLIN)
+    # to ask for the option EVENTS takes longer: the library first makes an enumeration of its number
+    return bool(zmq_poll([(socket, _POLLIN)], 0))
 
 
-def receive(socket: Socket) -> list[zmq.Frame]:
-    """One whole message as it lies in the library's buffers; empty if there is none."""
+def receive(socket: Socket) -> list[bytes | memoryview]:
+    """The contents of the frames of one whole message; empty if there is none.
+
+    What is large is a view of the library's buffer, which it keeps alive.
+    """
+    contents: list[bytes | memoryview] = []
+    more = True
     try:
-        frame: zmq.Frame = _receive(socket, _NOBLOCK, _AS_FRAME)
+        while more:
+            frame: Any = _receive(socket, _NOBLOCK, _AS_FRAME)
+            more = frame.more
+            contents.append(frame.bytes if len(frame) < _LARGE else memoryview(frame).toreadonly())
     except zmq.Again:
-        return []
-    frames = [frame]
-    while frame.more:
-        frame = _receive(socket, _NOBLOCK, _AS_FRAME)
-        frames.append(frame)
-    return frames
+        pass  # before the first frame: a message comes whole
+    return contents
 
 
 def receive_small(socket: Socket) -> tuple[zmq.Frame | None, list[bytes]]:
@@ -67,11 +72,6 @@ def send(socket: Socket, frames: list[bytes]) -> bool:
     except zmq.Again:
         return False
     return True
-
-
-def payload_of(frame: zmq.Frame) -> bytes | memoryview:
-    """The contents: a view of the library's buffer if it is large, which it keeps alive."""
-    return frame.bytes if len(frame) < _LARGE else memoryview(frame.buffer).toreadonly()
 
 
 def send_packet(socket: Socket, head: Sequence[bytes], payload: bytes | memoryview, tail: bytes | None) -> None:

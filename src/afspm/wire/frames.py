@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, Final
 
+from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from afspm.errors import AfspmError, WireError
@@ -14,7 +15,6 @@ from afspm.wire import convert
 from afspm.wire.codec import Buffer, encode
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.messages import parse
-from afspm.wire.split import as_varint, varint
 
 KILL: Final = b"KILL"
 """The packet of one frame by which everybody who subscribes learns that the experiment has ended."""
@@ -25,20 +25,12 @@ CLOSING: Final = b"\x01"
 LONGEST_ID = 200
 LONGEST_ENVELOPE = 1000
 
-
-# A time stands in every packet, and to make a message of it takes longer than all else that is done with a packet: so
-# its two fields, seconds = 1 and nanos = 2, are read and written by hand. What is unusual is left to the library.
-_SECONDS, _NANOS = 0x08, 0x10
 _NS = 1_000_000_000
 
 
 def encode_time(time_ns: int) -> bytes:
     """The third frame of a packet: a serialised google.protobuf.Timestamp."""
-    if time_ns < 0:
-        return convert.timestamp(time_ns).SerializeToString()
-    seconds, nanos = divmod(time_ns, _NS)
-    text = bytes([_SECONDS]) + as_varint(seconds) if seconds else b""
-    return text + bytes([_NANOS]) + as_varint(nanos) if nanos else text
+    return Timestamp(seconds=time_ns // _NS, nanos=time_ns % _NS).SerializeToString()
 
 
 def decode_time(frame: Buffer) -> int:
@@ -47,18 +39,11 @@ def decode_time(frame: Buffer) -> int:
     Raises:
         WireError: it is none.
     """
-    data = bytes(frame)
-    seconds = nanos = at = 0
-    while at < len(data):
-        if data[at] == _SECONDS:
-            seconds, at = varint(data, at + 1)
-        elif data[at] == _NANOS:
-            nanos, at = varint(data, at + 1)
-        else:
-            return convert.time_ns(parse(Timestamp, data))
-    if seconds >= 1 << 63 or nanos >= 1 << 31:
-        return convert.time_ns(parse(Timestamp, data))
-    return seconds * _NS + nanos
+    try:
+        stamp = Timestamp.FromString(bytes(frame))
+    except DecodeError as error:
+        raise WireError(f"the bytes are no Timestamp: {error}") from None
+    return stamp.seconds * _NS + stamp.nanos
 
 
 def encode_packet(packet: Packet) -> list[Buffer]:
