@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo test check bench soak chaos simulate clean
+.PHONY: demo test check bench bench-drift soak chaos simulate clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -30,6 +30,10 @@ check: $(SETUP)
 ## speed, beside bare pyzmq: a table, and build/bench.json
 bench: $(SETUP)
 	@$(BIN)/python -m benchmarks
+
+## drift: errors of the estimates beside the theoretical bound, and build/bench-drift.json: make bench-drift QUICK=1
+bench-drift: $(SETUP)
+	@$(BIN)/python -m benchmarks.drift $(if $(QUICK),--quick)
 
 ## a million malformed requests and packets
 soak: $(SETUP)

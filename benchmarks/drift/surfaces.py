@@ -131,7 +131,7 @@ def imaged(height: Array, second_tip_px: tuple[float, float] | None = None) -> A
     """What a tip makes of a surface of unit rms: dilated by a parabola, and of limited band.
 
     Args:
-        second_tip_px: (x, y) of a second apex as sharp as the first, a quarter of the rms height shorter.
+        second_tip_px: (x, y) of a second apex as sharp as the first, one rms height shorter.
     """
     reach = math.ceil(TIP_PX * OVERSAMPLING * math.sqrt(max(np.ptp(height), 1e-9)))
     reach = min(reach, 6 * OVERSAMPLING)
@@ -141,7 +141,7 @@ def imaged(height: Array, second_tip_px: tuple[float, float] | None = None) -> A
         touched = _dilated(touched, tip, axis)
     if second_tip_px is not None:
         dx, dy = (round(d * OVERSAMPLING) for d in second_tip_px)
-        touched = np.maximum(touched, np.roll(touched, (dy, dx), axis=(0, 1)) - 0.25)
+        touched = np.maximum(touched, np.roll(touched, (dy, dx), axis=(0, 1)) - 1.0)
     return np.asarray(ndimage.gaussian_filter(touched, BAND_PX * OVERSAMPLING, mode="nearest", truncate=5.0))
 
 

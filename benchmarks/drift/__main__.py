@@ -1,0 +1,105 @@
+"""`python -m benchmarks.drift`: how well drift is estimated, beside the bound and beside the methods of features.
+
+Prints tables, writes build/bench-drift.json (the lines with a target, in the form of build/bench.json) and
+build/bench-drift.txt (all that was printed). Returns 1 if a target was missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import json
+import os
+import secrets
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+# Before numpy starts its own threads: the cores are shared out by pairs.
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+
+from rich.console import Console
+from rich.table import Table
+
+from afspm.drift.estimators import DEFAULT, READY_MADE
+from afspm.drift.estimators import estimator as estimator_named
+from afspm.errors import ConfigError
+from benchmarks.drift import sizes
+from benchmarks.drift.parts import Plan
+from benchmarks.drift.workers import done
+from benchmarks.rows import Row
+
+PARTS = ("tracks", "sizes", "accuracy", "false_acceptance")  # the longest jobs first
+RESULT = Path("build/bench-drift.json")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    asked = _parser().parse_args(arguments)
+    console = Console(record=True, width=140, highlight=False)
+    plan = Plan(asked.seed, asked.quick, _available(asked.estimators, console))
+    began_s = time.perf_counter()
+    modules = [(n, importlib.import_module(f"benchmarks.drift.{n}")) for n in asked.parts if _exists(n)]
+    lists = [module.jobs(plan) for _, module in modules]
+    results = done([job for jobs in lists for job in jobs], asked.processes)
+    rows: list[Row] = []
+    for (_, module), jobs in zip(modules, lists, strict=True):
+        report = module.report(plan, [one for job in jobs for one in results[job]])
+        rows += report.rows
+        for table in report.tables:
+            console.print(table, "")
+    if "sizes" in asked.parts:
+        rows += sizes.costs(plan)
+    console.print(_targets(rows))
+    console.print(f"seed {plan.seed}{', quick' * plan.quick}; {time.perf_counter() - began_s:.0f} s")
+    RESULT.parent.mkdir(exist_ok=True)
+    RESULT.write_text(json.dumps([row.to_json() for row in rows], indent=1) + "\n", encoding="utf-8")
+    RESULT.with_suffix(".txt").write_text(console.export_text(), encoding="utf-8")
+    return 0 if all(row.met for row in rows) else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.drift", description=__doc__)
+    parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6) * 1000, help="default: a fresh one")
+    parser.add_argument("--quick", action="store_true", help="an eighth of the pairs")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--estimators", nargs="+", default=[DEFAULT, *(n for n in READY_MADE if n != DEFAULT)],
+                        help="names; the first is held against the targets")  # fmt: skip
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    return parser
+
+
+def _available(names: Sequence[str], console: Console) -> tuple[str, ...]:
+    """Those that can be made here; the first has to be."""
+    estimator_named(names[0])
+    found = [names[0]]
+    for name in names[1:]:
+        try:
+            estimator_named(name)
+        except ConfigError as error:
+            console.print(f"without {name}: {error}")
+        else:
+            found.append(name)
+    return tuple(found)
+
+
+def _exists(part: str) -> bool:
+    return importlib.util.find_spec(f"benchmarks.drift.{part}") is not None
+
+
+def _targets(rows: Sequence[Row]) -> Table:
+    table = Table(title="targets", title_justify="left", box=None, pad_edge=False)
+    for head in ("", "ours", "beside", "ratio", "target", ""):
+        table.add_column(head, justify="left" if not head else "right")
+    for row in rows:
+        sign = "<=" if row.better == "low" else ">="
+        bare = "" if row.bare is None else f"{row.bare:.4g}"
+        mark = "[green]met[/]" if row.met else "[red]MISSED[/]"
+        ratio = "" if row.bare is None else f"{row.ratio:.2f}"
+        table.add_row(f"{row.name} \\[{row.unit}]", f"{row.ours:.4g}", bare, ratio, f"{sign} {row.target:g}", mark)
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+"""How often scans that have nothing in common are said to fit: with what a tracker would expect, and without."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.table import Table
+
+from benchmarks.drift.parts import Plan, Report
+from benchmarks.drift.surfaces import SURFACES
+from benchmarks.drift.trials import Outcome, Trial
+from benchmarks.rows import Row
+
+CONDITIONS = ("null", "nullh")
+PAIRS = 60
+COMPARED = 10
+PRIOR_SD_PX = 1.0
+
+
+def jobs(plan: Plan) -> list[Trial]:
+    found = []
+    for condition in CONDITIONS:
+        for surface in SURFACES:
+            compared = set(plan.seeds(COMPARED))
+            for seed in plan.seeds(PAIRS):
+                names = plan.estimators if seed in compared else plan.estimators[:1]
+                found.append(Trial(condition, surface, condition, seed, names))
+                found.append(
+                    Trial(f"{condition}+prior", surface, condition, seed, (plan.ours,), prior_sd_px=PRIOR_SD_PX)
+                )
+    return found
+
+
+def report(plan: Plan, results: Sequence[Outcome]) -> Report:
+    table = Table(title="accepted though nothing is in common, %", title_justify="left", box=None, pad_edge=False)
+    for head in ("", "estimator", "n", *SURFACES):
+        table.add_column(head)
+    for cell in dict.fromkeys(o.cell for o in results):
+        for name in plan.estimators:
+            here = [o for o in results if (o.cell, o.estimator) == (cell, name)]
+            if here:
+                count = len(here) // len(SURFACES)
+                table.add_row(cell, name, str(count), *(f"{_percent(here, s):.1f}" for s in SURFACES))
+    own = [o for o in results if o.estimator == plan.ours]
+    informed = [o for o in own if "+" in o.cell]
+    blind = [o for o in own if "+" not in o.cell]
+    rows = [
+        Row("nothing in common, prior: accepted, worst surface", "%", max(_percent(informed, s) for s in SURFACES),
+            None, 0.5),
+        Row("nothing in common: accepted, worst but stamper", "%",
+            max(_percent(blind, s) for s in SURFACES if s != "stamper"), None, 2),
+    ]  # fmt: skip
+    return Report([table], rows)
+
+
+def _percent(outcomes: Sequence[Outcome], surface: str) -> float:
+    here = [o.accepted for o in outcomes if o.surface == surface]
+    return 100 * sum(here) / len(here)

@@ -1,0 +1,173 @@
+"""One pair, some estimators, and how far each is from the truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from afspm.drift.estimators import estimator
+from afspm.drift.registration import Registration
+from benchmarks.drift.bounds import bounds
+from benchmarks.drift.conditions import Array
+from benchmarks.drift.pairs import PIXEL_M, Pair, Sampling, pair
+
+FAILED_PX = 1.0  # further off than this is no estimate
+ELLIPSE_95 = 5.991  # of chi square with two degrees of freedom
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one estimator made of one pair.
+
+    Attributes:
+        cell: what the pair stands for, as the part names it.
+        error_px: (x, y) estimate less truth at the middle of the overlap; NaN without an estimate or a truth.
+        chi2: of the error and the covariance, both at the centre that the estimator chose.
+        bound_px, white_bound_px: roots of the traces of Cb and C.
+        cpu_s: of this process.
+    """
+
+    cell: str
+    surface: str
+    estimator: str
+    seed: int
+    accepted: bool
+    reason: str
+    error_px: tuple[float, float]
+    chi2: float
+    bound_px: float
+    white_bound_px: float
+    cpu_s: float
+
+    @property
+    def off_px(self) -> float:
+        return math.hypot(*self.error_px)
+
+    @property
+    def failed(self) -> bool:
+        """No estimate, or one that is off by a pixel or more."""
+        return not self.off_px <= FAILED_PX
+
+    @property
+    def wrong(self) -> bool:
+        """Accepted, and wrong."""
+        return self.accepted and self.failed
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A job: one pair, registered by some estimators."""
+
+    cell: str
+    surface: str
+    condition: str
+    seed: int
+    estimators: tuple[str, ...]
+    size: int = 128
+    samplings: tuple[Sampling, Sampling] | None = None
+    prior_sd_px: float | None = None
+
+    def run(self) -> list[Outcome]:
+        made = pair(
+            self.surface, self.condition, self.seed, self.size, samplings=self.samplings, prior_sd_px=self.prior_sd_px
+        )
+        return [self._outcome(made, name) for name in self.estimators]
+
+    def _outcome(self, made: Pair, name: str) -> Outcome:
+        register = estimator(name).register
+        began_s = time.process_time()
+        found = register(made.reference, made.scan, made.prior)
+        cpu_s = time.process_time() - began_s
+        error, chi2 = _errors(made, found)
+        full = white = math.nan
+        if made.truth is not None:
+            best = bounds(made)
+            full, white = math.sqrt(np.trace(best.full)), math.sqrt(np.trace(best.white))
+        return Outcome(
+            self.cell, self.surface, name, self.seed, found.accepted, found.reason, error, chi2, full, white, cpu_s
+        )  # fmt: skip
+
+
+def _errors(made: Pair, found: Registration) -> tuple[tuple[float, float], float]:
+    """Error at the middle of the overlap in pixels, and chi square at the centre of the estimate."""
+    if made.truth is None or not np.isfinite(found.displacement_m).all():
+        return (math.nan, math.nan), math.nan
+    moved_m = found.displacement_m + found.linear @ (made.truth.center_m - found.center_m)
+    x, y = (moved_m - made.truth.displacement_m) / PIXEL_M
+    own = found.displacement_m - made.truth.at(found.center_m)
+    try:
+        chi2 = float(own @ np.linalg.solve(found.covariance_m2, own))
+    except np.linalg.LinAlgError:
+        chi2 = math.nan
+    return (float(x), float(y)), chi2
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The figures of some outcomes.
+
+    Attributes:
+        rms_px, p95_px: of those that did not fail.
+        bound_px: root mean square of Cb over the same pairs.
+        failed, accepted, wrong: shares of all.
+        bias_px: mean error, (x, y), of those that did not fail.
+        covered: share of the accepted whose 95 % ellipse has the truth in it.
+        ms: median, of the processor's time.
+    """
+
+    count: int
+    rms_px: float
+    p95_px: float
+    bound_px: float
+    white_bound_px: float
+    failed: float
+    accepted: float
+    wrong: float
+    bias_px: tuple[float, float]
+    covered: float
+    ms: float
+
+    @property
+    def ratio(self) -> float:
+        return self.rms_px / self.bound_px
+
+    @classmethod
+    def of(cls, outcomes: Iterable[Outcome]) -> Cell:
+        every = list(outcomes)
+        good = [o for o in every if not o.failed]
+        sure = [o for o in every if o.accepted]
+        return cls(
+            count=len(every),
+            rms_px=_rms([o.off_px for o in good]),
+            p95_px=_of([o.off_px for o in good], lambda a: float(np.percentile(a, 95))),
+            bound_px=_rms([o.bound_px for o in good]),
+            white_bound_px=_rms([o.white_bound_px for o in good]),
+            failed=_of([o.failed for o in every]),
+            accepted=_of([o.accepted for o in every]),
+            wrong=_of([o.wrong for o in every]),
+            bias_px=(_of([o.error_px[0] for o in good]), _of([o.error_px[1] for o in good])),
+            covered=_of([o.chi2 <= ELLIPSE_95 for o in sure]),
+            ms=1e3 * _of([o.cpu_s for o in every], lambda a: float(np.median(a))),
+        )
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean())
+
+
+def _of(values: Sequence[float], figure: Callable[[Array], float] = _mean) -> float:
+    """A figure of some values, NaN of none."""
+    return figure(np.array(values, dtype=np.float64)) if values else math.nan
+
+
+def _rms(values: Sequence[float]) -> float:
+    return _of(values, lambda a: math.sqrt(np.mean(a**2)))
+
+
+def geometric_mean(values: Iterable[float]) -> float:
+    """NaN if any is."""
+    return float(np.exp(np.mean(np.log(np.array(list(values))))))
