@@ -24,8 +24,8 @@ _LINGER_MS = 200
 # A peer that is frozen or cut off is found within seconds and not when the system gives up on it after hours.
 _ALIVE_CHECK_MS, _ALIVE_TIMEOUT_MS = 2_000, 8_000
 # That is asked behind what waits for the peer, so one that takes nothing more is never asked. It is disconnected after
-# this time, and what waited for it is dropped: 4,000 scans may be more than any memory. Back again it asks for what it
-# missed. (Linux and Windows.)
+# this time, and what waited for it is dropped. Back again it asks for what it missed. (Linux and Windows; how much may
+# wait until then, see `laggards`.)
 _STALLED_MS = 5_000
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
 _HANDSHAKE_MS = 5_000

@@ -9,6 +9,7 @@ import zmq
 from afspm import wire
 from afspm.model import Packet
 from afspm.transport.frames import descriptor_of, property_of, readable, send_packet
+from afspm.transport.laggards import MOST_WAITING_BYTES, Laggards
 from afspm.transport.network import Network
 from afspm.transport.replay import Marker, is_reserved, spelled_out
 
@@ -23,16 +24,23 @@ class Publisher:
     it again, and from then on everything, without a gap. A subscriber of version 1 is sent what was kept as ordinary
     packets, which all of that version see.
 
+    Nobody is waited for. A subscriber of ours for which too much waits is disconnected: once it takes something again,
+    it connects anew and asks for what it missed.
+
     Args:
         history: what was published before; asked when somebody subscribes.
+        most_waiting_bytes: how much may wait for a subscriber.
     """
 
-    def __init__(self, network: Network, address: str, history: History) -> None:
+    def __init__(
+        self, network: Network, address: str, history: History, *, most_waiting_bytes: int = MOST_WAITING_BYTES
+    ) -> None:
         self.history = history
         self.touched = True
         self.socket = network.socket(zmq.XPUB)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
+        self._laggards = Laggards(self.socket, most_waiting_bytes)
         self.address = network.bind(self.socket, address)
 
     def publish(self, packet: Packet) -> None:
@@ -40,6 +48,7 @@ class Publisher:
         tail = None if packet.time_ns is None else wire.encode_time(packet.time_ns)
         self.touched = True
         send_packet(self.socket, [packet.envelope.encode()], packet.payload, tail)
+        self._laggards.published(len(packet.payload))
 
     def kill(self) -> None:
         """The experiment has ended: tell everyone to close."""
@@ -68,6 +77,7 @@ class Publisher:
     def _subscribed(self, subscription: bytes, frame: zmq.Frame, plain: dict[object, list[bytes]]) -> int:
         marker = Marker.decode(subscription)
         if marker is not None:
+            self._laggards.joined(marker.name, frame)
             self._replay(marker)
             return 1
         # our own subscribers repeat their prefixes by themselves when a connection is made again, before they can say

@@ -36,6 +36,11 @@ class Marker(NamedTuple):
     since_ns: int
     prefixes: tuple[str, ...]
 
+    @property
+    def name(self) -> str:
+        """Of the subscriber."""
+        return self.topic[len(_BEGIN) :].rpartition(b"/")[0].decode("utf-8", "replace")
+
     def encode(self) -> bytes:
         return b"\0".join([self.topic, b"%d" % self.since_ns, *(prefix.encode() for prefix in self.prefixes)])
 

@@ -1,0 +1,106 @@
+"""A subscriber that is stopped while large scans are published: memory stays bounded, and nobody else notices."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from afspm import wire
+from afspm.logic.envelopes import DEFAULT_HISTORY
+from afspm.model import Region, Scan
+from afspm.transport.laggards import MOST_WAITING_BYTES
+
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="a process is stopped by a signal, and its peak memory is read from /proc"
+)
+PIXELS = 2048
+SCAN_BYTES = 8 * PIXELS**2  # 32 MB
+SCANS = 36
+MOST_GROWTH_BYTES = MOST_WAITING_BYTES + 6 * SCAN_BYTES
+"""What may wait for a subscriber; and on their way at the same time: the scan in the cache and the one that replaces
+it, two being received, one being sent, and one between two looks at what waits."""
+
+
+class Listener:
+    """`listener.py`, and the times of the scans that it has received."""
+
+    def __init__(self, address: str, name: str) -> None:
+        self.times: list[int] = []
+        self.process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("listener.py")), address, name],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        self.times.extend(int(line) for line in self.process.stdout)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._thread.join()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def listener(rig: Any) -> Iterator[Callable[[str], Listener]]:
+    started: list[Listener] = []
+
+    def start(name: str) -> Listener:
+        started.append(Listener(rig.publish, name))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.close()
+
+
+def memory_bytes(pid: int, field: str) -> int:
+    """VmRSS: resident now; VmHWM: resident at most until now."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(field))
+
+
+def test_what_waits_for_a_stopped_subscriber_is_bounded_in_bytes_and_others_miss_nothing(
+    rig: Any, listener: Callable[[str], Listener]
+) -> None:
+    rig.start()
+    stopped, healthy = listener("Stopped"), listener("Healthy")
+    scan = Scan(Region((0.0, 0.0), (2e-6, 2e-6)), "Height", "m", np.zeros((PIXELS, PIXELS)), 1)
+    payload = wire.encode(scan)[1]
+    first_ns = rig.clock.now_ns() + 60 * 10**9  # later than what the scheduler says by itself: times stay as they are
+
+    def publish(number: int) -> None:
+        rig.translator.publish("Scan2d", payload, first_ns + 1_000_000 * number)
+
+    publish(0)
+    rig.until(lambda: stopped.times and healthy.times)
+    before = memory_bytes(rig.process.pid, "VmRSS")
+    stopped.process.send_signal(signal.SIGSTOP)
+    for number in range(1, SCANS + 1):
+        publish(number)
+        rig.until(lambda number=number: len(healthy.times) >= number)  # two on their way at a time
+    rig.until(lambda: len(healthy.times) > SCANS)
+    assert healthy.times == [first_ns + 1_000_000 * number for number in range(SCANS + 1)]
+    assert memory_bytes(rig.process.pid, "VmHWM") - before < MOST_GROWTH_BYTES < SCANS * SCAN_BYTES
+
+    stopped.process.send_signal(signal.SIGCONT)
+    rig.until(lambda: stopped.times[-1] == healthy.times[-1])
+    assert stopped.times == sorted(set(stopped.times))
+    kept = DEFAULT_HISTORY["Scan2d"]
+    assert stopped.times[-kept:] == healthy.times[-kept:]
+    assert len(stopped.times) < SCANS  # the others were dropped
+    publish(SCANS + 1)
+    rig.until(lambda: stopped.times[-1] == healthy.times[-1] == first_ns + 1_000_000 * (SCANS + 1))
