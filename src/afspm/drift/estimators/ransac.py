@@ -1,0 +1,234 @@
+"""The transform that most pairs of points agree on: RANSAC on least squares (paper, supporting information, "Drift
+Estimation"; Fischler and Bolles 1981)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_ENOUGH = 0.9  # of all pairs: no better consensus is looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """`x -> linear @ (x - center) + center + shift`, in any unit of length."""
+
+    linear: Array
+    shift: Array
+    center: Array
+
+    def __call__(self, points: Array) -> Array:
+        mapped: Array = (points - self.center) @ self.linear.T + self.center + self.shift
+        return mapped
+
+    def shift_at(self, point: Array) -> Array:
+        """The displacement of one point."""
+        moved: Array = self(point[None])[0] - point
+        return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """A transform and the pairs (n,) that agree with it."""
+
+    transform: Transform
+    inlier: Mask
+
+    @property
+    def count(self) -> int:
+        return int(self.inlier.sum())
+
+
+def _translation(a: Array, b: Array) -> Array | None:
+    return np.eye(2)
+
+
+def _euclidean(a: Array, b: Array) -> Array | None:
+    """The nearest rotation (Kabsch 1976), in two dimensions."""
+    sine, cosine = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()
+    length = math.hypot(sine, cosine)
+    if length <= 1e-12 * max((a * a).sum(), 1e-300):
+        return None
+    linear: Array = np.array([[cosine, -sine], [sine, cosine]]) / length
+    return linear
+
+
+def _similarity(a: Array, b: Array) -> Array | None:
+    """The nearest rotation with a scale (Umeyama 1991), in two dimensions."""
+    square = (a * a).sum()
+    if square == 0.0:
+        return None
+    sine, cosine = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()
+    linear: Array = np.array([[cosine, -sine], [sine, cosine]]) / square
+    return linear
+
+
+def _affine(a: Array, b: Array) -> Array | None:
+    square = a.T @ a
+    if np.linalg.det(square) <= 1e-6 * np.trace(square) ** 2:  # (almost) on one line
+        return None
+    return np.asarray(np.linalg.solve(square, a.T @ b).T, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Form:
+    """Which transforms are looked for.
+
+    Attributes:
+        pairs: how many determine one.
+        linear: least squares for its 2 x 2 part, of points about their means; None where they don't determine it.
+    """
+
+    pairs: int
+    linear: Callable[[Array, Array], Array | None]
+
+
+FORMS = {
+    "translation": Form(1, _translation),
+    "euclidean": Form(2, _euclidean),
+    "similarity": Form(2, _similarity),
+    "affine": Form(3, _affine),
+}
+
+
+def fitted(a: Array, b: Array, form: Form, bend_max: float) -> Transform | None:
+    """The transform of points `a` (n, 2) nearest to `b`, least squares. None where they don't determine one, or it
+    turns, scales or shears by more than `bend_max` (what drifts does not)."""
+    if len(a) < form.pairs:
+        return None
+    middle, shift = a.mean(axis=0), (b - a).mean(axis=0)
+    linear = form.linear(a - middle, b - middle - shift)
+    if linear is None or np.abs(linear - np.eye(2)).max() > bend_max:
+        return None
+    return Transform(linear, shift, middle)
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """RANSAC with its settings.
+
+    Attributes:
+        form: of the transform.
+        iterations: at most.
+        bend_max: see `fitted`.
+        rng: of the choices.
+    """
+
+    form: Form
+    iterations: int
+    bend_max: float
+    rng: np.random.Generator
+
+    def among(self, a: Array, b: Array, radius: float) -> Consensus | None:
+        """The paper's steps: fit to a random few, see who agrees (squared error), fit to those, keep the better one,
+        end early when almost all agree.
+
+        Args:
+            a, b: the pairs, (n, 2) each.
+            radius: how far a pair may lie from the transform.
+
+        Returns:
+            None if no transform was found.
+        """
+        best: Consensus | None = None
+        best_error = math.inf
+        for _ in range(self.iterations if len(a) >= self.form.pairs else 0):
+            some = self.rng.choice(len(a), self.form.pairs, replace=False)
+            found = consensus(a, b, fitted(a[some], b[some], self.form, self.bend_max), radius)
+            if found is None or found.count < self.form.pairs:
+                continue
+            again = consensus(a, b, fitted(a[found.inlier], b[found.inlier], self.form, self.bend_max), radius)
+            if again is not None and again.count >= found.count:
+                found = again
+            error = float(_squares(a, b, found.transform)[found.inlier].mean())
+            if best is None or (found.count, -error) > (best.count, -best_error):
+                best, best_error = found, error
+                if best.count >= _ENOUGH * len(a):
+                    break
+        return best
+
+    def within(self, coarse: Consensus, a: Array, b: Array, radius: float) -> Consensus | None:
+        """The same among those that agree already, with a smaller radius."""
+        near = np.flatnonzero(coarse.inlier)
+        found = self.among(a[near], b[near], radius)
+        if found is None:
+            return None
+        inlier = np.zeros(len(a), dtype=np.bool_)
+        inlier[near[found.inlier]] = True
+        return Consensus(found.transform, inlier)
+
+
+def consensus(a: Array, b: Array, transform: Transform | None, radius: float) -> Consensus | None:
+    """Who agrees with a transform."""
+    if transform is None:
+        return None
+    return Consensus(transform, _squares(a, b, transform) <= radius**2)
+
+
+def tightened(
+    a: Array, b: Array, start: Consensus, form: Form, *, least: float, most: float, bend_max: float
+) -> Consensus:
+    """The fit to those that lie as near as most of the inliers do: three robust standard deviations, from `least` to
+    `most`, until nothing changes. A wide radius lets mismatches in, and each of them pulls."""
+    best = start
+    for _ in range(10):
+        near = np.sqrt(_squares(a, b, best.transform)[best.inlier])
+        # the median of a Rayleigh distribution is 1.18 standard deviations
+        radius = min(max(3.0 * float(np.median(near)) / 1.18, least), most)
+        transform = fitted(a[best.inlier], b[best.inlier], form, bend_max)
+        found = consensus(a, b, transform, radius)
+        if found is None or found.count < form.pairs:
+            return best
+        if np.array_equal(found.inlier, best.inlier):
+            return found
+        best = found
+    return best
+
+
+def log10_false_alarms(pairs: int, inliers: int, sample: int, chance: float) -> float:
+    """How many consensuses as large are expected among pairs that have nothing in common, as a power of ten.
+
+    A contrario (Moisan and Stival 2004): (n - s) C(n, k) C(k, s) p^(k - s).
+
+    Args:
+        pairs, inliers, sample: n, k and s.
+        chance: p, that a wrong pair agrees with a transform.
+    """
+    if inliers <= sample:
+        return math.inf
+
+    def log_choose(n: int, k: int) -> float:
+        return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+
+    log = math.log(max(pairs - sample, 1)) + log_choose(pairs, inliers) + log_choose(inliers, sample)
+    return (log + (inliers - sample) * math.log(min(max(chance, 1e-12), 1.0))) / math.log(10.0)
+
+
+def jackknife_covariance(a: Array, b: Array, block: NDArray[np.intp], form: Form, at: Array) -> Array | None:
+    """Covariance (2, 2) of the displacement at a point, from leaving out one block of pairs after the other: pairs of
+    one place err together, so they are left out together. None for fewer than 3 blocks, or if it can't be fitted."""
+    blocks = np.unique(block)
+    shifts = []
+    for left_out in blocks:
+        kept = block != left_out
+        transform = fitted(a[kept], b[kept], form, math.inf)
+        if transform is None:
+            return None
+        shifts.append(transform.shift_at(at))
+    if len(blocks) < 3:
+        return None
+    deviation = np.array(shifts) - np.mean(shifts, axis=0)
+    covariance: Array = deviation.T @ deviation * (len(blocks) - 1) / len(blocks)
+    return covariance
+
+
+def _squares(a: Array, b: Array, transform: Transform) -> Array:
+    squares: Array = ((transform(a) - b) ** 2).sum(axis=1)
+    return squares

@@ -1,0 +1,49 @@
+"""Scans of a surface that is known everywhere exactly, for tests of estimators."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.registration import DriftScan
+from afspm.model import Region
+
+Array = NDArray[np.float64]
+PIXEL_M = 10e-9
+
+
+class Waves:
+    """A rough surface, as a sum of waves: its height at any position without interpolation."""
+
+    def __init__(self, seed: int, count: int = 150) -> None:
+        random = np.random.default_rng(seed)
+        length_m = PIXEL_M * np.exp(random.uniform(np.log(5.0), np.log(60.0), count))
+        direction = random.uniform(0.0, 2 * np.pi, count)
+        self._k = 2 * np.pi / length_m * np.array([np.cos(direction), np.sin(direction)])
+        self._phase = random.uniform(0.0, 2 * np.pi, count)
+        self._height_m = 1e-9 * length_m / length_m.max()
+
+    def at(self, x_m: Array, y_m: Array) -> Array:
+        height = np.zeros(x_m.shape)
+        for kx, ky, phase, amplitude in zip(*self._k, self._phase, self._height_m, strict=True):
+            height += amplitude * np.cos(kx * x_m + ky * y_m + phase)
+        return height
+
+
+def scanned(
+    surface: Waves,
+    region: Region,
+    shape: tuple[int, int],
+    drift_m: tuple[float, float] = (0.0, 0.0),
+    *,
+    turned_rad: float = 0.0,
+    noise: float = 0.02,
+    seed: int = 0,
+) -> DriftScan:
+    """What a tip sees in `region`: a feature at `x` is found at `drift_m + R x`, R a turn about the origin."""
+    x, y = region.pixels_m(shape)
+    x, y = x - drift_m[0], y - drift_m[1]
+    cos, sin = np.cos(turned_rad), np.sin(turned_rad)
+    values = surface.at(cos * x + sin * y, -sin * x + cos * y)
+    values = values + noise * values.std() * np.random.default_rng(seed).standard_normal(shape)
+    return DriftScan(values, region, 0.0, 100.0)
