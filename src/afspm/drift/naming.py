@@ -1,0 +1,108 @@
+"""Parts of drift correction by name: ready-made ones, and users' own as "module.Name"."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+import inspect
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from afspm.errors import AfspmError, ConfigError
+
+
+@dataclass(frozen=True)
+class ReadyMade:
+    """Something that has a name.
+
+    Attributes:
+        path: its class, "module.Name".
+        library: what it needs besides numpy.
+        extra: of afspm, which installs that.
+    """
+
+    path: str
+    library: str = "scipy"
+    extra: str = "drift"
+
+
+def named(
+    what: str, spec: str | Mapping[str, Any], ready_made: Mapping[str, ReadyMade], default: str, *arguments: object
+) -> tuple[object, str]:
+    """What a user asks for, and its name.
+
+    Args:
+        what: "estimator" or "tracker", for errors.
+        spec: a name of `ready_made` or "module.Name", or a table with that as its `class` and the settings of it (only
+            `class` names code).
+        default: where the table has no class.
+        arguments: given before the settings.
+
+    Raises:
+        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+    """
+    settings = {"class": spec} if isinstance(spec, str) else dict(spec)
+    name = settings.pop("class", default)
+    if not isinstance(name, str):
+        raise ConfigError(f"{_a(what)} is named by a text, not {name!r}", where="class")
+    found = _imported(what, name) if "." in name else _ready_made(what, name, ready_made)
+    _check_settings(what, name, found, settings, len(arguments))
+    try:
+        return found(*arguments, **settings), name
+    except AfspmError as error:
+        where = f"{name}: {error.where}" if error.where else name
+        raise ConfigError(error.what, where=where, hint=error.hint) from error
+    except Exception as error:  # anybody's constructor
+        raise ConfigError(f"the {what} {name} can't be made with these settings: {error}") from error
+
+
+def _imported(what: str, name: str) -> type[Any]:
+    module_name, _, class_name = name.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        hint = "is it installed, or on the path?"
+        raise ConfigError(f"the {what} {name} can't be imported: {error}", hint=hint) from error
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type):
+        raise ConfigError(f"the module {module_name} has no class {class_name}", hint=_near(class_name, vars(module)))
+    return found
+
+
+def _ready_made(what: str, name: str, ready_made: Mapping[str, ReadyMade]) -> type[Any]:
+    if name not in ready_made:
+        known = ", ".join(ready_made)
+        hint = _near(name.casefold(), ready_made) or f"there are {known}; write one of your own as module.Name"
+        raise ConfigError(f"there is no {what} {name!r}", hint=hint)
+    entry = ready_made[name]
+    if importlib.util.find_spec(entry.library) is None:
+        raise ConfigError(f"the {what} {name!r} needs {entry.library}", hint=f'pip install "afspm[{entry.extra}]"')
+    module_name, _, class_name = entry.path.rpartition(".")
+    found: type[Any] = getattr(importlib.import_module(module_name), class_name)
+    return found
+
+
+def _check_settings(what: str, name: str, class_: type[Any], settings: Mapping[str, Any], given: int) -> None:
+    """Settings are looked at first, so that a typo is told as one."""
+    try:
+        parameters = list(inspect.signature(class_).parameters.values())[given:]
+    except ValueError:  # a class of C code without a signature
+        return
+    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+        return
+    known = [p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.POSITIONAL_ONLY)]
+    for key in settings:
+        if key not in known:
+            hint = _near(key, known) or f"it takes {', '.join(known) or 'none'}"
+            raise ConfigError(f"the {what} {name} has no setting {key!r}", where=key, hint=hint)
+
+
+def _near(name: str, names: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(names), n=1)
+    return f"did you mean {close[0]!r}?" if close else ""
+
+
+def _a(what: str) -> str:
+    return f"an {what}" if what[0] in "aeiou" else f"a {what}"

@@ -1,0 +1,61 @@
+"""Trackers by name, users' own, and forecasts from JSON.
+
+tracker("bank", estimator)
+tracker({"class": "paper", "w_update": 0.8}, estimator)
+tracker({"class": "my_lab.Follower"}, estimator)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Table
+from typing import Any
+
+from afspm.drift.estimators import estimator as default_estimator
+from afspm.drift.naming import ReadyMade, named
+from afspm.drift.registration import Estimator
+from afspm.drift.trackers.bank import BankTracker
+from afspm.drift.trackers.forecast import BankForecast
+from afspm.drift.trackers.paper import PaperForecast, PaperTracker
+from afspm.drift.tracking import Forecast, Tracker
+from afspm.errors import ConfigError, InvalidValue
+
+__all__ = ["DEFAULT", "READY_MADE", "BankTracker", "PaperTracker", "forecast_from_dict", "tracker"]
+
+DEFAULT = "bank"
+
+READY_MADE: Table[str, ReadyMade] = {
+    DEFAULT: ReadyMade("afspm.drift.trackers.bank.BankTracker", "numpy"),
+    "paper": ReadyMade("afspm.drift.trackers.paper.PaperTracker", "numpy"),
+}
+_FORECASTS: Table[str, type[BankForecast] | type[PaperForecast]] = {"bank": BankForecast, "paper": PaperForecast}
+
+
+def tracker(spec: str | Table[str, Any] = DEFAULT, estimator: Estimator | None = None) -> Tracker:
+    """The tracker that is meant.
+
+    Args:
+        spec: a name of `READY_MADE` or "module.Name", or a table with that as its `class` and its settings.
+        estimator: that it registers scans with, its first argument; the default one if there is none.
+
+    Raises:
+        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+    """
+    made, name = named("tracker", spec, READY_MADE, DEFAULT, default_estimator() if estimator is None else estimator)
+    if not all(callable(getattr(made, method, None)) for method in ("add", "state", "restore")):
+        raise ConfigError(f"{name} is no tracker", hint="it needs add, state and restore, see afspm.drift.tracking")
+    return made  # type: ignore[return-value]
+
+
+def forecast_from_dict(table: Table[str, Any]) -> Forecast:
+    """What `Forecast.to_dict` made, of any of our trackers.
+
+    Raises:
+        InvalidValue: something else.
+    """
+    kind = str(table.get("kind"))
+    if kind not in _FORECASTS:
+        raise InvalidValue(f"a forecast of kind {kind!r}", hint=f"one of {', '.join(_FORECASTS)}")
+    try:
+        return _FORECASTS[kind].from_dict(table)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InvalidValue(f"a damaged forecast: {error}") from error

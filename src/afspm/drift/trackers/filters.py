@@ -1,0 +1,141 @@
+"""A bank of Kalman filters that share their measurements and differ in how drift may move.
+
+The state of each is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by two coordinates for
+each scan that is kept: the displacement at which that scan shows the sample. These stay correlated with each other and
+with the drift, so a scan that is compared many times is not taken for many (as landmarks in simultaneous localisation
+and mapping: Smith, Self and Cheeseman 1990).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.trackers.motion import Models
+from afspm.errors import InvalidValue
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Filters:
+    """n filters with s states each; nothing is changed in place.
+
+    Attributes:
+        models: how each moves.
+        time_s: of all of them.
+        mean: (n, s), m and m/s.
+        covariance: (n, s, s).
+        log_weight: (n,) of the probabilities of the filters.
+    """
+
+    models: Models
+    time_s: float
+    mean: Array
+    covariance: Array
+    log_weight: Array
+
+    @classmethod
+    def start(cls, models: Models, time_s: float, position_sd_m: float, velocity_sd_m_s: float) -> Filters:
+        """With the first scan, from which positions are counted: what it shows is where it is, exactly.
+
+        Args:
+            position_sd_m: of where the sample is when the scan shows it at zero: its location error.
+        """
+        n = len(models.density_m2_s3)
+        variances = [position_sd_m**2] * 2 + [velocity_sd_m_s**2] * 2 + [0.0] * 2
+        return cls(models, time_s, np.zeros((n, 6)), np.tile(np.diag(variances), (n, 1, 1)), np.full(n, -np.log(n)))
+
+    @property
+    def weight(self) -> Array:
+        """(n,) probabilities of the filters, sum 1."""
+        weight = np.exp(self.log_weight - self.log_weight.max())
+        return np.asarray(weight / weight.sum())
+
+    def moved(self, time_s: float, followed_m: Array) -> Filters:
+        """At a later time, in tip coordinates that have moved along by (2,)."""
+        step_s = time_s - self.time_s
+        transition, gained = self.models.over(step_s)
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[:, :4] = (transition @ mean[:, :4, None])[..., 0]
+        mean[:, :2] -= followed_m
+        covariance[:, :4, :] = transition @ covariance[:, :4, :]
+        covariance[:, :, :4] = covariance[:, :, :4] @ transition.transpose(0, 2, 1)
+        covariance[:, :4, :4] += gained
+        return replace(self, time_s=time_s, mean=mean, covariance=covariance)
+
+    def widened(self, position_sd_m: float, velocity_sd_m_s: float) -> Filters:
+        """Knowing less of the present."""
+        covariance = self.covariance.copy()
+        for k, sd in enumerate((position_sd_m, position_sd_m, velocity_sd_m_s, velocity_sd_m_s)):
+            covariance[:, k, k] += sd**2
+        return replace(self, covariance=covariance)
+
+    def with_scan(self, noise_m2: Array) -> Filters:
+        """With a scan of now that shows the sample where it is, but for a location error of a covariance (2, 2)."""
+        mean = np.concatenate([self.mean, self.mean[:, :2]], axis=1)
+        rows = np.concatenate([self.covariance, self.covariance[:, :2, :]], axis=1)
+        covariance = np.concatenate([rows, rows[:, :, :2]], axis=2)
+        covariance[:, -2:, -2:] += noise_m2
+        return replace(self, mean=mean, covariance=covariance)
+
+    def without_scan(self, number: int) -> Filters:
+        """Without one of the scans that are kept."""
+        kept = np.delete(np.arange(self.mean.shape[1]), (4 + 2 * number, 5 + 2 * number))
+        return replace(self, mean=self.mean[:, kept], covariance=self.covariance[:, kept][:, :, kept])
+
+    def mixed(self, rows: Array) -> tuple[Array, Array]:
+        """Mean (m,) and covariance (m, m) of `rows` (m, s) @ state over all filters."""
+        return mixed(self.weight, self.mean @ rows.T, rows @ self.covariance @ rows.T)
+
+    def updated(self, rows: Array, measured: Array, noise: Array, *, forget: float, rarest: float) -> Filters:
+        """After `measured` (m,) = `rows` (m, s) @ state + noise of a covariance (m, m).
+
+        Args:
+            forget: share of the logarithm of the old weights that is kept.
+            rarest: least weight beside the largest: a filter that was wrong for long must be able to come back.
+        """
+        innovation = measured - self.mean @ rows.T
+        crossed = self.covariance @ rows.T
+        expected = rows @ crossed + noise
+        gain = np.linalg.solve(expected, crossed.transpose(0, 2, 1)).transpose(0, 2, 1)
+        mean = self.mean + (gain @ innovation[..., None])[..., 0]
+        # Joseph's form stays positive
+        left = np.eye(self.mean.shape[1]) - gain @ rows
+        covariance = left @ self.covariance @ left.transpose(0, 2, 1) + gain @ noise @ gain.transpose(0, 2, 1)
+        covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
+        chi2 = (innovation * np.linalg.solve(expected, innovation[..., None])[..., 0]).sum(axis=1)
+        log_weight = forget * self.log_weight - (chi2 + np.linalg.slogdet(expected)[1]) / 2
+        log_weight = np.maximum(log_weight - log_weight.max(), np.log(rarest))
+        log_weight -= np.log(np.exp(log_weight).sum())
+        return replace(self, mean=mean, covariance=covariance, log_weight=log_weight)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the models."""
+        return {name: getattr(self, name) for name in ("time_s", "mean", "covariance", "log_weight")}
+
+    @classmethod
+    def from_dict(cls, models: Models, table: Table[str, Any]) -> Filters:
+        """What `to_dict` made.
+
+        Raises:
+            InvalidValue: of a bank with other filters.
+        """
+        mean, covariance, log_weight = (
+            np.asarray(table[name], dtype=np.float64) for name in ("mean", "covariance", "log_weight")
+        )
+        if len(log_weight) != len(models.density_m2_s3):
+            raise InvalidValue(f"a saved bank of {len(log_weight)} filters instead of {len(models.density_m2_s3)}")
+        return cls(models, float(table["time_s"]), mean, covariance, log_weight)
+
+
+def mixed(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """Mean (m,) and covariance (m, m) of a mixture of weights (n,), means (n, m) and covariances (n, m, m)."""
+    total = weight @ mean
+    apart = mean - total
+    spread = np.einsum("n,nij->ij", weight, covariance) + np.einsum("n,ni,nj->ij", weight, apart, apart)
+    return total, (spread + spread.T) / 2

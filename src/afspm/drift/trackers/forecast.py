@@ -1,0 +1,97 @@
+"""What a bank of filters knows, without the scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Table
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.mapping import Mapping
+from afspm.drift.trackers.compensation import Compensation
+from afspm.drift.trackers.filters import Filters, mixed
+from afspm.drift.trackers.motion import Models
+from afspm.drift.tracking import Prediction
+
+Array = NDArray[np.float64]
+
+_LEAST_WEIGHT = 1e-4  # filters that are less likely are left out
+
+
+@dataclass(frozen=True, eq=False)
+class BankForecast:
+    """The likely filters of a bank, n of them.
+
+    Attributes:
+        time_s: of the states.
+        models: how they move on.
+        weight: (n,) probabilities.
+        mean: (n, 4) displacement and velocity of the sample.
+        covariance: (n, 4, 4).
+        compensation: with which tip coordinates follow the sample.
+    """
+
+    time_s: float
+    models: Models
+    weight: Array
+    mean: Array
+    covariance: Array
+    compensation: Compensation
+
+    @classmethod
+    def at_start(cls) -> BankForecast:
+        """Before the first scan: it will be what positions are counted from."""
+        nothing = Models(np.zeros(1), np.zeros(1), 0.0)
+        return cls(0.0, nothing, np.ones(1), np.zeros((1, 4)), np.zeros((1, 4, 4)), Compensation())
+
+    @classmethod
+    def of(cls, filters: Filters, compensation: Compensation) -> BankForecast:
+        """What these filters know."""
+        likely = filters.weight >= _LEAST_WEIGHT
+        models = filters.models
+        return cls(
+            filters.time_s,
+            Models(models.density_m2_s3[likely], models.fading_per_s[likely], models.walk_m2_s),
+            filters.weight[likely] / filters.weight[likely].sum(),
+            filters.mean[likely, :4],
+            filters.covariance[likely, :4, :4],
+            compensation,
+        )
+
+    def at(self, time_s: float) -> Prediction:
+        """See `Forecast`."""
+        step_s = time_s - self.time_s
+        transition, gained = self.models.over(step_s)
+        means = (transition @ self.mean[..., None])[..., 0]
+        means[:, :2] -= self.compensation.followed_m(self.time_s, time_s)
+        means[:, 2:] -= self.compensation.velocity_m_s(time_s)
+        covariances = transition @ self.covariance @ transition.transpose(0, 2, 1) + gained
+        mean, covariance = mixed(self.weight, means, covariances)
+        return Prediction(time_s, Mapping.of_drift(mean[:2]), covariance[:2, :2], mean[2:], covariance[2:, 2:])
+
+    def to_dict(self) -> dict[str, Any]:
+        """See `Forecast`."""
+        return {
+            "kind": "bank",
+            "time_s": self.time_s,
+            "density_m2_s3": self.models.density_m2_s3.tolist(),
+            "fading_per_s": self.models.fading_per_s.tolist(),
+            "walk_m2_s": self.models.walk_m2_s,
+            "weight": self.weight.tolist(),
+            "mean": self.mean.tolist(),
+            "covariance": self.covariance.tolist(),
+            "compensation": [list(change) for change in self.compensation.changes],
+        }
+
+    @classmethod
+    def from_dict(cls, table: Table[str, Any]) -> BankForecast:
+        """What `to_dict` made."""
+        arrays = {name: np.array(table[name], dtype=np.float64) for name in _ARRAYS}
+        models = Models(arrays.pop("density_m2_s3"), arrays.pop("fading_per_s"), float(table["walk_m2_s"]))
+        compensation = Compensation.from_list(table["compensation"])
+        return cls(float(table["time_s"]), models, **arrays, compensation=compensation)
+
+
+_ARRAYS = ("density_m2_s3", "fading_per_s", "weight", "mean", "covariance")

@@ -1,0 +1,225 @@
+"""The tracker of the paper: first-order prediction, then the residual against the oldest scan that fits.
+
+Sullivan, Valdés, Bevan and Grutter, Beilstein J. Nanotechnol. 2026, 17, 653, "Overarching Workflow" and supporting
+information, "Drift Correction Algorithm".
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping as Table
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.mapping import Mapping
+from afspm.drift.overlap import intersection_ratio, sr_norm
+from afspm.drift.registration import DriftScan, Estimator, Registration
+from afspm.drift.trackers import saving
+from afspm.drift.trackers.transforms import TRANSFORMS, exponential, logarithm, transform_between
+from afspm.drift.tracking import Forecast, Prediction, Update
+from afspm.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+VERSION = 1
+_MEMORY = 0.7  # of the mean square of the residuals from one scan to the next
+
+
+@dataclass(frozen=True, eq=False)
+class PaperForecast:
+    """M_tot of the newest scan and the rate of the last step.
+
+    Attributes:
+        time_s: middle of the newest scan.
+        matrix: M_k, 3 x 3.
+        rate: (3, 3) logarithm of the last step by its duration, 1/s.
+        covariance_m2: (2, 2) of the newest scan's position.
+        rate_covariance: (2, 2), (m/s)².
+    """
+
+    time_s: float
+    matrix: Array
+    rate: Array
+    covariance_m2: Array
+    rate_covariance: Array
+
+    def at(self, time_s: float) -> Prediction:
+        """M_k times the step that the last rate makes of the time since."""
+        since_s = time_s - self.time_s
+        mapping = Mapping(self.matrix @ exponential(self.rate * since_s))
+        # x_S = M x_T stays while M moves, so in tip coordinates the sample moves by minus the rate.
+        velocity = -self.rate[:2, 2]
+        covariance = self.covariance_m2 + since_s**2 * self.rate_covariance
+        return Prediction(time_s, mapping, covariance, velocity, self.rate_covariance)
+
+    def to_dict(self) -> dict[str, Any]:
+        """See `Forecast`."""
+        arrays = {name: getattr(self, name).tolist() for name in _ARRAYS}
+        return {"kind": "paper", "time_s": self.time_s, **arrays}
+
+    @classmethod
+    def from_dict(cls, table: Table[str, Any]) -> PaperForecast:
+        """What `to_dict` made."""
+        return cls(float(table["time_s"]), **{name: np.array(table[name], dtype=np.float64) for name in _ARRAYS})
+
+
+_ARRAYS = ("matrix", "rate", "covariance_m2", "rate_covariance")
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A scan of the queue C and the mapping M_j that it was found to have."""
+
+    scan: DriftScan
+    mapping: Mapping
+
+
+class PaperTracker:
+    """The scheme of the paper, as it is written there.
+
+    Each scan is first predicted, M'_k = M_(k-1) dM^_k with dM^_k the rate of the last step times the time since, and
+    then corrected by the residual dM~_k against the oldest scan of the queue for which estimation succeeds:
+    M_k = M'_k dM~_k. What the paper leaves open: times are those of the middle of the scans; without a rate the
+    prediction is the identity; a scan without a match joins the queue where it was predicted. The paper knows no
+    uncertainty: that of a prediction is the mean square of the last residuals.
+
+    Args:
+        estimator: gets no prior.
+        transform: what a mapping may do, "translation", "euclidean", "similarity" or "affine".
+        w_update: share of the estimated residual that is believed; 1: all of it, 0: prediction alone.
+        queue: l, scans that are kept.
+        f_min: least intersection ratio of a pair, in sample coordinates.
+        sr_norm_min: least ratio of their resolutions.
+        lost_after: so many scans one after the other without a match mean that it is lost (ours; the paper goes on).
+
+    Raises:
+        ConfigError: a setting without a meaning.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        *,
+        transform: str = "translation",
+        w_update: float = 1.0,
+        queue: int = 5,
+        f_min: float = 0.5,
+        sr_norm_min: float = 0.25,
+        lost_after: int = 3,
+    ) -> None:
+        if transform not in TRANSFORMS:
+            raise ConfigError(f"no transform {transform!r}", where="transform", hint=f"one of {', '.join(TRANSFORMS)}")
+        for name, value in (("w_update", w_update), ("f_min", f_min), ("sr_norm_min", sr_norm_min)):
+            if not 0.0 <= value <= 1.0:
+                raise ConfigError(f"{value} is not between 0 and 1", where=name)
+        for name, number in (("queue", queue), ("lost_after", lost_after)):
+            if number < 1:
+                raise ConfigError(f"{number} is less than one scan", where=name)
+        self._estimator = estimator
+        self._transform, self._w_update, self._lost_after = transform, w_update, lost_after
+        self._f_min, self._sr_norm_min = f_min, sr_norm_min
+        self._queue: deque[_Placed] = deque(maxlen=queue)
+        self._now = PaperForecast(0.0, np.eye(3), np.zeros((3, 3)), np.zeros((2, 2)), np.zeros((2, 2)))
+        self._newest_s: float | None = None
+        self._residual_m2: float | None = None
+        self._unmatched = 0
+
+    @property
+    def forecast(self) -> Forecast:
+        """See `Tracker`."""
+        return self._now
+
+    def add(self, scan: DriftScan) -> Update:
+        """See `Tracker`."""
+        saving.must_be_newer(scan, self._newest_s)
+        first = self._newest_s is None
+        before = self._now.at(scan.mid_s)
+        placed, tried, reason = (None, {}, "") if first else self._match(scan, before.mapping)
+        matched = first or placed is not None
+        mapping = before.mapping if placed is None else self._averaged(before.mapping, placed)
+        self._unmatched = 0 if matched else self._unmatched + 1
+        self._step(scan, before, mapping, [one for one in tried.values() if one.accepted])
+        self._queue.append(_Placed(scan, mapping))
+        return Update(
+            key=scan.key,
+            before=before,
+            after=self._now.at(scan.mid_s),
+            matched=matched,
+            reason=reason,
+            lost=self._unmatched >= self._lost_after,
+            registrations=tried,
+            forecast=self._now,
+            quality={"candidates": float(len(tried))},
+        )
+
+    def _match(self, scan: DriftScan, predicted: Mapping) -> tuple[Mapping | None, dict[str, Registration], str]:
+        """M_k from the oldest scan of D for which estimation succeeds; what was tried; why there is none."""
+        region = predicted.to_sample(scan.region)
+        tried: dict[str, Registration] = {}
+        for old in self._queue:
+            ratio = intersection_ratio(old.mapping.to_sample(old.scan.region), region)
+            alike = sr_norm(old.scan.region, old.scan.values.shape, scan.region, scan.values.shape)
+            if ratio < self._f_min or alike < self._sr_norm_min:
+                continue
+            found = self._estimator.register(old.scan, scan)
+            tried[old.scan.key] = found
+            if found.accepted:
+                return old.mapping @ transform_between(found, self._transform).inverse, tried, ""
+        if tried:
+            return None, tried, next(reversed(tried.values())).reason
+        return None, tried, "no scan of the queue shares enough with it"
+
+    def _averaged(self, predicted: Mapping, estimated: Mapping) -> Mapping:
+        """M'_k dM~_k, with dM~_k shortened to the share that is believed."""
+        if self._w_update == 1.0:
+            return estimated
+        residual = predicted.inverse @ estimated
+        return predicted @ Mapping(exponential(self._w_update * logarithm(residual.matrix)))
+
+    def _step(self, scan: DriftScan, before: Prediction, mapping: Mapping, used: list[Registration]) -> None:
+        """dM_k = dM^_k dM~_k makes the next rate."""
+        since_s = 0.0 if self._newest_s is None else scan.mid_s - self._newest_s
+        rate, covariance = self._now.rate, before.covariance_m2
+        if used:
+            covariance = used[-1].covariance_m2
+            center = scan.region.center_m
+            residual_m2 = float(np.sum((mapping.apply(center) - before.mapping.apply(center)) ** 2) / 2)
+            kept = self._residual_m2
+            self._residual_m2 = residual_m2 if kept is None else _MEMORY * kept + (1 - _MEMORY) * residual_m2
+            if since_s > 0.0:
+                step = Mapping(self._now.matrix).inverse @ mapping
+                rate = logarithm(step.matrix) / since_s
+        spread_m2 = self._residual_m2
+        if spread_m2 is None:  # nothing has been compared yet
+            spread_m2 = (min(scan.region.size_m) / 4) ** 2
+        usual_s = since_s if since_s > 0.0 else max(scan.duration_s, 1.0)
+        rate_covariance = np.eye(2) * (spread_m2 / usual_s**2)
+        self._now = PaperForecast(scan.mid_s, mapping.matrix, rate, covariance, rate_covariance)
+        self._newest_s = scan.mid_s
+
+    def state(self) -> dict[str, Any]:
+        """See `Tracker`."""
+        return {
+            "kind": "paper",
+            "version": VERSION,
+            "forecast": self._now.to_dict(),
+            "newest_s": self._newest_s,
+            "residual_m2": self._residual_m2,
+            "unmatched": self._unmatched,
+            "queue": [
+                {"scan": saving.scan_to_dict(one.scan), "matrix": one.mapping.matrix.tolist()} for one in self._queue
+            ],
+        }
+
+    def restore(self, state: Table[str, Any]) -> None:
+        """See `Tracker`. Raises InvalidValue for the state of another tracker."""
+        saving.must_be(state, "paper", VERSION)
+        self._now = PaperForecast.from_dict(state["forecast"])
+        self._newest_s, self._residual_m2 = state["newest_s"], state["residual_m2"]
+        self._unmatched = int(state["unmatched"])
+        self._queue.clear()
+        for one in state["queue"]:
+            self._queue.append(_Placed(saving.scan_from_dict(one["scan"]), Mapping(one["matrix"])))

@@ -1,0 +1,154 @@
+"""Which scans are kept to compare later ones with, and which of them one is compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.overlap import overlap_ratio, sr_norm
+from afspm.drift.registration import DriftScan
+from afspm.drift.trackers import saving
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A scan that is kept.
+
+    Attributes:
+        velocity_m_s, velocity_covariance: (2,) and (2, 2) of the sample in tip coordinates when it was taken.
+        anchor: it stands for its part of the sample from now on.
+        refusals: how often in a row it could not be registered while another one could.
+        used: number of the scan that was last registered with it.
+    """
+
+    scan: DriftScan
+    velocity_m_s: Array
+    velocity_covariance: Array
+    anchor: bool
+    refusals: int = 0
+    used: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "scan": saving.scan_to_dict(self.scan),
+            "velocity_m_s": self.velocity_m_s,
+            "velocity_covariance": self.velocity_covariance,
+            "anchor": self.anchor,
+            "refusals": self.refusals,
+            "used": self.used,
+        }
+
+    @classmethod
+    def from_dict(cls, table: Table[str, Any]) -> Reference:
+        return cls(
+            saving.scan_from_dict(table["scan"]),
+            np.asarray(table["velocity_m_s"], dtype=np.float64),
+            np.asarray(table["velocity_covariance"], dtype=np.float64),
+            bool(table["anchor"]),
+            int(table["refusals"]),
+            int(table["used"]),
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How references are kept and chosen.
+
+    Attributes:
+        compared: at most so many references for each scan.
+        recent: scans that are kept besides the anchors.
+        anchors: at most so many.
+        most_bytes: of all values that are kept.
+        overlap_min: least share of the smaller scan that both have seen.
+        sr_norm_min: least ratio of the resolutions.
+        stale_after: refusals in a row after which an anchor is given up.
+        alike: share of a scan that an anchor must have seen, at half its resolution at least, to stand for it.
+    """
+
+    compared: int = 4
+    recent: int = 4
+    anchors: int = 8
+    most_bytes: int = 256_000_000
+    overlap_min: float = 0.3
+    sr_norm_min: float = 0.25
+    stale_after: int = 3
+    alike: float = 0.6
+
+
+class References:
+    """The scans that are kept, in the order of time. All displacements (…, 2) are those of the sample, in m."""
+
+    def __init__(self, choice: Choice) -> None:
+        self.choice = choice
+        self.kept: list[Reference] = []
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def __iter__(self) -> Iterator[Reference]:
+        return iter(self.kept)
+
+    def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:
+        """Numbers of those that a scan is to be compared with, the best first.
+
+        An anchor comes first, then the oldest, which have been averaged over most.
+
+        Args:
+            drift_m: (2,) expected in the scan.
+            drifts_m: (n, 2) shown by the references.
+            anywhere: the expectation is not to be trusted, so all may overlap.
+        """
+        fitting = []
+        for number, kept in enumerate(self.kept):
+            if _alike(kept.scan, scan) < self.choice.sr_norm_min:
+                continue
+            shared = overlap_ratio(kept.scan.region, scan.region, drift_m - drifts_m[number])
+            if anywhere or shared >= self.choice.overlap_min:
+                # a little more in common is no reason to prefer a younger one
+                rank = (-round(4 * shared), not kept.anchor, -_alike(kept.scan, scan), number)
+                fitting.append((rank, number))
+        return [number for _, number in sorted(fitting)][: self.choice.compared]
+
+    def judged(self, tried: Table[int, bool], step: int) -> None:
+        """Remember which could be registered with the newest scan."""
+        for number, succeeded in tried.items():
+            kept = self.kept[number]
+            if succeeded:
+                self.kept[number] = replace(kept, refusals=0, used=step)
+            elif any(tried.values()):
+                self.kept[number] = replace(kept, refusals=kept.refusals + 1)
+
+    def needs_anchor(self, scan: DriftScan, drift_m: Array, drifts_m: Array) -> bool:
+        """Whether no anchor stands for what a scan has seen."""
+        return not any(
+            kept.anchor
+            and _alike(kept.scan, scan) >= 0.5
+            and overlap_ratio(kept.scan.region, scan.region, drift_m - drifts_m[number]) >= self.choice.alike
+            for number, kept in enumerate(self.kept)
+        )
+
+    def superfluous(self) -> int | None:
+        """The number of one that must go; None if all may stay. The newest always may."""
+        old = list(enumerate(self.kept))[:-1]
+        stale = [n for n, one in old if one.anchor and one.refusals >= self.choice.stale_after]
+        if stale:
+            return stale[0]
+        recent = [n for n, one in old if not one.anchor]
+        anchors = sorted((one.used, n) for n, one in old if one.anchor)
+        too_much = sum(one.scan.values.nbytes for one in self.kept) > self.choice.most_bytes
+        if recent and (too_much or len(recent) + (not self.kept[-1].anchor) > self.choice.recent):
+            return recent[0]
+        if anchors and (too_much or len(anchors) + self.kept[-1].anchor > self.choice.anchors):
+            return anchors[0][1]
+        return None
+
+
+def _alike(first: DriftScan, second: DriftScan) -> float:
+    return sr_norm(first.region, first.values.shape, second.region, second.values.shape)

@@ -1,0 +1,87 @@
+"""What the default tracker takes drift to be, and when it is content."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from afspm.drift.trackers.motion import Models
+from afspm.drift.trackers.references import Choice
+from afspm.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class BankSettings:
+    """Measured on simulated nights with 2 µm scans every 15 minutes; wide enough for most microscopes.
+
+    Attributes:
+        densities_m2_s3: of the acceleration: how fast the velocity of drift wanders.
+        fadings_s: after which a velocity is gone to 1/e; inf for one that stays. There is a filter for each pair.
+        walk_m2_s: variance that positions gain in a second besides.
+        jitter_m: standard deviation of the position of a scan that no registration sees.
+        start_velocity_sd_m_s: what may be before anything is known.
+        start_px: standard deviation of where the sample is found in the first scan, in its pixels.
+        forget: share of the logarithm of the weights of the filters that is kept from one scan to the next.
+        rarest: least weight of a filter, beside the largest.
+        inflation: of the covariance that an estimator gives, above 1. What exceeds 1 belongs to the pair, the rest half
+            to each of its scans.
+        widening: of the covariance of an expected displacement, where the estimator is told to search.
+        doubt: chi2 above which a result is not believed before the next scan says so too.
+        lost_after: scans in a row that should have matched something and did not.
+    """
+
+    densities_m2_s3: tuple[float, ...] = (1e-26, 1e-25, 1e-24, 1e-23, 1e-22, 1e-21)
+    fadings_s: tuple[float, ...] = (math.inf, 10800.0, 2700.0)
+    walk_m2_s: float = 0.5e-18 / 900.0
+    jitter_m: float = 0.05e-9
+    start_velocity_sd_m_s: float = 3e-10
+    start_px: float = 0.02
+    forget: float = 0.97
+    rarest: float = 1e-6
+    inflation: float = 2.0
+    widening: float = 4.0
+    doubt: float = 36.0
+    lost_after: int = 3
+
+    def __post_init__(self) -> None:
+        numbers = (self.walk_m2_s, self.jitter_m, self.start_velocity_sd_m_s, self.start_px, self.rarest, self.doubt)
+        if not (self.densities_m2_s3 and self.fadings_s):
+            raise ConfigError("a bank without filters", where="densities_m2_s3, fadings_s")
+        if not min(*numbers, *self.densities_m2_s3, *self.fadings_s) > 0.0:
+            raise ConfigError("all settings of the bank are above zero")
+        if not (0.0 < self.forget <= 1.0 and self.rarest < 1.0):
+            raise ConfigError("weights: forget up to 1, rarest below it", where="forget, rarest")
+        if not (self.inflation > 1.0 and self.widening >= 1.0 and self.lost_after >= 1):
+            raise ConfigError("inflation above 1, widening and lost_after at least 1", where="inflation")
+
+    @classmethod
+    def split(cls, settings: dict[str, Any]) -> tuple[BankSettings, Choice]:
+        """Those of the bank and those of its references.
+
+        Raises:
+            ConfigError: a name that neither has, or a value without a meaning.
+        """
+        own, others = ({field.name for field in dataclasses.fields(one)} for one in (cls, Choice))
+        for name in settings:
+            if name not in own | others:
+                close = difflib.get_close_matches(name, sorted(own | others), n=1)
+                hint = f"did you mean {close[0]!r}?" if close else ", ".join(sorted(own | others))
+                raise ConfigError(f"the tracker has no setting {name!r}", where=name, hint=hint)
+        try:
+            values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+            return (
+                cls(**{k: v for k, v in values.items() if k in own}),
+                Choice(**{k: v for k, v in values.items() if k in others}),
+            )
+        except TypeError as error:
+            raise ConfigError(f"the settings of the tracker: {error}") from error
+
+    def models(self) -> Models:
+        """A filter for each density and fading."""
+        densities, fadings = np.meshgrid(self.densities_m2_s3, self.fadings_s, indexing="ij")
+        return Models(densities.ravel(), 1.0 / fadings.ravel(), self.walk_m2_s)
