@@ -14,6 +14,7 @@ import logging
 import socket
 import sys
 from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
 import zmq
@@ -85,7 +86,7 @@ class Laggards:
             waiting = self._published - lane.oldest(self._published)
             if waiting > self._most_bytes:
                 del self._lanes[lane.descriptor]
-                _log.warning("%s takes nothing: disconnected, with %d MB waiting for it", lane.name, waiting >> 20)
+                _log.warning("%d MB wait for %.100r, which takes none of it: disconnected", waiting >> 20, lane.name)
                 _disconnect(lane)
         self._probed = self._published
 
@@ -97,25 +98,27 @@ class Laggards:
         lane.probes.append((tracker, self._probed))
 
 
+@contextlib.contextmanager
+def _borrowed(descriptor: int) -> Iterator[socket.socket]:
+    """The library's connection, which stays open after. Raises OSError if there is none."""
+    connection = socket.socket(fileno=descriptor)
+    try:
+        yield connection
+    finally:
+        connection.detach()
+
+
 def _peer(descriptor: int) -> Any:
     """The address at the other end; None: there is none (any more)."""
-    with contextlib.suppress(OSError):
-        connection = socket.socket(fileno=descriptor)
-        try:
-            return connection.getpeername()
-        finally:
-            connection.detach()  # it is the library's
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        return connection.getpeername()
     return None
 
 
 def _disconnect(lane: _Lane) -> None:
     """As if the subscriber had hung up: once it goes on, it connects again and asks for what it missed."""
-    # There the library ends the process over a connection that was shut down for it: the time of `network` must do.
-    if sys.platform == "win32" or _peer(lane.descriptor) != lane.peer:
-        return
-    with contextlib.suppress(OSError):
-        connection = socket.socket(fileno=lane.descriptor)
-        try:
+    if sys.platform == "win32":
+        return  # there the library ends the process over a connection that was shut down for it
+    with contextlib.suppress(OSError), _borrowed(lane.descriptor) as connection:
+        if connection.getpeername() == lane.peer:  # else the descriptor was given to somebody else since
             connection.shutdown(socket.SHUT_RDWR)
-        finally:
-            connection.detach()
