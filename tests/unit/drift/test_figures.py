@@ -95,16 +95,15 @@ def test_a_keypoint_lies_on_the_pixel_that_it_was_found_at() -> None:
     np.testing.assert_allclose(corner, [1e6 * left, 1e6 * (low + one.region.size_m[1])])
 
 
-def test_true_errors_are_counted_from_when_correction_was_switched_on(tmp_path: Path) -> None:
+def test_true_errors_are_those_of_place_and_of_knowledge(tmp_path: Path) -> None:
     run = record()
-    on_s = float(run.time_s[8])
-    made = drawn(errors.draw(run, run.drift_m, switched_on_s=on_s), tmp_path)
+    truth = run.drift_m + 7e-6  # from another zero on
+    made = drawn(errors.draw(run, truth, switched_on_s=float(run.time_s[8])), tmp_path)
     shown = np.asarray(made.axes[0].lines[0].get_ydata(), dtype=float)
-    held = (run.drift_m - run.drift_m[8]) - (run.center_m - run.center_m[8])
-    np.testing.assert_allclose(shown[9:], 1e9 * np.hypot(*held[9:].T))
-    assert np.isnan(shown[8])
+    np.testing.assert_allclose(shown[1:], 1e9 * np.hypot(*run.misplacement_m[1:].T))
+    assert np.isnan(shown[0])
     believed = np.asarray(made.axes[1].lines[0].get_ydata(), dtype=float)
-    np.testing.assert_allclose(believed, 0.0, atol=1e-9)
+    np.testing.assert_allclose(believed, 0.0, atol=1e-6)
 
 
 def test_lengths_are_told_in_the_unit_that_reads_best() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from afspm.drift.figures.style import (
     BLUE,
@@ -24,20 +23,19 @@ from afspm.drift.record import DriftRecord
 
 
 def draw(record: DriftRecord, truth_m: Array, *, switched_on_s: float | None = None) -> Figure:
-    """a: how far off the scans were taken; b: what was known after each scan, minus the truth, within its own error.
+    """a: how far off the place of the first scan each was taken; b: what was known after it minus the truth, and its sd.
 
     Args:
         record: of the run.
-        truth_m: (n, 2) the true displacement at the middle of each scan.
-        switched_on_s: when drift correction was switched on; misplacement is counted from the first scan after it.
+        truth_m: (n, 2) the true displacement at the middle of each scan, from any zero on.
+        switched_on_s: when drift correction was switched on.
     """
     with styled():
         made = figure(WIDTH_IN, 4.2)
         above, below = made.subplots(2, 1, sharex=True)
         hours = (record.time_s - record.time_s[0]) / HOUR_S
-        on = np.ones(len(record), bool) if switched_on_s is None else record.time_s >= switched_on_s
         came_m = truth_m - truth_m[:1]
-        _misplaced(above, record, came_m, hours, on)
+        _misplaced(above, came_m - (record.center_m - record.center_m[:1]), hours)
         _known(below, record, came_m, hours)
         if switched_on_s is not None:
             for ax in (above, below):
@@ -49,17 +47,11 @@ def draw(record: DriftRecord, truth_m: Array, *, switched_on_s: float | None = N
     return made
 
 
-def _misplaced(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array, on: NDArray[np.bool_]) -> None:
-    off_m = np.hypot(*(truth_m - (record.center_m - record.center_m[:1])).T)
-    if on.any():  # in the hours without correction only the sample moves; what follows is held where it was then
-        first = int(np.argmax(on))
-        held = (truth_m - truth_m[first]) - (record.center_m - record.center_m[first])
-        off_m = np.where(on, np.hypot(*held.T), off_m)
-    unit, factor = unit_of(np.median(off_m[on]) * 10 if on.any() else off_m)
-    ax.semilogy(
-        hours, np.where(off_m > 0.0, off_m * factor, np.nan), "o-", color="black", markersize=2.5, linewidth=0.6
-    )
-    ax.set_ylabel(f"scan taken off its place / {unit}")
+def _misplaced(ax: Axes, off_m: Array, hours: Array) -> None:
+    distance_m = np.hypot(*off_m.T)
+    distance_m[distance_m == 0.0] = np.nan  # that of the first scan has no place on a logarithmic axis
+    ax.semilogy(hours, distance_m * 1e9, "o-", color="black", markersize=2.5, linewidth=0.6)
+    ax.set_ylabel("scan off its place / nm")
 
 
 def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:

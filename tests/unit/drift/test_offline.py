@@ -1,0 +1,128 @@
+"""Scans from files: which are followed, and what a pair says of the time in between."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_record import record
+
+from afspm.drift.offline import after_middle_s, against_first, chosen, spread_pairs, topography
+from afspm.drift.registration import DriftScan, Registration
+from afspm.errors import InvalidValue
+from afspm.model import Region, Scan
+
+REGION = Region((1e-6, 0.0), (2e-6, 1e-6))
+
+
+def scan(channel: str = "Height", at_s: float | None = 0.0, filename: str = "a.nc", pixels: int = 8) -> Scan:
+    time_ns = None if at_s is None else int(at_s * 1e9)
+    return Scan(REGION, channel, "m", np.zeros((pixels, pixels)), time_ns, filename)
+
+
+def found(displacement_m: tuple[float, float], *, center_m: tuple[float, float] = REGION.center_m) -> Registration:
+    return Registration(
+        accepted=True,
+        reason="",
+        displacement_m=np.array(displacement_m),
+        covariance_m2=1e-18 * np.eye(2),
+        linear=np.zeros((2, 2)),
+        center_m=np.array(center_m),
+    )
+
+
+@pytest.mark.parametrize(
+    ("channels", "expected"),
+    [
+        (["Phase", "Height Retrace", "Height"], "Height"),
+        (["Amplitude", "HeightRetrace"], "HeightRetrace"),
+        (["Current", "Z"], "Z"),
+        (["M-Xp-Topo", "Topo"], "Topo"),
+        (["Deflection", "Phase"], "Deflection"),
+    ],
+)
+def test_the_topography_is_found_by_its_name(channels: list[str], expected: str) -> None:
+    assert topography(channels) == expected
+
+
+def test_the_scans_of_a_channel_come_in_the_order_of_time_and_what_has_none_is_told() -> None:
+    series = chosen([scan(at_s=900.0, filename="b.nc"), scan("Phase"), scan(), scan(at_s=None, filename="c.nc"),
+                     scan(pixels=1, filename="d.nc")])  # fmt: skip
+    assert series.channel == "Height"
+    assert [one.key for one in series.scans] == ["a.nc", "b.nc"]
+    assert [one.mid_s for one in series.scans] == [0.0, 900.0]
+    assert series.left_out == ("c.nc: it does not say when it was taken", "d.nc: 1 x 1 pixels")
+
+
+def test_a_channel_without_two_scans_is_refused_with_those_there_are() -> None:
+    with pytest.raises(InvalidValue, match=r"'Phase'.*channels: Height, Phase"):
+        chosen([scan(), scan(at_s=1.0), scan("Phase")], "Phase")
+    with pytest.raises(InvalidValue, match="no scans"):
+        chosen([])
+
+
+def test_a_pair_speaks_of_the_rows_that_both_show_and_is_brought_to_the_middle_of_both() -> None:
+    """Sample and rows move up: what lies d above the middle was taken late, and meanwhile the sample went on."""
+    scans = [DriftScan(np.zeros((8, 8)), REGION, 900.0 * k, 900.0 * k + 200.0, upwards=True) for k in range(2)]
+    rates = np.array([(1e-10, 0.0), (0.0, 2e-10)])
+    run = replace(record()[:2], rate_m_s=rates)
+    center = (1e-6, 0.25e-6)  # a quarter of the height above the middle: 50 s late in the first scan
+    pair = found((10e-9, 100e-9), center_m=center)
+    late_s = 50.0 + 0.1 * 200.0
+    expected = np.array([10e-9, 100e-9]) - (rates[1] * late_s - rates[0] * 50.0)
+    brought = against_first(run, scans, [pair])
+    np.testing.assert_allclose(brought.drift_m[1], expected)
+    np.testing.assert_allclose(brought.drift_m[0], 0.0)
+    assert brought.matched.all()
+    unknown = [replace(one, upwards=None) for one in scans]
+    np.testing.assert_allclose(against_first(run, unknown, [pair]).drift_m[1], pair.displacement_m)
+
+
+def test_a_refused_pair_stays_in_the_table_with_its_reason() -> None:
+    scans = [DriftScan(np.zeros((8, 8)), REGION, 900.0 * k, 900.0 * k) for k in range(2)]
+    refused = against_first(record()[:2], scans, [Registration.refused("nothing in common")])
+    assert refused.matched.tolist() == [True, False]
+    assert refused.reasons == ("", "nothing in common")
+    assert np.isnan(refused.drift_m[1]).all()
+
+
+@pytest.mark.parametrize(("upwards", "sign"), [(True, 1.0), (False, -1.0)])
+def test_rows_of_a_turned_scan_are_counted_across_its_frame(upwards: bool, sign: float) -> None:
+    turned = Region((0.0, 0.0), (2e-6, 1e-6), np.pi / 2)  # its y axis points along -x
+    one = DriftScan(np.zeros((8, 8)), turned, 0.0, 100.0, upwards)
+    assert after_middle_s(one, np.array([-0.5e-6, 0.3e-6])) == pytest.approx(sign * 50.0)
+    assert after_middle_s(one, np.array([0.0, 0.9e-6])) == pytest.approx(0.0)
+
+
+def test_pairs_for_the_eye_are_as_far_apart_as_asked_and_spread_over_the_run() -> None:
+    run = record(20)
+    pairs = spread_pairs(run, 7200.0, 2)
+    assert len(pairs) == 2
+    assert all(run.matched[[first, second]].all() for first, second in pairs)
+    first, second = pairs[0]
+    assert abs(run.time_s[second] - run.time_s[first] - 7200.0) <= 900.0
+    assert spread_pairs(run[:1], 7200.0, 2) == []
+
+
+def test_an_album_holds_every_figure_that_there_is_something_for(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from afspm.drift.figures import album
+    from afspm.drift.registration import Matches
+
+    run = record(12)
+    scans = [DriftScan(np.random.default_rng(k).normal(size=(16, 16)), REGION, t, t) for k, t in enumerate(run.time_s)]
+    at = np.random.default_rng(1).uniform(0.5e-6, 1.5e-6, (9, 2))
+    matched = replace(found((0.0, 0.0)), matches=Matches(at, at, np.arange(9) > 2))
+    parts = [album.Part("off", "correction off", 0, 4, run[:4]), album.Part("on", "correction on", 4, 12, run[4:])]
+    whole = album.Run(scans, run, parts, (0, 1, matched), run.drift_m)
+    assert whole.switched_on_s == run.time_s[4]
+    names = {path.stem for path in album.write(whole, tmp_path)}
+    assert names == {
+        "drift_offset", "drift_pairs", "drift_estimates_off", "drift_histogram_off", "drift_estimates_on",
+        "drift_histogram_on", "drift_features", "drift_errors",
+    }  # fmt: skip
+    plain = album.Run(scans, run, [album.Part("", "Height", 0, 12)])
+    assert plain.switched_on_s is None
+    assert [path.stem for path in album.write(plain, tmp_path)] == ["drift_offset", "drift_pairs"]
