@@ -23,7 +23,7 @@ from afspm.drift.record import DriftRecord
 
 
 def draw(record: DriftRecord, truth_m: Array, *, switched_on_s: float | None = None) -> Figure:
-    """a: how far off the place of the first scan each was taken; b: what was known after it minus the truth, and its sd.
+    """a: how far off the place of the first scan each was taken; b: what was known after it, minus the truth.
 
     Args:
         record: of the run.
