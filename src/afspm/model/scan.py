@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import InvalidValue
-from afspm.model.geometry import Region, RegionChange
+from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:
     import xarray
@@ -115,6 +115,26 @@ class Scan:
     def time(self) -> datetime | None:
         """When it was finished, UTC."""
         return None if self.time_ns is None else datetime.fromtimestamp(self.time_ns / 1e9, UTC)
+
+    def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
+        """As it would have been at the middle of its acquisition, without the drift meanwhile (needs scipy).
+
+        Args:
+            velocity_m_s: (x, y) of the sample under the tip, e.g. from an up frame followed by a down frame
+                (`afspm.drift.shear`); constant during the scan.
+            duration_s: from the first to the last row.
+            upwards: whether small y was scanned first.
+
+        Returns:
+            The same region and pixels; NaN where nothing was measured.
+
+        Raises:
+            InvalidValue: what is not finite, or a sample as fast as the scan.
+        """
+        from afspm.model.undistort import undistorted
+
+        values = undistorted(self.values, self.region, velocity_m_s, duration_s, upwards=upwards)
+        return replace(self, values=values)
 
     def to_xarray(self) -> xarray.DataArray:
         """As an xarray DataArray with coordinates in m (needs the extra `xarray`).

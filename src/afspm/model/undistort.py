@@ -1,0 +1,69 @@
+"""Scans as they would have been taken in no time: the drift during a scan's own acquisition taken out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+from afspm.model.geometry import XY, Region
+
+Array = NDArray[np.float64]
+
+
+def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Array:
+    """Values on the same grid as they were at the middle of the scan.
+
+    Rows are taken one after the other, so what is at the offset S from the centre c when half of the scan is done is
+    found at the offset q with S = (1 - v a') q, where v is the velocity and a the vector along the slow axis of length
+    duration / height, negative when scanning down. Cubic splines between pixels; NaN where nothing was measured.
+
+    Args:
+        values: [y, x].
+        velocity_m_s: of the sample, in the coordinates of the region.
+        duration_s: from the first to the last row.
+        upwards: whether small y was scanned first.
+
+    Raises:
+        InvalidValue: what is not finite, or a sample that moves as fast along the slow axis as rows are taken.
+    """
+    ny, nx = values.shape
+    along_m, across_m = _per_scan_m(region, velocity_m_s, duration_s, upwards=upwards)
+    width_m, height_m = region.size_m
+    # In pixels from the centre: S_y = (1 - along) q_y and S_x = q_x - across q_y.
+    along = along_m / height_m
+    across = across_m / width_m * (nx - 1) / max(ny - 1, 1)
+    if along >= 1.0:
+        raise InvalidValue(f"the sample moved by {along:.2g} of the scan's height while it was taken")
+    y = (np.arange(ny) - (ny - 1) / 2)[:, None] / (1.0 - along)
+    x = (np.arange(nx) - (nx - 1) / 2)[None, :] + across * y
+    return _interpolated(values, np.broadcast_to(y + (ny - 1) / 2, values.shape), x + (nx - 1) / 2)
+
+
+def _per_scan_m(region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool) -> XY:
+    """By how much the sample moves during a scan along the slow and the fast axis, counted from small y to large y."""
+    x, y = (float(v) for v in velocity_m_s)
+    if not (all(map(math.isfinite, (x, y, duration_s))) and duration_s >= 0.0):
+        raise InvalidValue(f"a velocity of ({x}, {y}) m/s during {duration_s} s", hint="finite, and no time below zero")
+    cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
+    signed_s = duration_s if upwards else -duration_s
+    return (-sin * x + cos * y) * signed_s, (cos * x + sin * y) * signed_s
+
+
+def _interpolated(values: Array, row: Array, column: Array) -> Array:
+    """Values at positions in pixels; NaN outside and wherever a neighbour is NaN."""
+    from scipy.ndimage import distance_transform_edt, map_coordinates
+
+    ny, nx = values.shape
+    known = np.isfinite(values)
+    inside = (row >= -1e-6) & (row <= ny - 1 + 1e-6) & (column >= -1e-6) & (column <= nx - 1 + 1e-6)
+    if not known.any():
+        return np.full(values.shape, np.nan)
+    if not known.all():  # splines need a number everywhere: the nearest one that was measured
+        nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
+        inside &= map_coordinates((~known).astype(np.float64), (row, column), order=1, mode="nearest") < 1e-6
+    resampled = map_coordinates(values, (row, column), order=3, mode="mirror")
+    return np.where(inside, resampled, np.nan)
