@@ -1,0 +1,15 @@
+"""Studies of drift: many simulated nights over a grid of settings, on the cores of this computer or on a Dask cluster.
+
+settings = NightSettings.of({"tracker": "paper", "paper.queue": 3})
+metrics = night(settings, seed=1)
+"""
+
+from __future__ import annotations
+
+from afspm.study.grid import Grid
+from afspm.study.night import Night, night
+from afspm.study.settings import NightSettings
+from afspm.study.summary import Summary, summarised
+from afspm.study.workers import Outcome, on_cluster, on_cores
+
+__all__ = ["Grid", "Night", "NightSettings", "Outcome", "Summary", "night", "on_cluster", "on_cores", "summarised"]

@@ -1,0 +1,101 @@
+"""A grid of settings: each name with the values to try, from a command line or a TOML file."""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from afspm.errors import ConfigError, FileError
+from afspm.study.settings import PARTS, NightSettings
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Every combination of the values.
+
+    Attributes:
+        values: by name; see `NightSettings.of`. What belongs to a tracker that a combination does not have
+            ("paper.queue" for the bank) makes no further combinations.
+    """
+
+    values: Mapping[str, tuple[Any, ...]]
+
+    @classmethod
+    def of(cls, given: Sequence[str]) -> Grid:
+        """From a command line: files ending in .toml, and NAME=VALUE[,VALUE…], which go on top of them.
+
+        Raises:
+            ConfigError: not such a text, or wrong TOML. FileError: the file can't be read.
+        """
+        values: dict[str, tuple[Any, ...]] = {}
+        for text in given:
+            name, equals, listed = text.partition("=")
+            if equals:
+                values[name.strip()] = tuple(_value(one.strip()) for one in listed.split(","))
+            elif text.endswith(".toml"):
+                values.update(_flat(_read(Path(text))))
+            else:
+                raise ConfigError(f"{text!r} is no setting", hint="e.g. tracker=bank,paper, or a file ending in .toml")
+        return cls(values)
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """The names with more than one value."""
+        return tuple(name for name, values in self.values.items() if len(values) > 1)
+
+    def settings(self) -> Iterator[tuple[str, NightSettings]]:
+        """Each combination once, and what it is called: what differs between them; the defaults first.
+
+        Raises:
+            ConfigError, InvalidValue: as `NightSettings.of`.
+        """
+        fixed = {name: values[0] for name, values in self.values.items() if len(values) == 1}
+        told: list[NightSettings] = []
+        for chosen in [{}, *self._combinations()]:
+            settings = NightSettings.of(fixed | chosen)
+            in_force = [name for name in chosen if _is_in_force(name, settings)]
+            label = " ".join(f"{name}={chosen[name]}" for name in in_force) or "defaults"
+            if settings not in told:
+                told.append(settings)
+                yield label, settings
+
+    def _combinations(self) -> Iterator[dict[str, Any]]:
+        lists = [self.values[name] for name in self.varied]
+        for combination in itertools.product(*lists) if lists else ():
+            yield dict(zip(self.varied, combination, strict=True))
+
+
+def _is_in_force(name: str, settings: NightSettings) -> bool:
+    part, dot, _ = name.partition(".")
+    return not dot or part in {getattr(settings, one)["class"] for one in PARTS}
+
+
+def _value(text: str) -> Any:
+    """A value of TOML, or else a text as it is."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(f"can't be read: {error}", where=str(path)) from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"is not TOML: {error}", where=str(path)) from error
+
+
+def _flat(table: Mapping[str, Any], before: str = "") -> dict[str, tuple[Any, ...]]:
+    found: dict[str, tuple[Any, ...]] = {}
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{before}{name}.")
+        else:
+            found[before + name] = tuple(value) if isinstance(value, list) else (value,)
+    return found

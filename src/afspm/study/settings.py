@@ -1,0 +1,94 @@
+"""What a simulated night is made of, from names as a command line or a TOML file gives them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from afspm.drift.estimators import DEFAULT as DEFAULT_ESTIMATOR
+from afspm.drift.rescan import F_RESCAN
+from afspm.drift.trackers import DEFAULT as DEFAULT_TRACKER
+from afspm.errors import ConfigError, InvalidValue
+
+Table = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class NightSettings:
+    """One region, scanned again and again while the sample drifts.
+
+    Attributes:
+        surface: kind of the sample, see `afspm.simulation`.
+        size_m, pixels: of the square that is scanned.
+        every_s: from the beginning of one scan to that of the next.
+        line_s: of trace and retrace together.
+        hours: how long.
+        drift_m: how far the sample goes in the end; its direction, and a random walk besides, follow from the seed.
+        rescan: when a scan is taken again, see `afspm.drift.rescan`: "tolerance", "paper" or "never".
+        tolerance_m: for that rule; None: a tenth of the size.
+        f_rescan: for that of the paper.
+        estimator, tracker: "class" and settings.
+    """
+
+    surface: str = "stamper"
+    size_m: float = 2e-6
+    pixels: int = 128
+    every_s: float = 900.0
+    line_s: float = 1.0
+    hours: float = 8.0
+    drift_m: float = 1.5e-6
+    rescan: str = "tolerance"
+    tolerance_m: float | None = None
+    f_rescan: float = F_RESCAN
+    estimator: Table = field(default_factory=lambda: {"class": DEFAULT_ESTIMATOR})
+    tracker: Table = field(default_factory=lambda: {"class": DEFAULT_TRACKER})
+
+    def __post_init__(self) -> None:
+        if self.rescan not in RULES:
+            raise ConfigError(f"no rule {self.rescan!r} for rescans", hint=f"one of {', '.join(RULES)}")
+        if self.pixels * self.line_s > self.every_s:
+            raise InvalidValue(
+                f"a scan of {self.pixels * self.line_s:g} s does not fit into {self.every_s:g} s",
+                hint="less pixels, a shorter line_s or a longer every_s",
+            )
+        if self.scans < 2:
+            raise InvalidValue(f"{self.hours:g} h with a scan every {self.every_s:g} s are not two scans")
+
+    @property
+    def scans(self) -> int:
+        """How many scans are planned."""
+        return int(self.hours * 3600.0 / self.every_s + 1e-9)
+
+    @classmethod
+    def of(cls, names: Table) -> NightSettings:
+        """From names: those of the fields, and "paper.queue" for what the tracker (estimator) "paper" is told,
+        where that is chosen.
+
+        Raises:
+            ConfigError: unknown names. InvalidValue: values that don't fit each other.
+        """
+        plain: dict[str, Any] = {name: value for name, value in names.items() if "." not in name}
+        known = [one.name for one in fields(cls)]
+        for name in plain:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+                raise ConfigError(f"a night has no setting {name!r}", hint=hint)
+        for part in PARTS:
+            table = plain.get(part, {})
+            table = {"class": table} if isinstance(table, str) else dict(table)
+            table.setdefault("class", _DEFAULTS[part])
+            plain[part] = table | _told(table["class"], names)
+        return cls(**plain)
+
+
+PARTS = ("estimator", "tracker")
+RULES = ("tolerance", "paper", "never")
+_DEFAULTS = {"estimator": DEFAULT_ESTIMATOR, "tracker": DEFAULT_TRACKER}
+
+
+def _told(name: str, names: Table) -> dict[str, Any]:
+    before = f"{name}."
+    return {key.removeprefix(before): value for key, value in names.items() if key.startswith(before)}

@@ -1,0 +1,71 @@
+"""What many nights say about settings: medians and spread, the best, and whether the defaults hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+
+import numpy as np
+
+BY = "misplaced rms"
+"""What settings are judged by: how far off their place scans are taken, once the rate is known."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The nights of one combination of settings.
+
+    Attributes:
+        label: what it is called.
+        nights: how many came to their end.
+        failed: why the others did not.
+        quartiles: of each metric: lower quartile, median, upper quartile.
+        is_default, is_best: which it is.
+        holds: for the defaults, whether they are as good as the best: their median lies within its spread.
+    """
+
+    label: str
+    nights: int
+    failed: tuple[str, ...]
+    quartiles: Mapping[str, tuple[float, float, float]]
+    is_default: bool = False
+    is_best: bool = False
+    holds: bool = False
+
+    @property
+    def median(self) -> float:
+        """Of what settings are judged by; infinite without a night."""
+        return self.quartiles[BY][1] if self.nights else float("inf")
+
+
+def summarised(
+    labels: Sequence[str], metrics: Mapping[str, Sequence[Mapping[str, float]]], failed: Mapping[str, Sequence[str]]
+) -> list[Summary]:
+    """One summary for each label, best first. The first label is that of the defaults.
+
+    Args:
+        metrics: of the nights, by label. Nights that were lost count as infinitely bad.
+        failed: why other nights did not come to their end, by label.
+    """
+    rows = [_row(label, metrics.get(label, ()), failed.get(label, ()), labels[0]) for label in labels]
+    rows.sort(key=lambda row: row.median)
+    best = rows[0]
+    upper = best.quartiles[BY][2] if best.nights else float("-inf")
+    return [replace(row, is_best=row is best, holds=row.is_default and row.median <= upper) for row in rows]
+
+
+def _row(label: str, nights: Sequence[Mapping[str, float]], failed: Sequence[str], default: str) -> Summary:
+    quartiles = {name: _quartiles([_honest(one, name) for one in nights]) for name in (nights[0] if nights else ())}
+    return Summary(label, len(nights), tuple(failed), quartiles, is_default=label == default)
+
+
+def _honest(metrics: Mapping[str, float], name: str) -> float:
+    return float("inf") if name == BY and metrics.get("lost") else metrics[name]
+
+
+def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    # of the values themselves: between a number and infinity there is nothing
+    lower = float(np.percentile(values, 25, method="lower"))
+    upper = float(np.percentile(values, 75, method="higher"))
+    return lower, float(median(values)), upper

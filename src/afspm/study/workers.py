@@ -1,0 +1,101 @@
+"""Many independent tasks, on the cores of this computer or on a Dask cluster. A worker that dies costs only time."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any
+
+from afspm.errors import AfspmError, ConfigError
+
+_MOST_DEATHS = 3  # of workers one after the other while nothing gets done
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one task.
+
+    Attributes:
+        index: which one.
+        value: what it returned, None if it failed.
+        error: how it failed, for a person.
+    """
+
+    index: int
+    value: Any = None
+    error: str = ""
+
+
+def on_cores(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, jobs: int) -> Iterator[Outcome]:
+    """The outcomes of `function(*task)`, as they come, from `jobs` processes (1: in this one)."""
+    if jobs <= 1:
+        for index, task in enumerate(tasks):
+            yield _done(function, index, task)
+        return
+    left = dict(enumerate(tasks))
+    deaths = 0
+    while left:
+        before = len(left)
+        for outcome in _until_one_dies(function, left, jobs):
+            del left[outcome.index]
+            yield outcome
+        deaths = 0 if len(left) < before else deaths + 1
+        if deaths >= _MOST_DEATHS:
+            died = f"worker processes died {deaths} times one after the other (too little memory?)"
+            yield from (Outcome(index, error=died) for index in left)
+            return
+
+
+def on_cluster(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, address: str) -> Iterator[Outcome]:
+    """As `on_cores`, on the workers of a Dask cluster, which need the same afspm installed. What a worker was at when
+    it died is done by another.
+
+    Raises:
+        ConfigError: `distributed` is not installed, or nobody answers at the address.
+    """
+    try:
+        distributed: Any = importlib.import_module("distributed")
+    except ImportError as error:
+        raise ConfigError("a cluster needs Dask", hint='pip install "afspm[study]"') from error
+    try:
+        client = distributed.Client(address, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"no cluster can be reached: {error}", where=address) from error
+    with client:
+        futures = {client.submit(_done, function, index, task, pure=False): index for index, task in enumerate(tasks)}
+        for future in distributed.as_completed(list(futures), loop=client.loop):
+            if future.status == "finished":
+                yield future.result()
+            else:
+                yield Outcome(futures[future], error=_told(future.exception()))
+            future.release()
+
+
+def _until_one_dies(function: Callable[..., Any], left: dict[int, tuple[Any, ...]], jobs: int) -> Iterator[Outcome]:
+    """All outcomes that come before a worker dies, which ends them all."""
+    # spawn: the same on all systems, and none of the threads of numpy are copied half
+    with ProcessPoolExecutor(min(jobs, len(left)), mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            futures = [pool.submit(_done, function, index, task) for index, task in left.items()]
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool:
+            return
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _done(function: Callable[..., Any], index: int, task: tuple[Any, ...]) -> Outcome:
+    """One task, in whatever process. Errors go back as text: not every exception survives the way."""
+    try:
+        return Outcome(index, function(*task))
+    except Exception as error:
+        return Outcome(index, error=_told(error))
+
+
+def _told(error: BaseException | None) -> str:
+    return str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"

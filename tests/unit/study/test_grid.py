@@ -1,0 +1,54 @@
+"""A grid is every combination that differs, by names from a command line or a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from afspm.errors import ConfigError, FileError, InvalidValue
+from afspm.study.grid import Grid
+from afspm.study.settings import NightSettings
+
+
+def test_every_combination_comes_once_after_the_defaults() -> None:
+    grid = Grid.of(["pixels=64,128", "hours=4", "every_s=900,1800"])
+    named = dict(grid.settings())
+    assert next(iter(named)) == "defaults"
+    assert named["defaults"].hours == 4
+    combinations = {(one.pixels, one.every_s) for one in named.values()}
+    assert combinations == {(64, 900), (64, 1800), (128, 900), (128, 1800)}
+    assert len(named) == 4
+
+
+def test_what_belongs_to_another_tracker_makes_no_combination() -> None:
+    grid = Grid.of(["tracker=bank,paper", "paper.queue=3,5,10"])
+    named = dict(grid.settings())
+    assert list(named) == ["defaults", "tracker=paper paper.queue=3", "tracker=paper paper.queue=5",
+                           "tracker=paper paper.queue=10"]  # fmt: skip
+    assert named["defaults"].tracker == {"class": "bank"}
+    assert named["tracker=paper paper.queue=10"].tracker == {"class": "paper", "queue": 10}
+
+
+def test_a_file_is_read_and_the_command_line_goes_on_top_of_it(tmp_path: Path) -> None:
+    file = tmp_path / "grid.toml"
+    file.write_text('tracker = ["bank", "paper"]\nhours = 2\n[paper]\nqueue = [3, 5]\nf_min = 0.5\n', encoding="utf-8")
+    grid = Grid.of([str(file), "hours=3"])
+    assert grid.values == {
+        "tracker": ("bank", "paper"), "hours": (3,), "paper.queue": (3, 5), "paper.f_min": (0.5,),
+    }  # fmt: skip
+    assert grid.varied == ("tracker", "paper.queue")
+
+
+def test_settings_that_are_not_there_or_make_no_sense_are_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="pixel"):
+        NightSettings.of({"pixel": 3})
+    with pytest.raises(InvalidValue, match="does not fit"):
+        NightSettings.of({"pixels": 1024})
+    with pytest.raises(ConfigError, match="no setting"):
+        Grid.of(["tracker"])
+    with pytest.raises(FileError, match="can't be read"):
+        Grid.of([str(tmp_path / "missing.toml")])
+    (tmp_path / "bad.toml").write_text("= 3", encoding="utf-8")
+    with pytest.raises(ConfigError, match="is not TOML"):
+        Grid.of([str(tmp_path / "bad.toml")])

@@ -1,0 +1,42 @@
+"""`afspm drift study`, from the command line to the table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from afspm.cli.app import app
+
+SMALL = ["surface=particles", "pixels=32", "size_m=5e-7", "hours=1", "estimator=correlation"]
+
+
+def told(*arguments: str, code: int = 0) -> str:
+    done = CliRunner().invoke(app, ["drift", "study", *arguments], env={"COLUMNS": "200"}, catch_exceptions=True)
+    assert done.exit_code == code, done.output
+    return done.output
+
+
+def test_a_study_names_the_best_and_judges_the_defaults() -> None:
+    output = told(*SMALL, "tracker=bank,paper", "-n", "2", "-j", "1")
+    assert "tracker=paper" in output
+    assert "best" in output
+    assert "The defaults" in output
+
+
+def test_settings_that_fail_are_told_and_the_others_go_on() -> None:
+    output = told(*SMALL, "tracker=bank,paper", "paper.queue=0", "-n", "2", "-j", "1")
+    assert "tracker=paper: 2 nights failed" in output
+    assert "The defaults are the best." in output
+
+
+@pytest.mark.timeout(60)
+def test_the_same_study_on_a_cluster_says_the_same(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs Dask, the extra `study`")
+    here = told(*SMALL, "-n", "2", "-j", "1")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, scheduler_port=0
+    ) as cluster:
+        there = told(*SMALL, "-n", "2", "--cluster", cluster.scheduler_address)
+    assert there == here

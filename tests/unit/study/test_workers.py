@@ -1,0 +1,72 @@
+"""Tasks are done whatever becomes of the workers."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from afspm.errors import ConfigError, InvalidValue
+from afspm.study.workers import Outcome, on_cluster, on_cores
+
+
+def doubled(number: int) -> int:
+    if number < 0:
+        raise InvalidValue("below zero")
+    return 2 * number
+
+
+def doubled_by_the_next(number: int, marks: Path) -> int:
+    """The first worker that is given 3 dies of it."""
+    mark = marks / "died"
+    if number == 3 and not mark.exists():
+        mark.touch()
+        os._exit(9)
+    return 2 * number
+
+
+def deadly(number: int) -> int:
+    os._exit(9)
+
+
+def by_index(outcomes: list[Outcome]) -> list[Outcome]:
+    return sorted(outcomes, key=lambda outcome: outcome.index)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_every_task_is_done_and_an_error_is_told_for_its_task_alone(jobs: int) -> None:
+    done = by_index(list(on_cores(doubled, [(1,), (-1,), (3,)], jobs=jobs)))
+    assert done == [Outcome(0, 2), Outcome(1, error="below zero"), Outcome(2, 6)]
+
+
+def test_a_worker_that_is_killed_loses_no_task(tmp_path: Path) -> None:
+    done = by_index(list(on_cores(doubled_by_the_next, [(n, tmp_path) for n in range(6)], jobs=2)))
+    assert [outcome.value for outcome in done] == [2 * n for n in range(6)]
+    assert (tmp_path / "died").exists()
+
+
+def test_what_kills_every_worker_is_told_instead_of_tried_for_ever() -> None:
+    done = list(on_cores(deadly, [(1,), (2,)], jobs=2))
+    assert len(done) == 2
+    assert all("died 3 times" in outcome.error for outcome in done)
+
+
+@pytest.mark.timeout(60)
+def test_a_cluster_loses_no_task_with_a_worker(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs Dask, the extra `study`")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, scheduler_port=0
+    ) as cluster:
+        tasks = [(n, tmp_path) for n in range(6)]
+        done = by_index(list(on_cluster(doubled_by_the_next, tasks, address=cluster.scheduler_address)))
+        failed = list(on_cluster(doubled, [(-1,)], address=cluster.scheduler_address))
+    assert [outcome.value for outcome in done] == [2 * n for n in range(6)]
+    assert (tmp_path / "died").exists()
+    assert failed == [Outcome(0, error="below zero")]
+
+
+def test_a_cluster_that_is_not_there_is_told() -> None:
+    pytest.importorskip("distributed", reason="needs Dask, the extra `study`")
+    with pytest.raises(ConfigError, match="no cluster"):
+        list(on_cluster(doubled, [(1,)], address="nonsense://nowhere"))
