@@ -65,7 +65,7 @@ def _shown(outcomes: Iterator[Outcome], total: int) -> Iterator[Outcome]:
 def show(rows: Sequence[Summary], console: Console) -> None:
     """The table, what it means, and what it says of the defaults."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("settings", overflow="fold", min_width=16)
+    table.add_column("settings", overflow="fold", min_width=14)
     for name in ("n", COLUMNS[BY], "quartiles", *(name for key, name in COLUMNS.items() if key != BY)):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
@@ -90,7 +90,10 @@ def _mark(row: Summary) -> str:
 
 
 def _cell(row: Summary, name: str) -> str:
-    return f"{row.quartiles[name][1]:.3g}" if name in row.quartiles else "-"
+    if name not in row.quartiles:
+        return "-"
+    value = row.quartiles[name][1]
+    return f"{value:.3g}" if value >= 1.0 else f"{value:.2g}"
 
 
 def _spread(row: Summary) -> str:
