@@ -96,6 +96,9 @@ WIRE_KEYS: Final[dict[str, tuple[Wire, ...]]] = {
 COMPONENT_ALIASES: Final[dict[str, str]] = {
     "afspm.components.microscope.mediator.MicroscopeMediator": "Scheduler",
     "afspm.components.microscope.scheduler.MicroscopeScheduler": "Scheduler",
+    "afspm.components.drift.mediator.DriftCompensatedMediator": "DriftCompensatedScheduler",
+    "afspm.components.drift.scheduler.DriftCompensatedScheduler": "DriftCompensatedScheduler",
+    "afspm.components.drift.rescanner.DriftRescanner": "Rescanner",
     "afspm.components.scan.metadata.ScanMetadataWriter": "Metadata",
 }
 

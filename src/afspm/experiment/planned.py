@@ -9,7 +9,7 @@ from typing import Any
 from afspm.logic.limits import Guard, Limits
 from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
 
-PURE = ("afspm.components", "afspm.microscopes.simulator")
+PURE = ("afspm.components", "afspm.microscopes.simulator", "afspm.scheduler")
 """Classes from here, and those derived from them, do nothing in `__init__` but to keep and to check their settings."""
 
 
@@ -31,6 +31,8 @@ def plan_of(component: type, settings: Mapping[str, Any]) -> Planned | None:
     if not any(f"{base.__module__}.".startswith(f"{package}.") for base in component.__mro__ for package in PURE):
         return None
     made = component(**settings)
+    if callable(check := getattr(made, "check", None)):
+        check()  # what takes longer than `__init__` may
     plan = getattr(made, "plan", None)
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))

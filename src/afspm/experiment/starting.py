@@ -12,6 +12,7 @@ from afspm.experiment import limits, wiring
 from afspm.experiment.experiment import Start
 from afspm.experiment.findings import nearest
 from afspm.experiment.parts import Part, Role
+from afspm.model import Frame
 from afspm.runtime.launch import Launch, Sockets
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
         messages=resolved.messages,
         beat_period_s=resolved.restart.beat_period,
         simulated=resolved.simulated,
+        sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
     )
     folders = tuple(str(folder) for folder in resolved.document.folders)
     return Start(launch, role, _command(part), experiment.folder, folders, part.own.get("heartbeats") is not False)
@@ -166,6 +168,12 @@ def _log(resolved: Resolved) -> tuple[str | None, str]:
         if getattr(component, "collects_logs", False) is True:
             return wiring.connectable(str(resolved.settings[name]["address"])), name
     return None, ""
+
+
+def _in_sample_coordinates(resolved: Resolved) -> bool:
+    """Whether the scheduler maps places, as its class says."""
+    schedulers = resolved.with_role(Role.SCHEDULER)
+    return any(getattr(resolved.classes.get(part.name), "frame", None) is Frame.SAMPLE for part in schedulers)
 
 
 def _first(a: int | None, b: int) -> int:

@@ -24,8 +24,8 @@ _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
 _SENT_REMEMBERED = 100
 _UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
-OwnEnd = Callable[[Response, float, int], None]
-"""Told of the answer to a request of the scheduler's own, with now_s and now_ns."""
+OwnEnd = Callable[[Response, int], Iterable[Effect]]
+"""Told of the answer to a request of the scheduler's own, and of the experiment's time, ns; what follows from it."""
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 
 
@@ -228,6 +228,7 @@ class Desk:
         if not self.mover.begin(event, move, now_s):
             return False  # nobody is there to be moved, as the action will be told
         self._once.note(event.name, event.request, Fate.PENDING)
+        self.effects.append(self._save())  # with where it is sent: what is told of it is then known after a restart
         return True
 
     def act_when_moved(self, now_s: float) -> None:
@@ -325,7 +326,7 @@ class Desk:
             self.act_when_moved(now_s)
             return
         if (ended := self._asked_by_us.pop(job.number, None)) is not None:
-            ended(response, now_s, now_ns)
+            self.effects += ended(response, now_ns)
             return
         told = self.errands.ended(job, end, response, now_s)
         if told is not None:

@@ -259,16 +259,16 @@ class Guard:
     def _check_parameter_geometry(self, parameter: Parameter) -> None:
         """A single parameter may move or turn the scan, or make it too many pixels, as well."""
         for name, value in self._values(parameter):
-            if name not in _GEOMETRY and name not in _PROBE and name not in _RESOLUTION:
+            if name not in REGION_CHANGES and name not in PROBE_CHANGES and name not in _RESOLUTION:
                 continue
-            if name in _PROBE:
-                self._check_move(_PROBE[name](value))
+            if name in PROBE_CHANGES:
+                self._check_move(PROBE_CHANGES[name](value))
             elif name in _RESOLUTION:
                 if value < 1 or value != int(value):
                     raise _param_error(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
                 self._check_scan(ScanParameters(shape=_RESOLUTION[name](int(value))))
             else:
-                self._check_scan(ScanParameters(_GEOMETRY[name](value)))
+                self._check_scan(ScanParameters(REGION_CHANGES[name](value)))
 
     # --- values ---
 
@@ -278,7 +278,7 @@ class Guard:
             value = self._number(subject)
             return [] if value is None else [(subject.name, value)]
         if isinstance(subject, ScanParameters):
-            return _scan_values(subject)
+            return scan_values(subject)
         if isinstance(subject, Feedback):
             pairs = (
                 (names.ZCTRL_SETPOINT, subject.setpoint),
@@ -328,11 +328,11 @@ _RESOLUTION: dict[str, Callable[[int], ShapeChange]] = {
     names.SCAN_RESOLUTION_X: lambda value: ShapeChange(columns=value),
     names.SCAN_RESOLUTION_Y: lambda value: ShapeChange(rows=value),
 }
-_PROBE: dict[str, Callable[[float], PositionChange]] = {
+PROBE_CHANGES: dict[str, Callable[[float], PositionChange]] = {
     names.PROBE_POS_X: lambda value: PositionChange(x_m=value),
     names.PROBE_POS_Y: lambda value: PositionChange(y_m=value),
 }
-_GEOMETRY: dict[str, Callable[[float], RegionChange]] = {
+REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
     names.SCAN_TOP_LEFT_X: lambda value: RegionChange(left_m=value),
     names.SCAN_TOP_LEFT_Y: lambda value: RegionChange(low_m=value),
     names.SCAN_SIZE_X: lambda value: RegionChange(width_m=value),
@@ -364,7 +364,8 @@ def _inside(allowed: Region, xy_m: XY) -> bool:
     return replace(allowed, size_m=grown).contains(xy_m)
 
 
-def _scan_values(wanted: ScanParameters) -> list[tuple[str, float]]:
+def scan_values(wanted: ScanParameters) -> list[tuple[str, float]]:
+    """The parameters that a request for a scan sets, with their values in SI."""
     region, values = wanted.region, list[tuple[str, float]]()
     if isinstance(region, Region):
         (left, low), (width, height) = region.top_left_m, region.size_m

@@ -62,3 +62,8 @@ PULSE_DURATION: Final = "x-pulse-duration"
 CRASH_SPEED: Final = "x-crash-speed"
 CRASH_DEPTH: Final = "x-crash-depth"
 SPEC_KIND: Final = "x-spec-kind"
+
+# Of the slow axis: "up" (small y first) or "down".
+SCAN_DIRECTION: Final = "x-scan-direction"
+UP: Final = "up"
+DOWN: Final = "down"

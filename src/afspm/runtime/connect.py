@@ -12,7 +12,7 @@ from typing import Any
 
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, ExperimentEnded, FileError, NoResponse
-from afspm.model import ProblemNames
+from afspm.model import Frame, ProblemNames
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
 from afspm.runtime.messages import register_all
@@ -64,7 +64,8 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     if not joined:
         port.close()
         raise NoResponse("nobody is there", where=str(folder), hint="is the experiment still running?")
-    scope = Scope(link, ProblemNames(launch.problems), folder / "state")
+    frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
+    scope = Scope(link, ProblemNames(launch.problems), folder / "state", frame=frame)
     weakref.finalize(scope, port.close)
     return scope
 

@@ -66,6 +66,8 @@ class Launch:
     messages: tuple[str, ...] = ()
     """Python modules, or .proto files, with message types of the user."""
     simulated: bool = False
+    sample_coordinates: bool = False
+    """Whether places are those of the sample, which the scheduler maps to those of the tip."""
 
     def to_json(self) -> str:
         """One line, without the newline at its end."""

@@ -21,7 +21,10 @@ def load(launch: Launch) -> Process:
     class_ = find_class(launch.class_, launch.name)
     _check_settings(class_, launch)
     try:
-        made = class_(**{name: made_of(value, launch.name) for name, value in launch.settings.items()})
+        plain = getattr(class_, "plain_settings", ())  # tables in which it looks for a `class` by itself
+        made = class_(
+            **{name: value if name in plain else made_of(value, launch.name) for name, value in launch.settings.items()}
+        )
     except AfspmError as error:
         where = f"{launch.name}: {error.where}" if error.where else launch.name
         raise ConfigError(error.what, where=where, hint=error.hint) from error

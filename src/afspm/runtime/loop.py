@@ -9,7 +9,7 @@ from pathlib import Path
 from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import ConfigError, ExperimentEnded
-from afspm.model import Packet
+from afspm.model import Frame, Packet
 from afspm.runtime import failure
 from afspm.runtime.backlog import Backlog
 from afspm.runtime.component import Component
@@ -54,7 +54,8 @@ class ComponentLoop:
             log=context.log,
         )
         between = self._handle_what_came if self._is_script and self._dispatcher.wants_anything else _nothing
-        self._scope = Scope(self._link, context.problems, state_dir, between)
+        frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
+        self._scope = Scope(self._link, context.problems, state_dir, between, frame)
         self._link.listen(self._keep)
         self._give_attributes(state_dir)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from afspm.model import (
@@ -25,20 +26,28 @@ from afspm.runtime.view import View
 SAME = 1e-6  # of the size: closer than any controller positions
 FITS = 1e-2  # of the size: a controller's rounding, not another region
 SAME_PLACE_M = 1e-9
+MOVED = 0.5  # of the size: where drift is corrected, a scan lies where it turned out to have been taken
 
 MEASURED = {"scan": (ScopeState.SCANNING, "Scan2d"), "spectrum": (ScopeState.SPEC, "Spec1d")}
 """By what is measured: the state of the microscope meanwhile, and the message of the results."""
 
 
 class Plans:
-    """Makes the plans of one component."""
+    """Makes the plans of one component.
 
-    def __init__(self, view: View, asker: Asker) -> None:
+    Args:
+        frame: of the places that it speaks of.
+    """
+
+    def __init__(self, view: View, asker: Asker, frame: Frame = Frame.TIP) -> None:
         self._view = view
         self._asker = asker
+        self._frame = frame
         self._set: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def scan(self, region: Region | None, shape: tuple[int, int] | None) -> Plan:
+        if region is not None and self._frame is Frame.SAMPLE:
+            region = replace(region, frame=Frame.SAMPLE)
         wanted = ScanParameters(region, shape)
         facts = {"what": "scan", "region": _region_facts(region), "shape": list(shape) if shape else None}
         return Plan(
@@ -53,7 +62,10 @@ class Plans:
         )
 
     def spectrum(self, at_m: tuple[float, float] | None, kind: str | None) -> Plan:
-        facts = {"what": "spectrum", "at_m": [float(at_m[0]), float(at_m[1])] if at_m else None, "kind": kind}
+        facts: dict[str, Any] = {"what": "spectrum", "at_m": [float(at_m[0]), float(at_m[1])] if at_m else None}
+        facts["kind"] = kind
+        if self._frame is Frame.SAMPLE:
+            facts["frame"] = self._frame.value
 
         def prepare(until_s: float | None) -> None:
             if kind is not None:
@@ -108,13 +120,17 @@ def _scan_fits(facts: dict[str, Any], scan: Scan) -> bool:
     if facts["region"] is None:
         return True
     *numbers, frame = facts["region"]
-    return _is_near(_region_of(numbers, frame), scan.region, FITS)
+    wanted = _region_of(numbers, frame)
+    if wanted.frame is Frame.SAMPLE:
+        near = math.dist(wanted.center_m, scan.region.center_m) <= MOVED * min(wanted.size_m)
+        return near and _is_near(wanted.moved_to(scan.region.center_m), scan.region, FITS)
+    return _is_near(wanted, scan.region, FITS)
 
 
 def _spectrum_fits(facts: dict[str, Any], spectrum: Spectrum) -> bool:
     if facts["kind"] is not None and spectrum.kind != facts["kind"]:
         return False
-    if facts["at_m"] is None or spectrum.position_m is None:
+    if facts["at_m"] is None or spectrum.position_m is None or facts.get("frame") == Frame.SAMPLE.value:
         return True
     return math.dist(facts["at_m"], spectrum.position_m) <= SAME_PLACE_M
 

@@ -15,6 +15,7 @@ from afspm.model import (
     ControlResponse,
     ControlState,
     Feedback,
+    Frame,
     Parameter,
     ProbePosition,
     Problem,
@@ -56,6 +57,7 @@ class Scope:
         link: to the experiment.
         state_dir: where keyed measurements are kept; None: only in memory.
         between: called after each outermost call, when nothing is under way.
+        frame: of all places.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class Scope:
         problems: ProblemNames | None = None,
         state_dir: Path | None = None,
         between: Callable[[], None] = lambda: None,
+        frame: Frame = Frame.TIP,
     ) -> None:
         self._link = link
         self._between = between
@@ -71,7 +74,7 @@ class Scope:
         self.problems = problems or ProblemNames()
         self._holding = Holding(link, self.problems)
         self._asker = Asker(link, self._holding)
-        self._plans = Plans(link.view, self._asker)
+        self._plans = Plans(link.view, self._asker, frame)
         self._results = Results(state_dir, link.name)
         self._measuring = Measuring(link, self._holding, self._asker, self._results)
         self._measuring.resume(MEASURED, fits)

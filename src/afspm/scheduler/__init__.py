@@ -2,6 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from afspm.scheduler.scheduler import Scheduler
 
-__all__ = ["Scheduler"]
+if TYPE_CHECKING:
+    from afspm.scheduler.drift.scheduler import DriftCompensatedScheduler
+
+__all__ = ["DriftCompensatedScheduler", "Scheduler"]
+
+
+def __getattr__(name: str) -> Any:
+    if name != "DriftCompensatedScheduler":  # loaded only where it is asked for
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from afspm.scheduler.drift.scheduler import DriftCompensatedScheduler
+
+    return DriftCompensatedScheduler

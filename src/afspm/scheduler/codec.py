@@ -27,6 +27,14 @@ class WireCodec:
         except AfspmError:
             return None
 
+    def encode(self, thing: Any) -> bytes:
+        return wire.encode(thing)[1]
+
+    def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
+        """See `scheduler.drift.places.PlaceCodec`."""
+        of = "ScanParameters2d" if message in ("Scan2d", "ScanParameters2d") else "ProbePosition"
+        return wire.relocated(message, payload, wire.place_in(of, told))
+
     def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
         try:
             return wire.decode(message, payload)

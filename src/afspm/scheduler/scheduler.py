@@ -12,12 +12,12 @@ from typing import Any, Protocol
 
 from afspm.clock import Clock
 from afspm.errors import FileError
-from afspm.logic.scheduling import SchedulerCore
+from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
 from afspm.model import ProblemNames
 from afspm.scheduler.codec import WireCodec
 from afspm.scheduler.journal import Journal
 from afspm.scheduler.settings import scheduler_settings
-from afspm.scheduler.shell import Shell
+from afspm.scheduler.shell import Core, Shell
 from afspm.scheduler.state_file import StateFile
 from afspm.transport.complaints import Complaints
 from afspm.transport.launching import Launched
@@ -93,7 +93,8 @@ class Scheduler:
         folder = Path(launch.state_dir) if launch.state_dir else None
         state = StateFile(folder and folder / f"{launch.name}.json", log)
         journal = Journal(folder and folder / f"{launch.name}.cache", clock, log)
-        core = self._core(context, state, journal)
+        core = self._core(context)
+        _restore(core, state, journal)
         complaints = Complaints(log, clock)
         sockets = SchedulerSockets(launch, complaints, since_ns=core.newest_source_ns)
         stopping = threading.Event()
@@ -103,7 +104,7 @@ class Scheduler:
             sockets.wake_up()
 
         context.when_stopping(stop)
-        shell = Shell(core, sockets, clock, state, journal, complaints, log)
+        shell = self._shell(core, sockets, clock, state, journal, complaints, log)
         try:
             shell.start()
             while not (shell.over or stopping.is_set()):
@@ -115,21 +116,31 @@ class Scheduler:
             shell.close()
         return _ENDED if shell.ended else _ORPHAN
 
-    def _core(self, context: SchedulerContext, state: StateFile, journal: Journal) -> SchedulerCore:
-        """The decisions, with what was in force before a restart."""
+    def _settings(self, context: SchedulerContext) -> SchedulerSettings:
         settings = scheduler_settings(
             self._control, self._limits, self._cache, context.problems, context.launch.request_timeout_s
         )
-        core = SchedulerCore(replace(settings, clock=dict(context.launch.clock)), WireCodec())
-        saved = state.load()
-        try:
-            if saved:
-                core.restore(saved)
-        except (KeyError, TypeError, ValueError) as error:
-            raise FileError(
-                f"what was in force before the restart can't be understood: {error!r}",
-                where=str(state.path),
-                hint="delete the file to begin with nobody in control",
-            ) from error
-        core.restore_cache(journal.load())
-        return core
+        return replace(settings, clock=dict(context.launch.clock))
+
+    def _core(self, context: SchedulerContext) -> Core:
+        """The decisions."""
+        return SchedulerCore(self._settings(context), WireCodec())
+
+    def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> Shell:
+        """What is around them."""
+        return Shell(core, sockets, *others)
+
+
+def _restore(core: Core, state: StateFile, journal: Journal) -> None:
+    """What was in force before a restart."""
+    saved = state.load()
+    try:
+        if saved:
+            core.restore(saved)
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(
+            f"what was in force before the restart can't be understood: {error!r}",
+            where=str(state.path),
+            hint="delete the file to begin with nobody in control",
+        ) from error
+    core.restore_cache(journal.load())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Hashable, Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from afspm import wire
 from afspm.errors import WireError
@@ -19,7 +19,6 @@ from afspm.wire.frames import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
-    from afspm.logic.scheduling import SchedulerCore
     from afspm.scheduler.journal import Journal
     from afspm.scheduler.state_file import StateFile
     from afspm.transport.complaints import Complaints
@@ -34,12 +33,26 @@ FAREWELL_S = 3.0
 it is over."""
 
 
+class Core(Protocol):
+    """A `SchedulerCore`, or what has the same steps; see there."""
+
+    def start(self, now_s: float, now_ns: int) -> list[events.Effect]: ...
+    def step(self, event: events.Input, now_s: float, now_ns: int) -> list[events.Effect]: ...
+    def deadline_s(self) -> float | None: ...
+    def deadline_ns(self) -> int | None: ...
+    def restore(self, state: dict[str, Any]) -> None: ...
+    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None: ...
+    def cached(self) -> Iterable[tuple[Packet, int | None]]: ...
+    @property
+    def newest_source_ns(self) -> int: ...
+
+
 class Shell:
     """One scheduler at work: `start`, then `handle` what `wait` returns until it is `over`."""
 
     def __init__(
         self,
-        core: SchedulerCore,
+        core: Core,
         sockets: SchedulerSockets,
         clock: Clock,
         state: StateFile,

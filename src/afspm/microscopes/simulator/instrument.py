@@ -276,6 +276,7 @@ class Instrument:
             doing["start_s"],
             feedback(values),
             float(values[names.TIP_BIAS_VOLTAGE]),
+            direction=str(values[names.SCAN_DIRECTION]),
             slope=(float(values[names.SAMPLE_SLOPE_X]), float(values[names.SAMPLE_SLOPE_Y])),
         )
 

@@ -1,0 +1,54 @@
+"""The wire, as far as drift compensation needs it."""
+
+from __future__ import annotations
+
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from afspm.scheduler.codec import WireCodec
+from afspm.scheduler.drift.told import Matrix, Registered, RescanWanted, ScanJob
+from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
+from afspm.wire.generated.scan_pb2 import ScanParameters2d
+
+_NS = 1_000_000_000
+
+
+class DriftWireCodec(WireCodec):
+    """See `scheduler.drift.told.DriftCodec`."""
+
+    def encode_mapping(self, registered: Registered, scan: ScanJob, *, correcting: bool) -> bytes:
+        return DriftMapping(
+            timestamp=_timestamp(round(registered.time_s * _NS)),
+            matrix=_flat(registered.matrix[:2]),
+            covariance=_flat(registered.covariance_m2),
+            rate=registered.rate_m_s,
+            rate_covariance=_flat(registered.rate_covariance),
+            matched=registered.matched,
+            lost=registered.lost,
+            reason=registered.reason,
+            residual=registered.residual_m,
+            references=[key.rpartition(" ")[0] for key in registered.references],
+            filename=scan.scan.filename,
+            center=scan.scan.region.center_m,
+            correcting=correcting,
+        ).SerializeToString()
+
+    def encode_rescan(self, wanted: RescanWanted) -> bytes:
+        params = ScanParameters2d.FromString(wanted.said)
+        if wanted.shape is not None:
+            params.data.shape.y, params.data.shape.x = wanted.shape
+        message = DriftRescan(
+            timestamp=_timestamp(wanted.time_ns),
+            params=params,
+            kind=int(wanted.kind),  # type: ignore[arg-type]
+            reason=wanted.reason,
+            upwards=wanted.upwards,
+        )
+        return message.SerializeToString()
+
+
+def _timestamp(time_ns: int) -> Timestamp:
+    return Timestamp(seconds=time_ns // _NS, nanos=time_ns % _NS)
+
+
+def _flat(rows: Matrix) -> list[float]:
+    return [value for row in rows for value in row]

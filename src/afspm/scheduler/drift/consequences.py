@@ -1,0 +1,136 @@
+"""What follows from what a scan has told of the drift: flags, scans to be taken again, a rate handed over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from afspm.logic.desk import OwnEnd
+from afspm.logic.events import Announced, Effect, Input, Log, ProblemSeen
+from afspm.logic.scheduling import SchedulerCore
+from afspm.model import ControlRequest, Parameter, Problem, Request, Response, names
+from afspm.scheduler.drift.frame import DriftFrame
+from afspm.scheduler.drift.knowledge import Knowledge
+from afspm.scheduler.drift.settings import DriftSettings
+from afspm.scheduler.drift.told import DriftCodec, Registered, RescanKind, RescanWanted, ScanJob, Worker
+
+RESCAN = "DriftRescan"
+_DRIFT = int(Problem.THERMAL_DRIFT)
+_AT_START = "drift is not known until a scan in the other direction has told the velocity"
+
+Step = Callable[[Input], list[Effect]]
+
+
+class Consequences:
+    """Decides what is to be done; `step` has the scheduler do it.
+
+    Args:
+        name: of the scheduler, in which it flags problems.
+    """
+
+    def __init__(
+        self,
+        settings: DriftSettings,
+        core: SchedulerCore,
+        codec: DriftCodec,
+        frame: DriftFrame,
+        knowledge: Knowledge,
+        worker: Worker,
+        name: str,
+    ) -> None:
+        self._settings = settings
+        self._core = core
+        self._codec = codec
+        self._frame = frame
+        self._knowledge = knowledge
+        self._worker = worker
+        self._name = name
+        self._started = settings.at_start == "nothing"
+        self._given_m_s = [0.0, 0.0]
+        self._accepted: dict[str, float] = {}
+
+    def of(self, registered: Registered, job: ScanJob, step: Step, now_ns: int) -> list[Effect]:
+        """What is done after a scan was published."""
+        if not self._knowledge.corrects(now_ns * 1e-9):
+            return []
+        if registered.lost:
+            effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
+            return effects + self._want(RescanKind.SEARCH, f"the sample is lost: {registered.reason}", step, now_ns)
+        if not self._started:
+            return self._begin(job.upwards, step, now_ns)
+        effects = self._found(step)
+        if registered.rescan:
+            effects += self._want(RescanKind.AGAIN, registered.rescan, step, now_ns)
+        return effects
+
+    def _begin(self, upwards: bool | None, step: Step, now_ns: int) -> list[Effect]:
+        """The first scan is there: nobody goes on before it has been taken in the other direction."""
+        self._started = True
+        if upwards is None:
+            return [Log("WARNING", f"the microscope does not tell its {names.SCAN_DIRECTION}: no scan up and down")]
+        effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
+        return effects + self._want(RescanKind.OPPOSITE, _AT_START, step, now_ns, upwards=not upwards)
+
+    def _found(self, step: Step) -> list[Effect]:
+        """Remove a flag of ours; but who is in control to solve it first puts right what it changed for that."""
+        control = self._core.control
+        if control.problems.get(_DRIFT) != self._name or control.solving == _DRIFT:
+            return []
+        return step(ProblemSeen(_DRIFT, flagged=False, name=self._name))
+
+    def _want(
+        self, kind: RescanKind, reason: str, step: Step, now_ns: int, *, upwards: bool | None = None
+    ) -> list[Effect]:
+        place = self._frame.region.current
+        if place is None:
+            return [Log("ERROR", f"{reason}, and where to scan again is not known")]
+        wanted = RescanWanted(kind, place.said, self._frame.shape, reason, now_ns, upwards)
+        return [
+            Log("WARNING", f"a scan is wanted again: {reason}"),
+            *step(Announced(RESCAN, self._codec.encode_rescan(wanted))),
+        ]
+
+    # --- a controller that compensates by itself ---
+
+    def hand_over(self, now_s: float, now_ns: int) -> list[Effect]:
+        """Tell the controller the newest rate, if there is one beyond what it has been told."""
+        compensate, time_s = self._settings.compensate, now_ns * 1e-9
+        predicted = self._knowledge.predicted(time_s)
+        if compensate is None or predicted is None or not self._knowledge.corrects(time_s):
+            return []
+        sd_m_s = np.sqrt(np.diagonal(predicted.rate_covariance))
+        if np.hypot(*predicted.rate_m_s) <= np.hypot(*sd_m_s):
+            return []
+        total = [float(given + more) for given, more in zip(self._given_m_s, predicted.rate_m_s, strict=True)]
+        self._accepted = {}
+        effects: list[Effect] = []
+        for axis, value_m_s in zip((compensate.x, compensate.y), total, strict=True):
+            effects += self._core.ask_own(self._set(axis, value_m_s), now_s, self._answered(axis, total))
+        return effects
+
+    def _set(self, name: str, value_m_s: float) -> Request:
+        parameter = Parameter(name, f"{value_m_s:.9g}", "m/s")
+        return Request(int(ControlRequest.PARAM), parameter, self._codec.encode_parameter(parameter))
+
+    def _answered(self, axis: str, total_m_s: list[float]) -> OwnEnd:
+        def ended(response: Response, now_ns: int) -> list[Effect]:
+            if not response.ok:
+                return [Log("ERROR", f"the controller does not take the rate of the drift, {axis}: {response.reason}")]
+            self._accepted[axis] = now_ns * 1e-9
+            if len(self._accepted) == 2:
+                self._given_m_s = total_m_s
+                self._worker.compensated(max(self._accepted.values()), (total_m_s[0], total_m_s[1]))
+            return []
+
+        return ended
+
+    # --- over a kill ---
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain JSON."""
+        return {"started": self._started, "given_m_s": self._given_m_s}
+
+    def restore(self, plain: dict[str, Any]) -> None:
+        self._started, self._given_m_s = bool(plain["started"]), [float(v) for v in plain["given_m_s"]]

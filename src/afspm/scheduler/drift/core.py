@@ -1,0 +1,373 @@
+"""`DriftCore`: a `SchedulerCore` in whose coordinates the sample stands still."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from afspm.drift.mapping import Mapping
+from afspm.errors import AfspmError
+from afspm.logic.arbitration import Control
+from afspm.logic.events import (
+    Announced,
+    Effect,
+    Input,
+    Log,
+    PacketIn,
+    RequestIn,
+    SaveState,
+    Tick,
+    TranslatorCaughtUp,
+    TranslatorUp,
+)
+from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
+from afspm.model import (
+    ControlRequest,
+    ControlState,
+    Frame,
+    Packet,
+    PacketHeader,
+    Parameter,
+    Region,
+    Request,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
+    names,
+)
+from afspm.scheduler.drift.consequences import Consequences
+from afspm.scheduler.drift.frame import DriftFrame
+from afspm.scheduler.drift.gate import Gate, Held, Matrix
+from afspm.scheduler.drift.knowledge import Knowledge
+from afspm.scheduler.drift.places import is_same
+from afspm.scheduler.drift.settings import DriftSettings
+from afspm.scheduler.drift.told import (
+    DriftCodec,
+    NotRegistered,
+    Registered,
+    ScanJob,
+    Worker,
+    WorkerGone,
+    WorkerSaid,
+)
+from afspm.units import same_kind
+
+MAPPING = "DriftMapping"
+_MOST_TRIES = 2
+"""So often a scan is registered, if the worker ends over it."""
+_MOST_ENDS = 4
+"""After so many ends in a row, without a scan registered between them, it is not started again."""
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """When a scan began, and in which direction."""
+
+    time_s: float
+    upwards: bool | None
+
+
+class DriftCore:
+    """Has the same steps as a `SchedulerCore`, which does all that is not about drift.
+
+    Scans are held back until the worker has registered them; then everything that came after them follows. What the
+    worker says is an input, too: `said`.
+
+    Args:
+        name: of the scheduler.
+    """
+
+    def __init__(
+        self, settings: SchedulerSettings, drift: DriftSettings, codec: DriftCodec, worker: Worker, name: str
+    ) -> None:
+        self.knowledge = Knowledge(drift)
+        self.frame = DriftFrame(codec, self.knowledge.mapping_at)
+        self.frame.beside = self._kept
+        self.core = SchedulerCore(settings, codec, self.frame)
+        self._settings = drift
+        self._codec = codec
+        self._worker = worker
+        self._consequences = Consequences(drift, self.core, codec, self.frame, self.knowledge, worker, name)
+        self._gate = Gate()
+        self._jobs: dict[str, ScanJob] = {}
+        self._begun: _Begun | None = None
+        self._channel = drift.channel
+        self._ends = 0
+        self._told_channel = False
+
+    # --- life ---
+
+    def start(self, now_s: float, now_ns: int) -> list[Effect]:
+        if self.knowledge.start_s is None:
+            self.knowledge.start_s = now_ns * 1e-9
+        self._worker.start()
+        return self.core.start(now_s, now_ns)
+
+    def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
+        if isinstance(event, PacketIn):
+            return self._on_packet(event, now_s, now_ns)
+        held, effects = self._gate.held, list[Effect]()
+        if held is not None and isinstance(event, TranslatorCaughtUp):
+            self._gate.keep(event)  # there is more to come, which waits as well
+            return []
+        if held is not None and isinstance(event, RequestIn) and event.request.kind == ControlRequest.END_EXPERIMENT:
+            effects = self._give_up(held.key, now_s, now_ns)  # what was measured is published before the end
+        effects += self.core.step(event, now_s, now_ns)
+        if isinstance(event, Tick):
+            effects += self._late(now_s, now_ns)
+        elif isinstance(event, TranslatorUp):
+            effects += self._ask_direction(now_s)
+        return effects
+
+    def said(self, event: WorkerSaid, now_s: float, now_ns: int) -> list[Effect]:
+        """The worker said something."""
+        if isinstance(event, Registered):
+            return self._registered(event, now_s, now_ns)
+        if isinstance(event, NotRegistered):
+            self._ends = 0
+            told = Log("ERROR", f"a scan could not be registered, it goes out as predicted: {event.reason}")
+            return [told, *self._give_up(event.key, now_s, now_ns)]
+        if isinstance(event, WorkerGone):
+            return self._gone(event, now_s, now_ns)
+        return self._learn(event.forecast)
+
+    def deadline_s(self) -> float | None:
+        due_s, held = self.core.deadline_s(), self._gate.held
+        if held is None:
+            return due_s
+        return held.until_s if due_s is None else min(due_s, held.until_s)
+
+    def deadline_ns(self) -> int | None:
+        return self.core.deadline_ns()
+
+    def snapshot(self) -> dict[str, Any]:
+        return self.core.snapshot()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.core.restore(state)
+        kept = self.frame.restored
+        if kept:
+            self.knowledge.restore(kept["knowledge"])
+            self._consequences.restore(kept["consequences"])
+            self._gate.restore(kept["scans"])
+            self._channel = self._settings.channel or kept["channel"]
+
+    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
+        entries = list(packets)
+        self.core.restore_cache(entries)
+        for packet, source_ns in entries:
+            if packet.envelope == "ScopeStateMsg":
+                self._note_state(packet.payload, packet.time_ns if source_ns is None else source_ns)
+
+    def cached(self) -> Iterable[tuple[Packet, int | None]]:
+        return self.core.cached()
+
+    @property
+    def newest_source_ns(self) -> int:
+        return self.core.newest_source_ns
+
+    @property
+    def control(self) -> Control:
+        return self.core.control
+
+    @property
+    def control_state(self) -> ControlState:
+        return self.core.control_state
+
+    def _kept(self) -> dict[str, Any]:
+        return {
+            "knowledge": self.knowledge.to_dict(),
+            "consequences": self._consequences.to_dict(),
+            "scans": self._gate.to_list(),
+            "channel": self._channel,
+        }
+
+    # --- packets ---
+
+    def _on_packet(self, event: PacketIn, now_s: float, now_ns: int) -> list[Effect]:
+        if self._gate.held is not None:
+            self._gate.keep(event)
+            return self._look_at(event, now_s, now_ns)
+        message = event.header.message
+        if message == "ScopeStateMsg":
+            self._note_state(event.packet.payload, event.packet.time_ns)
+        if message != "Scan2d":
+            return self.core.step(event, now_s, now_ns)
+        scan = self._codec.decode_packet(message, event.packet.payload)
+        if not isinstance(scan, Scan) or not scan.values.size:
+            return self.core.step(event, now_s, now_ns)
+        key = scan_key(scan, event.packet)
+        if self._gate.is_settled(key):
+            return self.core.step(self._relocated(event, scan, self._gate.mapping_of(key)), now_s, now_ns)
+        self._gate.hold(Held(key, self._middle_s(scan, event, now_ns), now_s + self._settings.longest_registration))
+        self._gate.keep(event)
+        return self._look_at(event, now_s, now_ns)
+
+    def _look_at(self, event: PacketIn, now_s: float, now_ns: int) -> list[Effect]:
+        """A packet that waits: is it the channel to register, or the end of a scan that has none?"""
+        held = self._gate.held
+        assert held is not None
+        if held.asked:
+            return []
+        if self._ends >= _MOST_ENDS:
+            return self._give_up(held.key, now_s, now_ns)
+        message = event.header.message
+        if message == "ScopeStateMsg":
+            status = self._codec.decode_packet(message, event.packet.payload)
+            if isinstance(status, ScopeStatus) and status.state is not ScopeState.SCANNING:
+                return self._without_channel() + self._give_up(held.key, now_s, now_ns)
+        elif message == "Scan2d":
+            scan = self._codec.decode_packet(message, event.packet.payload)
+            if isinstance(scan, Scan) and scan_key(scan, event.packet) == held.key and self._is_channel(scan):
+                self._register(held, scan, event, now_ns)
+        return []
+
+    def _is_channel(self, scan: Scan) -> bool:
+        if self._channel is None and same_kind(scan.unit, "m"):
+            self._channel = scan.channel
+        return scan.channel == self._channel
+
+    def _without_channel(self) -> list[Effect]:
+        if self._told_channel:
+            return []
+        self._told_channel = True
+        wanted = self._channel or "in a unit of length"
+        return [Log("WARNING", f"a scan without the channel {wanted}: drift can't be seen in it")]
+
+    def _register(self, held: Held, scan: Scan, event: PacketIn, now_ns: int) -> None:
+        end_s = self._end_s(scan, event, now_ns)
+        start_s, upwards = 2 * held.middle_s - end_s, None
+        if self._begun is not None and self._begun.time_s < end_s:
+            upwards = self._begun.upwards
+            self.frame.durations.learn(scan.shape, scan.region.size_m, end_s - start_s)
+        job = ScanJob(held.key, scan, start_s, end_s, upwards, self._asked(scan))
+        self._jobs = {held.key: job}
+        held.asked, held.tries = True, held.tries + 1
+        self._worker.register(job)
+
+    def _asked(self, scan: Scan) -> Region | None:
+        """The region that a scan was meant to show, if it was taken where we had it set."""
+        place = self.frame.region.current
+        if place is None or not is_same(place.tip, scan.region):
+            return None
+        return replace(place.sample, frame=Frame.SAMPLE)
+
+    def _middle_s(self, scan: Scan, event: PacketIn, now_ns: int) -> float:
+        """Between when it began and its own end, so that a file that comes late biases nothing."""
+        end_s = self._end_s(scan, event, now_ns)
+        begun = self._begun
+        if begun is not None and begun.time_s < end_s:
+            return (begun.time_s + end_s) / 2
+        return end_s - self.frame.durations.expected_s(scan.shape, scan.region.size_m) / 2
+
+    def _end_s(self, scan: Scan, event: PacketIn, now_ns: int) -> float:
+        time_ns = scan.time_ns if scan.time_ns is not None else event.packet.time_ns
+        return (now_ns if time_ns is None else time_ns) * 1e-9
+
+    def _note_state(self, payload: bytes | memoryview, time_ns: int | None) -> None:
+        status = self._codec.decode_packet("ScopeStateMsg", payload)
+        if not isinstance(status, ScopeStatus) or time_ns is None:
+            return
+        if status.state is ScopeState.SCANNING and status.paused is not True:
+            self._begun = _Begun(time_ns * 1e-9, self.frame.upwards)
+
+    def _relocated(self, event: PacketIn, scan: Scan, matrix: Matrix | None) -> PacketIn:
+        if matrix is None:
+            return event
+        region = Mapping(matrix).to_sample(scan.region)  # type: ignore[arg-type]
+        said = self._codec.encode(ScanParameters(region))
+        packet, header = event.packet, event.header
+        payload = self._codec.relocated("Scan2d", packet.payload, said)
+        size_m = region.size_m if header.size_m is not None else None
+        moved = PacketHeader(header.message, header.channel, size_m, header.kind, header.time_ns)
+        return PacketIn(Packet(packet.envelope, payload, packet.time_ns), moved)
+
+    # --- what comes of a scan ---
+
+    def _registered(self, said: Registered, now_s: float, now_ns: int) -> list[Effect]:
+        self._ends = 0
+        effects = self._learn(said.forecast)
+        job = self._jobs.pop(said.key, None)
+        held = self._gate.held
+        is_awaited = held is not None and held.key == said.key
+        if is_awaited:
+            correcting = self.knowledge.corrects(said.time_s)
+            self._gate.settle(said.key, said.matrix if correcting else None)
+        if job is None:
+            return effects  # long told: a worker that was restarted says it again
+        correcting = self.knowledge.corrects(now_ns * 1e-9)
+        payload = self._codec.encode_mapping(said, job, correcting=correcting)
+        effects += [SaveState(self.snapshot()), *self.core.step(Announced(MAPPING, payload), now_s, now_ns)]
+        if is_awaited:
+            effects += self._release(now_s, now_ns)
+
+        def step(event: Input) -> list[Effect]:
+            return self.core.step(event, now_s, now_ns)
+
+        effects += self._consequences.of(said, job, step, now_ns)
+        return effects + self._consequences.hand_over(now_s, now_ns)
+
+    def _learn(self, forecast: dict[str, Any] | None) -> list[Effect]:
+        try:
+            self.knowledge.learn(forecast)
+        except AfspmError as error:
+            return [Log("ERROR", f"the forecast of the drift can't be understood: {error}")]
+        return []
+
+    def _give_up(self, key: str, now_s: float, now_ns: int) -> list[Effect]:
+        """A scan goes out with the prediction."""
+        held = self._gate.held
+        if held is None or held.key != key:
+            return []
+        self._gate.settle(key, self.knowledge.matrix_at(held.middle_s))
+        return [SaveState(self.snapshot()), *self._release(now_s, now_ns)]
+
+    def _release(self, now_s: float, now_ns: int) -> list[Effect]:
+        effects: list[Effect] = []
+        for event in self._gate.open():
+            effects += self.step(event, now_s, now_ns)
+        return effects
+
+    def _late(self, now_s: float, now_ns: int) -> list[Effect]:
+        """Nobody waits for ever: not for a worker that hangs."""
+        held = self._gate.held
+        if held is None or now_s < held.until_s:
+            return []
+        effects: list[Effect] = []
+        if held.asked:
+            limit_s = self._settings.longest_registration
+            effects.append(Log("ERROR", f"a scan was not registered within {limit_s:g} s, it goes out as predicted"))
+            self._jobs.clear()
+            self._worker.start()
+        return effects + self._give_up(held.key, now_s, now_ns)
+
+    def _gone(self, event: WorkerGone, now_s: float, now_ns: int) -> list[Effect]:
+        self._ends += 1
+        held = self._gate.held
+        if self._ends >= _MOST_ENDS:
+            effects: list[Effect] = [Log("CRITICAL", f"drift is not followed any more: {event.reason}")]
+            return effects + ([] if held is None else self._give_up(held.key, now_s, now_ns))
+        effects = [Log("ERROR", f"what registers scans has ended and is started again: {event.reason}")]
+        self._worker.start()
+        if held is None or not held.asked:
+            return effects
+        job = self._jobs.get(held.key)
+        if job is None or held.tries >= _MOST_TRIES:
+            return effects + self._give_up(held.key, now_s, now_ns)
+        held.tries += 1
+        self._worker.register(job)
+        return effects
+
+    def _ask_direction(self, now_s: float) -> list[Effect]:
+        """In which direction it scans, where it tells."""
+        parameter = Parameter(names.SCAN_DIRECTION)
+        request = Request(int(ControlRequest.PARAM), parameter, self._codec.encode_parameter(parameter))
+        return self.core.ask_own(request, now_s, lambda response, now_ns: ())
+
+
+def scan_key(scan: Scan, packet: Packet) -> str:
+    """What all channels of a scan share, and no other scan has."""
+    time_ns = packet.time_ns if scan.time_ns is None else scan.time_ns
+    return f"{scan.filename} {time_ns}"

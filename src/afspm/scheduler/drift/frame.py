@@ -1,0 +1,363 @@
+"""Components speak of the sample, the microscope of its tip: every request and packet between them is mapped."""
+
+from __future__ import annotations
+
+import base64
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from afspm.drift.mapping import Mapping
+from afspm.errors import AfspmError
+from afspm.logic.frame import Mapped
+from afspm.logic.limits import PROBE_CHANGES, REGION_CHANGES, scan_values
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    PacketHeader,
+    Parameter,
+    PositionChange,
+    ProbePosition,
+    Region,
+    RegionChange,
+    Request,
+    Response,
+    ScanParameters,
+    names,
+)
+from afspm.scheduler.drift.durations import Durations
+from afspm.scheduler.drift.parameters import number_of, told_as, value_in
+from afspm.scheduler.drift.places import InForce, Place, PlaceCodec, away_m, is_same
+
+MOVES_PX = 0.01
+"""A region that lies this far off in the tip's coordinates is set again before it is scanned."""
+MOVES_M = 1e-11
+"""The same of the probe: finer than any scanner positions it."""
+
+_REMEMBERED = 64
+_AT_PROBE = frozenset({names.START_SPEC, names.PULSE, names.CRASH})
+_SET_SCAN, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
+_PARAM = int(ControlRequest.PARAM)
+_MESSAGES = {_SET_SCAN: "ScanParameters2d", _SET_PROBE: "ProbePosition"}
+
+MappingAt = Callable[[float], Mapping | None]
+"""The mapping from tip to sample coordinates at an experiment time, s; None: components are given tip coordinates."""
+
+
+@dataclass(frozen=True)
+class _Remembered:
+    """What a request with an id was mapped to."""
+
+    kind: int
+    place: Place[Any]
+    payload: bytes
+
+
+class DriftFrame:
+    """See `logic.frame.CoordinateFrame`. What is in force is known in both coordinates.
+
+    Attributes:
+        upwards: the direction of the slow axis that is set; None: not known.
+        beside: gives what its owner wants to be kept with it, plain JSON; after a restart that is in `restored`.
+
+    Args:
+        mapping_at: changes whenever more is known of the drift.
+    """
+
+    def __init__(self, codec: PlaceCodec, mapping_at: MappingAt) -> None:
+        self.upwards: bool | None = None
+        self.beside: Callable[[], dict[str, Any]] = dict
+        self.restored: dict[str, Any] = {}
+        self.durations = Durations()
+        self.region: InForce[Region] = InForce()
+        self.probe: InForce[ProbePosition] = InForce()
+        self.shape: tuple[int, int] | None = None
+        self._codec = codec
+        self._mapping_at = mapping_at
+        self._remembered: OrderedDict[str, _Remembered] = OrderedDict()
+
+    # --- requests ---
+
+    def outgoing(self, who: str, request: Request, now_ns: int) -> Mapped | Response | None:
+        now_s = now_ns * 1e-9
+        mapping = self._mapping_at(now_s)
+        change = _place_of(request)
+        if mapping is None or change is None:
+            return None
+        key = f"{who} {request.id}"
+        if request.id and (known := self._remembered.get(key)) is not None:
+            return self._again(known, request)
+        asks = isinstance(request.subject, Parameter) and request.subject.value is None
+        try:
+            if isinstance(change, PositionChange | ProbePosition):
+                sample: Region | ProbePosition = self._position_after(change)
+            else:
+                sample = self._region_after(change)
+        except AfspmError as error:
+            return Response(int(ControlResponse.PARAM_ERROR), b"", str(error), request.id)
+        if asks:
+            return None  # its answer will be mapped
+        return self._mapped(key, request, sample, now_s)
+
+    def _mapped(self, key: str, request: Request, sample: Region | ProbePosition, now_s: float) -> Mapped:
+        """Map a place as a whole, whatever part of it was asked for, and remember what comes of it."""
+        kind, asked = (_SET_SCAN if isinstance(sample, Region) else _SET_PROBE), request.subject
+        rest = asked if isinstance(asked, ScanParameters) else ScanParameters()
+        is_whole = isinstance(asked, ProbePosition) or isinstance(rest.region, Region)
+        place, subject = self._to_tip(sample, request.payload if is_whole else None, rest, now_s)
+        payload = self._codec.encode(subject)
+        if request.id:
+            self._remembered[key] = _Remembered(kind, place, payload)
+            if len(self._remembered) > _REMEMBERED:
+                self._remembered.popitem(last=False)
+        return Mapped(Request(kind, subject, payload, request.id), _names(asked), _said(place))
+
+    def _again(self, known: _Remembered, request: Request) -> Mapped:
+        (self.region if known.kind == _SET_SCAN else self.probe).sending(known.place)
+        subject = self._codec.decode_packet(_MESSAGES[known.kind], known.payload)
+        return Mapped(
+            Request(known.kind, subject, known.payload, request.id), _names(request.subject), _said(known.place)
+        )
+
+    def move_before(self, action: str, now_ns: int) -> Mapped | None:
+        now_s = now_ns * 1e-9
+        if self._mapping_at(now_s) is None:
+            return None
+        here: Place[Any] | None = None
+        if action == names.START_SCAN:
+            here = self.region.current
+        elif action in _AT_PROBE:
+            here = self.probe.current
+        if here is None:
+            return None
+        there = self._tip_of(here.sample, now_s)
+        if away_m(there, here.tip) <= self._tolerance_m(here.tip):
+            return None
+        place, subject = self._to_tip(here.sample, here.said, ScanParameters(), now_s)
+        kind = _SET_SCAN if isinstance(place.tip, Region) else _SET_PROBE
+        return Mapped(Request(kind, subject, place.sent), (), _said(place))
+
+    def _tip_of(self, sample: Region | ProbePosition, now_s: float) -> Any:
+        """Where the tip must be: for a scan that begins now at its middle, for the probe now."""
+        middle_s = now_s
+        if isinstance(sample, Region):
+            middle_s += self.durations.expected_s(self.shape, sample.size_m) / 2
+        mapping = self._mapping_at(middle_s) or Mapping.identity()
+        if isinstance(sample, Region):
+            return mapping.to_tip(sample)
+        x, y = mapping.inverse.apply(sample.xy_m)
+        return ProbePosition((float(x), float(y)))
+
+    def _to_tip(
+        self, sample: Region | ProbePosition, said: bytes | None, rest: ScanParameters, now_s: float
+    ) -> tuple[Place[Any], Any]:
+        """The place in both coordinates, and what the microscope is to be sent for it."""
+        tip = self._tip_of(sample, now_s)
+        if isinstance(sample, Region):
+            subject: Any = ScanParameters(tip, rest.shape, rest.unit)
+            if said is None:
+                said = self._codec.encode(ScanParameters(sample))
+            region_place = Place(sample, said, tip, self._codec.encode(subject))
+            self.region.sending(region_place)
+            return region_place, subject
+        said = self._codec.encode(sample) if said is None else said
+        probe_place = Place(sample, said, tip, self._codec.encode(tip))
+        self.probe.sending(probe_place)
+        return probe_place, tip
+
+    def _tolerance_m(self, tip: Region | ProbePosition) -> float:
+        if isinstance(tip, ProbePosition) or self.shape is None:
+            return MOVES_M
+        rows, columns = self.shape
+        pixel_m = min(tip.size_m[0] / max(columns - 1, 1), tip.size_m[1] / max(rows - 1, 1))
+        return MOVES_PX * pixel_m
+
+    def _region_after(self, change: Region | RegionChange) -> Region:
+        if isinstance(change, Region):
+            return change
+        if self.region.current is None:
+            raise AfspmError(
+                "where the scan is now is not known, so a part of its place can't be mapped; give it whole"
+            )
+        return change.onto(self.region.current.sample)
+
+    def _position_after(self, change: ProbePosition | PositionChange) -> ProbePosition:
+        if isinstance(change, ProbePosition):
+            return change
+        if self.probe.current is None:
+            raise AfspmError(
+                "where the probe is now is not known, so a part of its place can't be mapped; give x and y"
+            )
+        x_m, y_m = self.probe.current.sample.xy_m
+        return ProbePosition((x_m if change.x_m is None else change.x_m, y_m if change.y_m is None else change.y_m))
+
+    # --- what the microscope answers ---
+
+    def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> None:
+        if sent.kind == _SET_SCAN:
+            self.region.was_set(sent.payload)
+            if isinstance(sent.subject, ScanParameters) and isinstance(sent.subject.shape, tuple):
+                self.shape = sent.subject.shape
+        elif sent.kind == _SET_PROBE:
+            self.probe.was_set(sent.payload)
+        elif isinstance(sent.subject, Parameter):
+            parameter = told or sent.subject
+            if parameter.name == names.SCAN_SPEED and sent.subject.value is not None:
+                self.durations.forget()
+            elif parameter.name == names.SCAN_DIRECTION and parameter.value is not None:
+                self.upwards = {names.UP: True, names.DOWN: False}.get(parameter.value)
+
+    def answer(self, asked: Request, told: Parameter | None, now_ns: int) -> Parameter | None:
+        subject, mapping = asked.subject, self._mapping_at(now_ns * 1e-9)
+        if mapping is None or not isinstance(subject, Parameter) or _place_of(asked) is None:
+            return None
+        if subject.value is not None:
+            return subject  # set as a part of the whole place, about which no value came back
+        tip_value = None if told is None else number_of(told)
+        if tip_value is None:
+            return None
+        sample_value = self._in_sample(subject.name, tip_value, mapping)
+        return None if sample_value is None else told_as(subject.name, sample_value, told)
+
+    def _in_sample(self, name: str, tip_value: float, mapping: Mapping) -> float | None:
+        """A part of the place in force, from what the microscope tells of it."""
+        if name in PROBE_CHANGES:
+            position = self.probe.current
+            if position is None:
+                return None
+            axis = int(name == names.PROBE_POS_Y)
+            xy_m = [position.tip.xy_m[0], position.tip.xy_m[1]]
+            xy_m[axis] = tip_value
+            if is_same(ProbePosition((xy_m[0], xy_m[1])), position.tip):
+                return position.sample.xy_m[axis]
+            return float(mapping.apply(xy_m)[axis])
+        region = self.region.current
+        if region is None:
+            return None
+        tip = REGION_CHANGES[name](tip_value).onto(region.tip)
+        return value_in(name, region.sample if is_same(tip, region.tip) else mapping.to_sample(tip))
+
+    # --- packets ---
+
+    def incoming(self, packet: Packet, header: PacketHeader, now_ns: int) -> Packet:
+        handler = {
+            "ScanParameters2d": self._region_told,
+            "ProbePosition": self._probe_told,
+            "Spec1d": self._spectrum_told,
+        }.get(header.message)
+        if handler is None:
+            return packet
+        told = self._codec.decode_packet(header.message, packet.payload)
+        payload = handler(told, packet.payload, (header.time_ns or now_ns) * 1e-9)
+        return packet if payload is None else Packet(packet.envelope, payload, packet.time_ns)
+
+    def _region_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        if not isinstance(told, ScanParameters) or not isinstance(told.region, Region):
+            return None
+        if isinstance(told.shape, tuple):
+            self.shape = told.shape
+        mapping, place = self._mapping_at(time_s), self.region.told(told.region)
+        if place is None or mapping is None:
+            sample = told.region if mapping is None else mapping.to_sample(told.region)
+            place = Place(sample, self._codec.encode(ScanParameters(sample)), told.region, bytes(payload))
+            self.region.current = place
+        return None if mapping is None else self._codec.relocated("ScanParameters2d", payload, place.said)
+
+    def _probe_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        if not isinstance(told, ProbePosition):
+            return None
+        mapping, place = self._mapping_at(time_s), self.probe.told(told)
+        if place is None or mapping is None:
+            sample = told if mapping is None else _position(mapping, told.xy_m)
+            place = Place(sample, self._codec.encode(sample), told, bytes(payload))
+            self.probe.current = place
+        return None if mapping is None else self._codec.relocated("ProbePosition", payload, place.said)
+
+    def _spectrum_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        """It lies where the sample was at its own time, which may not be that of the move to it."""
+        mapping, position_m = self._mapping_at(time_s), getattr(told, "position_m", None)
+        if mapping is None or position_m is None:
+            return None
+        return self._codec.relocated("Spec1d", payload, self._codec.encode(_position(mapping, position_m)))
+
+    # --- over a kill ---
+
+    def snapshot(self) -> dict[str, Any]:
+        return {
+            "region": self.region.current and self.region.current.to_list(),
+            "probe": self.probe.current and self.probe.current.to_list(),
+            "shape": self.shape,
+            "upwards": self.upwards,
+            "durations": self.durations.to_list(),
+            "remembered": [
+                [key, one.kind, *one.place.to_list(), base64.b64encode(one.payload).decode()]
+                for key, one in self._remembered.items()
+            ],
+            "beside": self.beside(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.restored = state["beside"]
+        if state["region"] is not None:
+            self.region.current = self._place(_SET_SCAN, *state["region"])
+        if state["probe"] is not None:
+            self.probe.current = self._place(_SET_PROBE, *state["probe"])
+        self.shape = None if state["shape"] is None else (int(state["shape"][0]), int(state["shape"][1]))
+        self.upwards = state["upwards"]
+        self.durations.restore(state["durations"])
+        for key, kind, said, sent, payload in state["remembered"]:
+            place = self._place(int(kind), said, sent)
+            self._remembered[str(key)] = _Remembered(int(kind), place, base64.b64decode(payload))
+
+    def _place(self, kind: int, said: str, sent: str) -> Place[Any]:
+        """What `Place.to_list` wrote. Raises ValueError if it is no such place."""
+        parts = [base64.b64decode(part) for part in (said, sent)]
+        sample, tip = (self._codec.decode_packet(_MESSAGES[kind], part) for part in parts)
+        if isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters):
+            sample, tip = sample.region, tip.region
+        if sample is None or tip is None:
+            raise ValueError("a place in force that can't be read")
+        return Place(sample, parts[0], tip, parts[1])
+
+
+def _place_of(request: Request) -> Region | RegionChange | ProbePosition | PositionChange | None:
+    """The place, or the part of one, that a request is about."""
+    subject = request.subject
+    if request.kind == _SET_SCAN and isinstance(subject, ScanParameters):
+        return subject.region
+    if request.kind == _SET_PROBE and isinstance(subject, ProbePosition | PositionChange):
+        return subject
+    if request.kind != _PARAM or not isinstance(subject, Parameter):
+        return None
+    if subject.name not in REGION_CHANGES and subject.name not in PROBE_CHANGES:
+        return None
+    value = 1.0 if subject.value is None else number_of(subject)
+    if value is None:
+        return None  # the limits say what is wrong with it
+    return REGION_CHANGES[subject.name](value) if subject.name in REGION_CHANGES else PROBE_CHANGES[subject.name](value)
+
+
+def _names(asked: Any) -> tuple[str, ...]:
+    """The parameters that somebody asked to set."""
+    if isinstance(asked, Parameter):
+        return (asked.name,)
+    if isinstance(asked, ScanParameters):
+        return tuple(name for name, _ in scan_values(asked))
+    if isinstance(asked, PositionChange):
+        return (names.PROBE_POS_X,) if asked.y_m is None else (names.PROBE_POS_Y,)
+    return (names.PROBE_POS_X, names.PROBE_POS_Y)
+
+
+def _said(place: Place[Any]) -> str:
+    def centre(where: Region | ProbePosition) -> str:
+        x, y = where.center_m if isinstance(where, Region) else where.xy_m
+        return f"({x:.6g}, {y:.6g}) m"
+
+    return f"that is {centre(place.tip)} at the tip, asked for at {centre(place.sample)} on the sample"
+
+
+def _position(mapping: Mapping, xy_m: tuple[float, float]) -> ProbePosition:
+    x, y = mapping.apply(xy_m)
+    return ProbePosition((float(x), float(y)))

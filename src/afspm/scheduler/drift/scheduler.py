@@ -1,0 +1,86 @@
+"""The Drift Compensated Scheduler (paper, "Drift Compensated Scheduler"): takes the place of the Scheduler."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from afspm.model import Frame
+from afspm.scheduler.drift.codec import DriftWireCodec
+from afspm.scheduler.drift.consequences import RESCAN
+from afspm.scheduler.drift.core import MAPPING, DriftCore
+from afspm.scheduler.drift.registrar import Registrar
+from afspm.scheduler.drift.settings import DriftSettings
+from afspm.scheduler.scheduler import Scheduler, SchedulerContext
+from afspm.scheduler.shell import Core, Shell
+from afspm.transport.scheduler_sockets import SchedulerSockets
+
+if TYPE_CHECKING:
+    from afspm.transport.scheduler_sockets import Source
+
+
+class DriftCompensatedScheduler(Scheduler):
+    """A Scheduler whose components live in the coordinates of the sample, while the microscope stays in those of its
+    tip: drift is followed from scan to scan, scans and spectra are published where they were taken on the sample, and
+    what is asked for is sent to where it is at the tip by then.
+
+    It publishes a `DriftMapping` whenever more is known, and a `DriftRescan` when it would like a scan to be taken
+    again, for the component `Rescanner`. When it does not know any more where the sample is, it flags thermal-drift.
+
+    Args:
+        drift: how drift is followed and corrected.
+        control, limits, cache: as for the Scheduler. Limits hold for what goes to the microscope: tip coordinates.
+    """
+
+    frame: ClassVar = Frame.SAMPLE
+    flags: ClassVar = ("thermal-drift",)
+    publishes: ClassVar = (MAPPING, RESCAN)
+    plain_settings: ClassVar = ("drift",)
+
+    def __init__(
+        self,
+        drift: DriftSettings | None = None,
+        control: Mapping[str, Any] | None = None,
+        limits: Mapping[str, Any] | None = None,
+        cache: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__(control, limits, cache)
+        self.drift = DriftSettings.from_table(drift or {}) if not isinstance(drift, DriftSettings) else drift
+
+    def check(self) -> None:
+        """Whether estimator and tracker can be made. Raises ConfigError if not."""
+        from afspm.drift.estimators import estimator
+        from afspm.drift.trackers import tracker
+
+        tracker(self.drift.tracker, estimator(self.drift.estimator))
+
+    def _core(self, context: SchedulerContext) -> Core:
+        launch = context.launch
+        file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
+        self._registrar = Registrar(self.drift, file, context.log)
+        return DriftCore(self._settings(context), self.drift, DriftWireCodec(), self._registrar, launch.name)
+
+    def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> Shell:
+        assert isinstance(core, DriftCore)
+        self._registrar.wake = sockets.wake_up
+        return DriftShell(self._registrar, core, sockets, *others)
+
+
+class DriftShell(Shell):
+    """A shell that also hears the worker."""
+
+    def __init__(self, registrar: Registrar, core: DriftCore, sockets: SchedulerSockets, *others: Any) -> None:
+        super().__init__(core, sockets, *others)
+        self._registrar = registrar
+        self._drift_core = core
+
+    def handle(self, ready: list[Source]) -> None:
+        if not self.ended:
+            for said in self._registrar.said():
+                self._carry_out(self._drift_core.said(said, self._clock.monotonic_s(), self._clock.now_ns()))
+        super().handle(ready)
+
+    def close(self) -> None:
+        self._registrar.close()
+        super().close()

@@ -1,0 +1,91 @@
+"""`python -m afspm.scheduler.drift.worker`: registers scans in a process of its own, so that nobody waits for it who
+need not, and whatever a user's own estimator does, the scheduler lives.
+
+The first message on its standard input says what it is; the end of that input ends it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import IO, Any
+
+from afspm.errors import AfspmError
+from afspm.scheduler.drift import pipe
+from afspm.scheduler.drift.settings import DriftSettings
+
+
+def main() -> int:
+    """Until the scheduler has gone."""
+    # Ctrl-C reaches the whole terminal; whether it ends us is the scheduler's decision
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    asked, answers = sys.stdin.buffer, _own_output()
+    first = pipe.read(asked)
+    if first is None:
+        return 0
+    try:
+        worker = _Worker(first[0], answers)
+    except AfspmError as error:
+        pipe.write(answers, {"is": "broken", "reason": str(error)})
+        return 1
+    try:
+        while (message := pipe.read(asked)) is not None:
+            worker.take(*message)
+    except BrokenPipeError:
+        return 0
+    return 0
+
+
+class _Worker:
+    """Answers what it is asked, one after the other."""
+
+    def __init__(self, settings: dict[str, Any], answers: IO[bytes]) -> None:
+        from afspm.drift.estimators import estimator
+        from afspm.drift.trackers import tracker
+        from afspm.scheduler.drift.estimation import Estimation
+        from afspm.scheduler.drift.store import Store
+
+        drift = DriftSettings.from_table(settings["drift"])
+        store = Store(Path(settings["file"]) if settings["file"] else None)
+        made = tracker(drift.tracker, estimator(drift.estimator))
+        self._estimation = Estimation(made, drift.rescan, store.save)
+        self._answers = answers
+        if (state := store.load()) is not None:
+            self._estimation.restore(state)
+        self._tell_forecast()
+
+    def take(self, head: dict[str, Any], data: bytes) -> None:
+        if head["do"] == "register":
+            self._register(head, data)
+            return
+        try:
+            self._estimation.compensated(head["time_s"], tuple(head["velocity_m_s"]))
+        except AfspmError as error:
+            pipe.write(self._answers, {"is": "complaint", "reason": str(error)})
+        self._tell_forecast()
+
+    def _register(self, head: dict[str, Any], data: bytes) -> None:
+        try:
+            answer = self._estimation.register(*pipe.job_from_head(head, data))
+        except Exception as error:  # of a user's own estimator or tracker, too: it is the reason
+            reason = str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"
+            pipe.write(self._answers, {"is": "not registered", "key": head["key"], "reason": reason})
+            return
+        pipe.write(self._answers, {"is": "registered", **asdict(answer)})
+
+    def _tell_forecast(self) -> None:
+        pipe.write(self._answers, {"is": "forecast", "forecast": self._estimation.forecast})
+
+
+def _own_output() -> IO[bytes]:
+    """Standard output for our answers alone: what libraries and users print goes where errors go."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return answers
+
+
+if __name__ == "__main__":
+    sys.exit(main())
