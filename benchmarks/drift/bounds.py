@@ -48,7 +48,7 @@ def bounds(pair: Pair) -> Bounds:
     linear = [g * a for g in gradient for a in (x, y)]
     level = pair.view.at(sample)
     columns = np.stack([*gradient, level - level.mean(), *linear], axis=1)  # (rows, 7, columns)
-    information = np.einsum("yix,xw,yjw->ij", columns, _row_precision(how, q.shape[2]), columns, optimize=True) / noise
+    information = np.einsum("yix,xw,yjw->ij", columns, row_precision(how, q.shape[2]), columns, optimize=True) / noise
     known = np.zeros((7, 7))
     known[3:, 3:] = _linear_precision(how, first.width_px[1])
     fixed = [0, 1] if how.gain == 1.0 and not how.bend else [0, 1, 2]
@@ -69,7 +69,7 @@ def _window(pair: Pair) -> tuple[slice, slice]:
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
-def _row_precision(how: Condition, width: int) -> Array:
+def row_precision(how: Condition, width: int) -> Array:
     """Of `width` pixels of one row, with an unknown straight line in it."""
     covariance = how.white**2 * np.eye(width)
     if how.one_over_f:

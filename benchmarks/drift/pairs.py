@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,7 @@ PIXEL_M = 2e-6 / 128
 HEIGHT_M = 5e-9  # rms of the images
 ROW_S = 2.0
 MARGIN_PX = 4.0
+ELSEWHERE_PX = 60.0
 
 
 @dataclass(frozen=True)
@@ -54,19 +55,25 @@ class Frame:
 
 @dataclass(frozen=True)
 class View:
-    """A tip's image of a sample, wherever one wants to know it (cubic B-spline on a fine grid)."""
+    """A tip's image of a sample, wherever one wants to know it (cubic B-spline on a fine grid).
+
+    Attributes:
+        origin_px: (x, y) of the origin of the sample on the grid.
+    """
 
     grid: Grid
     coefficients: Array
+    origin_px: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, grid: Grid, image: Array) -> View:
-        return cls(grid, ndimage.spline_filter(image, order=3, mode="nearest"))
+    def of(cls, grid: Grid, image: Array, origin_px: tuple[float, float] = (0.0, 0.0)) -> View:
+        return cls(grid, ndimage.spline_filter(image, order=3, mode="nearest"), origin_px)
 
     def at(self, sample_px: Array) -> Array:
         """Values at positions (2, …) in the sample."""
-        return np.asarray(ndimage.map_coordinates(self.coefficients, self.grid.index(sample_px), order=3,
-                                                  mode="nearest", prefilter=False))  # fmt: skip
+        origin_px = np.array(self.origin_px).reshape(2, *[1] * (sample_px.ndim - 1))
+        where = self.grid.index(sample_px + origin_px)
+        return np.asarray(ndimage.map_coordinates(self.coefficients, where, order=3, mode="nearest", prefilter=False))
 
     def gradient(self, sample_px: Array) -> Array:
         """Derivatives along x and y at positions (2, …): shape (2, …), per standard pixel."""
@@ -102,7 +109,8 @@ class Pair:
     Attributes:
         truth: None when the scans have nothing in common.
         prior: what a tracker that is right could know: set by `pair(prior_sd_px=…)`.
-        frames, view: where the scans lie in the ideal image of the sample, which has unit rms in the reference.
+        frames, view: where the scans lie in the ideal image of the sample, which has unit rms in the reference (of a
+            pair without truth: that of the reference alone).
         gain: of the second scan.
     """
 
@@ -174,7 +182,7 @@ def pair(
     ]
     truth = _truth(frames, centers_m)
     known = None if prior_sd_px is None else _prior(truth, prior_sd_px, how, first.shape[0], random)
-    unit_view = View(views[0].grid, scale * views[0].coefficients)
+    unit_view = replace(views[0], coefficients=scale * views[0].coefficients)
     return Pair(surface, how, scans[0], scans[1], None if how.elsewhere else truth, known, frames, unit_view, gain)
 
 
@@ -204,7 +212,7 @@ def _views(
     """What the tip sees of the sample in each scan; once if it is the same."""
     corners = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
     reach = max(np.abs(f.sample_px(corners * f.width_px[:, None])).max() for f in frames)
-    grid = Grid(reach + MARGIN_PX)
+    grid = Grid(reach + MARGIN_PX + (ELSEWHERE_PX if how.elsewhere else 0.0))
     second_tip = None
     if how.second_tip_px:
         direction = random.uniform(0.0, 2 * math.pi)
@@ -219,9 +227,10 @@ def _views(
 
     height = relief(0)
     first = View.of(grid, imaged(height))
-    if not (how.elsewhere or second_tip):
-        return first, first
-    return first, View.of(grid, imaged(relief(1) if how.elsewhere else height, second_tip))
+    if how.elsewhere:  # and not the same distance from what every place has near its origin
+        x, y = random.uniform(-ELSEWHERE_PX, ELSEWHERE_PX, 2)
+        return first, View.of(grid, imaged(relief(1)), (x, y))
+    return first, View.of(grid, imaged(height, second_tip)) if second_tip else first
 
 
 def _truth(frames: tuple[Frame, Frame], centers_m: list[Array]) -> Truth:

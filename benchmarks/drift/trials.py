@@ -75,21 +75,31 @@ class Trial:
         made = pair(
             self.surface, self.condition, self.seed, self.size, samplings=self.samplings, prior_sd_px=self.prior_sd_px
         )
-        return [self._outcome(made, name) for name in self.estimators]
+        full = white = math.nan
+        if made.truth is not None:
+            best = bounds(made)
+            full, white = math.sqrt(np.trace(best.full)), math.sqrt(np.trace(best.white))
+        return [self._outcome(made, name, full, white) for name in self.estimators]
 
-    def _outcome(self, made: Pair, name: str) -> Outcome:
+    def _outcome(self, made: Pair, name: str, bound_px: float, white_bound_px: float) -> Outcome:
         register = estimator(name).register
         began_s = time.process_time()
         found = register(made.reference, made.scan, made.prior)
         cpu_s = time.process_time() - began_s
         error, chi2 = _errors(made, found)
-        full = white = math.nan
-        if made.truth is not None:
-            best = bounds(made)
-            full, white = math.sqrt(np.trace(best.full)), math.sqrt(np.trace(best.white))
         return Outcome(
-            self.cell, self.surface, name, self.seed, found.accepted, found.reason, error, chi2, full, white, cpu_s
-        )  # fmt: skip
+            cell=self.cell,
+            surface=self.surface,
+            estimator=name,
+            seed=self.seed,
+            accepted=found.accepted,
+            reason=found.reason,
+            error_px=error,
+            chi2=chi2,
+            bound_px=bound_px,
+            white_bound_px=white_bound_px,
+            cpu_s=cpu_s,
+        )
 
 
 def _errors(made: Pair, found: Registration) -> tuple[tuple[float, float], float]:

@@ -1,0 +1,8 @@
+"""The drift benchmark's generator of pairs serves the tests too: `benchmarks` is imported from the repository."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[3]))
