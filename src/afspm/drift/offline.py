@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan, Registration
+from afspm.drift.shear import row_delay_s
 from afspm.drift.tracking import Tracker, Update
 from afspm.errors import InvalidValue
 from afspm.model import Scan
@@ -112,8 +113,8 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
     """
     drift, covariance = [np.zeros(2)], [np.zeros((2, 2))]
     for k, (scan, pair) in enumerate(zip(scans[1:], pairs, strict=True), start=1):
-        early = record.rate_m_s[0] * after_middle_s(scans[0], pair.center_m)
-        late = record.rate_m_s[k] * after_middle_s(scan, pair.center_m + pair.displacement_m)
+        early = record.rate_m_s[0] * (row_delay_s(scans[0], pair.center_m) or 0.0)
+        late = record.rate_m_s[k] * (row_delay_s(scan, pair.center_m + pair.displacement_m) or 0.0)
         drift.append(pair.displacement_m - (late - early))
         covariance.append(pair.covariance_m2)
     return replace(
@@ -123,17 +124,6 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
         matched=np.array([True, *(pair.accepted for pair in pairs)]),
         reasons=("", *(pair.reason for pair in pairs)),
     )
-
-
-def after_middle_s(scan: DriftScan, at_m: Array) -> float:
-    """How long after the middle of the scan the row through a place was taken; 0 where the direction is not known."""
-    if scan.upwards is None:
-        return 0.0
-    angle = scan.region.angle_rad
-    x, y = np.asarray(at_m) - scan.region.center_m
-    across = y * np.cos(angle) - x * np.sin(angle)
-    part = float(across / scan.region.size_m[1])
-    return part * scan.duration_s * (1.0 if scan.upwards else -1.0)
 
 
 def spread_pairs(record: DriftRecord, apart_s: float, count: int) -> list[tuple[int, int]]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.registration import DriftScan
+from afspm.drift.shear import delay_per_length_s_m
 from afspm.errors import FileError, InvalidValue
 from afspm.model import Frame, Region
 
@@ -125,9 +126,8 @@ def _pixels_at(scan: DriftScan, x_m: Array, y_m: Array, rate_m_s: Array) -> tupl
     cos, sin = math.cos(scan.region.angle_rad), math.sin(scan.region.angle_rad)
     x, y = x_m - scan.region.center_m[0], y_m - scan.region.center_m[1]
     u, v = x * cos + y * sin, y * cos - x * sin
-    if scan.upwards is not None:
-        direction = 1.0 if scan.upwards else -1.0
-        slowness = direction * scan.duration_s / ((ny - 1) * dy)  # s/m: time that the slow axis takes for a length
+    slowness = delay_per_length_s_m(scan)
+    if slowness is not None:
         along, across = rate_m_s @ np.array([[cos, -sin], [sin, cos]])
         v = v / (1.0 - across * slowness)
         u = u + along * slowness * v

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_record import record
 
-from afspm.drift.offline import after_middle_s, against_first, chosen, spread_pairs, topography
+from afspm.drift.offline import against_first, chosen, spread_pairs, topography
 from afspm.drift.registration import DriftScan, Registration
 from afspm.errors import InvalidValue
 from afspm.model import Region, Scan
@@ -86,14 +86,6 @@ def test_a_refused_pair_stays_in_the_table_with_its_reason() -> None:
     assert refused.matched.tolist() == [True, False]
     assert refused.reasons == ("", "nothing in common")
     assert np.isnan(refused.drift_m[1]).all()
-
-
-@pytest.mark.parametrize(("upwards", "sign"), [(True, 1.0), (False, -1.0)])
-def test_rows_of_a_turned_scan_are_counted_across_its_frame(upwards: bool, sign: float) -> None:
-    turned = Region((0.0, 0.0), (2e-6, 1e-6), np.pi / 2)  # its y axis points along -x
-    one = DriftScan(np.zeros((8, 8)), turned, 0.0, 100.0, upwards)
-    assert after_middle_s(one, np.array([-0.5e-6, 0.3e-6])) == pytest.approx(sign * 50.0)
-    assert after_middle_s(one, np.array([0.0, 0.9e-6])) == pytest.approx(0.0)
 
 
 def test_pairs_for_the_eye_are_as_far_apart_as_asked_and_spread_over_the_run() -> None:
