@@ -24,6 +24,7 @@ from afspm.errors import InvalidValue
 Array = NDArray[np.float64]
 
 VERSION = 1
+_LIKE = 1.2  # a second surprise may differ from the first by so much of it: a new velocity doubles it
 
 
 class BankTracker:
@@ -57,7 +58,8 @@ class BankTracker:
         self._compensation = Compensation()
         self._scans = 0
         self._unmatched = 0  # scans in a row that should have matched
-        self._doubted = False  # the newest scan's result
+        self._doubted_m: Array | None = None  # where the newest scan was found, from where it was expected
+        self._matched_s = 0.0
         self._lost = False
         self._forecast = BankForecast.at_start()
 
@@ -76,28 +78,26 @@ class BankTracker:
         followed_m = self._compensation.followed_m(self._filters.time_s, scan.mid_s)
         filters = self._filters.moved(scan.mid_s, followed_m)
         before = self._known(filters)
-        filters = self._turned(filters, scan)
+        newest = Newest(scan, self._turned(filters, scan), self._compensation.velocity_m_s(scan.mid_s))
         anywhere = self._lost or before.sd_m > self._limit_m(scan)
-        tried = self._tried(filters, scan, anywhere=anywhere)
-        comparison, surprise = self._believed(filters, scan, tried, anywhere=anywhere)
-        self._unmatched = 0 if comparison else self._unmatched + bool(tried and not self._doubted)
+        tried = self._tried(newest, anywhere=anywhere)
         registrations = {self._references.kept[number].scan.key: found for number, found in tried.items()}
-        self._references.judged(self._succeeded(tried, comparison), self._scans)
-        self._filters = self._learned(filters, scan, comparison)
-        self._keep(scan)
-        self._forecast = BankForecast.of(self._filters, self._compensation)
+        found = self._compared(newest, tried)
+        used = self._believed(newest, found, anywhere=anywhere)
+        self._unmatched = 0 if used else self._unmatched + bool(tried)
+        self._learn(newest, used, tried)
         after = self._known(self._filters)
         self._lost = after.sd_m > self._limit_m(scan)
         return Update(
             key=scan.key,
             before=before,
             after=after,
-            matched=comparison is not None,
-            reason="" if comparison else self._why_not(tried, surprise),
+            matched=used is not None,
+            reason="" if used else self._why_not(tried, found),
             lost=self._lost,
             registrations=registrations,
             forecast=self._forecast,
-            quality={"references": float(len(comparison.measured) if comparison else 0), "surprise_sd": surprise**0.5},
+            quality={"references": float(len(used.measured) if used else 0)},
         )
 
     def set_velocity(self, time_s: float, velocity_m_s: ArrayLike, covariance: ArrayLike) -> None:
@@ -135,8 +135,10 @@ class BankTracker:
         before, settings = self._forecast.at(scan.mid_s), self._settings
         position_sd_m = settings.start_px * min(scan.pixel_m)
         self._filters = Filters.start(settings.models(), scan.mid_s, position_sd_m, settings.start_velocity_sd_m_s)
+        self._matched_s = scan.mid_s
         now = self._known(self._filters)
-        self._references.kept.append(Reference(scan, now.rate_m_s, now.rate_covariance, anchor=True, used=1))
+        compensated_m_s = self._compensation.velocity_m_s(scan.mid_s)
+        self._references.kept.append(Reference(scan, compensated_m_s, anchor=True, used=self._scans))
         self._forecast = BankForecast.of(self._filters, self._compensation)
         return Update(
             scan.key, before, now, matched=True, reason="", lost=False, registrations={}, forecast=self._forecast
@@ -158,71 +160,79 @@ class BankTracker:
             filters, between_s, sheared[0] + self._compensation.velocity_m_s(between_s), sheared[1]
         )
 
-    def _tried(self, filters: Filters, scan: DriftScan, *, anywhere: bool) -> dict[int, Registration]:
+    def _tried(self, newest: Newest, *, anywhere: bool) -> dict[int, Registration]:
         """What the estimator says of the scan and each reference, by its number, the best first."""
-        newest = self._newest(filters, scan)
-        widening = self._settings.widening * 4.0 ** (self._unmatched + self._doubted)
+        kept, filters = self._references.kept, newest.filters
+        widening = self._settings.widening * 4.0**self._unmatched
         tried = {}
-        for number in self._references.candidates(scan, *_drifts(filters), anywhere=anywhere):
-            reference = self._references.kept[number]
-            prior = None if anywhere else newest.prior(number, reference, filters, widening)
-            tried[number] = self._estimator.register(reference.scan, scan, prior)
+        for number in self._references.candidates(newest.scan, *_drifts(filters), anywhere=anywhere):
+            prior = None if anywhere else newest.prior(number, kept[number], widening)
+            tried[number] = self._estimator.register(kept[number].scan, newest.scan, prior)
+        firm = [number for number in tried if not kept[number].adrift]
+        if not anywhere and not any(tried[number].accepted for number in firm):
+            # not where it was expected, or not to be recognised: somewhere else?
+            for number in firm[: self._settings.second_looks]:
+                tried[number] = self._estimator.register(kept[number].scan, newest.scan)
         return tried
 
-    def _believed(
-        self, filters: Filters, scan: DriftScan, tried: Table[int, Registration], *, anywhere: bool
-    ) -> tuple[Comparison | None, float]:
-        """What is taken in of that, and the chi2 of how far it is from what was expected."""
-        newest, kept = self._newest(filters, scan), self._references.kept
+    def _compared(self, newest: Newest, tried: Table[int, Registration]) -> Comparison | None:
+        """What was found, by the references that agree; those adrift count only where there is no other."""
+        kept, inflation = self._references.kept, self._settings.inflation
         measured = [
-            Measured.of(newest, number, kept[number], found, self._settings.inflation)
+            Measured.of(newest, number, kept[number], found, inflation)
             for number, found in tried.items()
             if found.accepted
         ]
-        if not measured:
-            self._doubted = False
-            return None, 0.0
-        comparison = Comparison(agreeing(measured, filters))
-        surprise = comparison.surprise(filters)
-        self._doubted = surprise > self._settings.doubt and not (self._doubted or anywhere)
-        return None if self._doubted else comparison, surprise
+        firm = [one for one in measured if not kept[one.link.number].adrift]
+        return Comparison(agreeing(firm or measured, newest.filters), newest.filters) if measured else None
 
-    @staticmethod
-    def _succeeded(tried: Table[int, Registration], comparison: Comparison | None) -> dict[int, bool]:
-        used = {one.link.number for one in comparison.measured} if comparison else set()
-        return {number: number in used for number in tried}
+    def _believed(self, newest: Newest, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
+        """What is taken in of that: a surprise only where everything is possible, or after another one like it."""
+        before, self._doubted_m = self._doubted_m, None
+        if found is None or found.surprise <= self._settings.doubt:
+            return found
+        again = before is not None and np.linalg.norm(found.apart_m - before) <= _LIKE * np.linalg.norm(before)
+        if not (anywhere or again):
+            self._doubted_m = found.apart_m
+            return None
+        # Either it jumped, or it is faster than was thought: the next scan will tell.
+        far_m, since_s = float(np.linalg.norm(found.apart_m)), newest.scan.mid_s - self._matched_s
+        return replace(found, filters=found.filters.widened(far_m, far_m / max(since_s, 1.0)))
 
-    def _learned(self, filters: Filters, scan: DriftScan, comparison: Comparison | None) -> Filters:
-        settings = self._settings
-        if self._unmatched == settings.lost_after:
-            filters = filters.widened(self._limit_m(scan), settings.start_velocity_sd_m_s)
+    def _learn(self, newest: Newest, used: Comparison | None, tried: Table[int, Registration]) -> None:
+        """Take in what is believed; keep the scan, unless it is in doubt, and let go of what there is too much of."""
+        settings, references, scan = self._settings, self._references, newest.scan
         noise = np.eye(2) * settings.jitter_m**2
-        if comparison is None:
-            return filters.with_scan(noise)
-        filters = filters.with_scan(noise + comparison.scan_noise_m2)
-        rows, values, noise = comparison.rows(filters.mean.shape[1])
-        return filters.updated(rows, values, noise, forget=settings.forget, rarest=settings.rarest)
-
-    def _keep(self, scan: DriftScan) -> None:
-        """Keep a scan, and let go of what there is too much of then; one in doubt is not kept."""
-        assert self._filters is not None
+        if used is None:
+            filters = newest.filters
+            if self._unmatched == settings.lost_after:
+                filters = filters.widened(self._limit_m(scan), settings.start_velocity_sd_m_s)
+            self._filters = filters.with_scan(noise)
+        else:
+            self._matched_s = scan.mid_s
+            filters = used.filters.with_scan(noise + used.scan_noise_m2)
+            rows, values, pair_noise = used.rows(filters.mean.shape[1])
+            self._filters = filters.updated(rows, values, pair_noise, forget=settings.forget, rarest=settings.rarest)
+        numbers = {one.link.number for one in used.measured} if used else set()
+        adrift = all(references.kept[number].adrift for number in numbers) and bool(tried)
+        references.judged({number: number in numbers for number in tried}, self._scans)
         drift_m, drifts_m = _drifts(self._filters)
-        now = self._known(self._filters)
-        anchor = self._references.needs_anchor(scan, drift_m, drifts_m[:-1])
-        self._references.kept.append(Reference(scan, now.rate_m_s, now.rate_covariance, anchor, used=self._scans))
-        if self._doubted:
-            self._drop(len(self._references) - 1)
-        while (number := self._references.superfluous()) is not None:
+        anchor = references.needs_anchor(scan, drift_m, drifts_m[:-1])
+        references.kept.append(Reference(scan, newest.compensated_m_s, anchor, adrift, used=self._scans))
+        if self._doubted_m is not None:
+            self._drop(len(references) - 1)
+        while (number := references.superfluous()) is not None:
             self._drop(number)
+        self._forecast = BankForecast.of(self._filters, self._compensation)
 
     def _drop(self, number: int) -> None:
         assert self._filters is not None
         del self._references.kept[number]
         self._filters = self._filters.without_scan(number)
 
-    def _why_not(self, tried: Table[int, Registration], surprise: float) -> str:
-        if self._doubted:
-            far = f"found {surprise**0.5:.1f} standard deviations from where it was expected"
+    def _why_not(self, tried: Table[int, Registration], found: Comparison | None) -> str:
+        if found is not None:
+            far = f"found {found.surprise**0.5:.1f} standard deviations from where it was expected"
             return f"{far}; believed if the next one is too"
         if tried:
             return next(iter(tried.values())).reason
@@ -230,14 +240,9 @@ class BankTracker:
 
     def _with_velocity(self, filters: Filters, time_s: float, velocity_m_s: Array, covariance: Array) -> Filters:
         """With a velocity of the sample itself that was measured at about the time of the filters."""
-        elsewhen = self._settings.models().over(abs(filters.time_s - time_s))[1][:, 2, 2]
-        noise = covariance + np.eye(2) * float(filters.weight @ elsewhen)
-        rows = np.eye(filters.mean.shape[1])[2:4]
-        return filters.updated(rows, velocity_m_s, noise, forget=1.0, rarest=self._settings.rarest)
-
-    def _newest(self, filters: Filters, scan: DriftScan) -> Newest:
-        now = self._known(filters)
-        return Newest(scan, now.rate_m_s, now.rate_covariance, self._compensation.velocity_m_s(scan.mid_s))
+        elsewhen = filters.models.over(abs(filters.time_s - time_s))[1][:, 2:, 2:]
+        rarest = self._settings.rarest
+        return filters.updated(filters.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
 
     def _known(self, filters: Filters) -> Prediction:
         return BankForecast.of(filters, self._compensation).at(filters.time_s)
@@ -258,7 +263,8 @@ class BankTracker:
             "compensation": [list(change) for change in self._compensation.changes],
             "scans": self._scans,
             "unmatched": self._unmatched,
-            "doubted": self._doubted,
+            "doubted_m": self._doubted_m,
+            "matched_s": self._matched_s,
             "lost": self._lost,
             "filters": None if filters is None else filters.to_dict(),
             "references": [one.to_dict() for one in self._references.kept],
@@ -273,7 +279,8 @@ class BankTracker:
         self._filters, self._newest_s = filters, state["newest_s"]
         self._compensation = Compensation.from_list(state["compensation"])
         self._scans, self._unmatched = int(state["scans"]), int(state["unmatched"])
-        self._doubted, self._lost = bool(state["doubted"]), bool(state["lost"])
+        self._doubted_m = None if state["doubted_m"] is None else np.asarray(state["doubted_m"], dtype=np.float64)
+        self._matched_s, self._lost = float(state["matched_s"]), bool(state["lost"])
         self._references.kept = [Reference.from_dict(one) for one in state["references"]]
         self._forecast = BankForecast.at_start()
         if filters is not None:
@@ -282,6 +289,4 @@ class BankTracker:
 
 def _drifts(filters: Filters) -> tuple[Array, Array]:
     """The expected displacement (2,) of now, and those (n, 2) that the scans show."""
-    states = filters.mean.shape[1]
-    mean, _ = filters.mixed(np.eye(states))
-    return mean[:2], mean[4:].reshape(-1, 2)
+    return (filters.weight @ filters.mean)[:2], filters.scan_drifts_m()

@@ -1,9 +1,9 @@
 """A bank of Kalman filters that share their measurements and differ in how drift may move.
 
-The state of each is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by two coordinates for
-each scan that is kept: the displacement at which that scan shows the sample. These stay correlated with each other and
-with the drift, so a scan that is compared many times is not taken for many (as landmarks in simultaneous localisation
-and mapping: Smith, Self and Cheeseman 1990).
+The state of each is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four of the same for
+each scan that is kept: the displacement at which it shows the sample, and the velocity during it. These stay correlated
+with each other and with the drift, so a scan that is compared many times is not taken for many, and what is learned
+later counts (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
 """
 
 from __future__ import annotations
@@ -47,8 +47,12 @@ class Filters:
             position_sd_m: of where the sample is when the scan shows it at zero: its location error.
         """
         n = len(models.density_m2_s3)
-        variances = [position_sd_m**2] * 2 + [velocity_sd_m_s**2] * 2 + [0.0] * 2
-        return cls(models, time_s, np.zeros((n, 6)), np.tile(np.diag(variances), (n, 1, 1)), np.full(n, -np.log(n)))
+        variances = [position_sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
+        covariance = np.tile(np.diag(variances), (n, 1, 1))
+        start = cls(models, time_s, np.zeros((n, 4)), covariance, np.full(n, -np.log(n))).with_scan(np.zeros((2, 2)))
+        covariance = start.covariance.copy()
+        covariance[:, 4:6, :] = covariance[:, :, 4:6] = 0.0
+        return replace(start, covariance=covariance)
 
     @property
     def weight(self) -> Array:
@@ -77,23 +81,38 @@ class Filters:
 
     def with_scan(self, noise_m2: Array) -> Filters:
         """With a scan of now that shows the sample where it is, but for a location error of a covariance (2, 2)."""
-        mean = np.concatenate([self.mean, self.mean[:, :2]], axis=1)
-        rows = np.concatenate([self.covariance, self.covariance[:, :2, :]], axis=1)
-        covariance = np.concatenate([rows, rows[:, :, :2]], axis=2)
-        covariance[:, -2:, -2:] += noise_m2
+        mean = np.concatenate([self.mean, self.mean[:, :4]], axis=1)
+        rows = np.concatenate([self.covariance, self.covariance[:, :4, :]], axis=1)
+        covariance = np.concatenate([rows, rows[:, :, :4]], axis=2)
+        covariance[:, -4:-2, -4:-2] += noise_m2
         return replace(self, mean=mean, covariance=covariance)
 
     def without_scan(self, number: int) -> Filters:
         """Without one of the scans that are kept."""
-        kept = np.delete(np.arange(self.mean.shape[1]), (4 + 2 * number, 5 + 2 * number))
+        kept = np.delete(np.arange(self.mean.shape[1]), range(4 + 4 * number, 8 + 4 * number))
         return replace(self, mean=self.mean[:, kept], covariance=self.covariance[:, kept][:, :, kept])
+
+    def scan_drifts_m(self) -> Array:
+        """(scans, 2) the displacement that each scan shows, as all filters together expect it."""
+        mean: Array = (self.weight @ self.mean)[4:].reshape(-1, 4)[:, :2]
+        return mean
+
+    def velocity(self, number: int | None = None) -> tuple[Array, Array]:
+        """(2,) and (2, 2) of the velocity during a scan, or now."""
+        return self.mixed(self.velocity_rows(number))
+
+    def velocity_rows(self, number: int | None = None) -> Array:
+        """(2, s) whose product with the state is the velocity during a scan, or now."""
+        first = 2 if number is None else 6 + 4 * number
+        return np.eye(self.mean.shape[1])[first : first + 2]
 
     def mixed(self, rows: Array) -> tuple[Array, Array]:
         """Mean (m,) and covariance (m, m) of `rows` (m, s) @ state over all filters."""
         return mixed(self.weight, self.mean @ rows.T, rows @ self.covariance @ rows.T)
 
     def updated(self, rows: Array, measured: Array, noise: Array, *, forget: float, rarest: float) -> Filters:
-        """After `measured` (m,) = `rows` (m, s) @ state + noise of a covariance (m, m).
+        """After `measured` (m,) = `rows` (m, s) @ state + noise of a covariance (m, m), or one for
+        each filter (n, m, m).
 
         Args:
             forget: share of the logarithm of the old weights that is kept.

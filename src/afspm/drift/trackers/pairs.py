@@ -2,12 +2,13 @@
 
 A feature at tip position x of the reference j is found at x + d in the scan k, so d is the displacement of the sample
 when k passed it, less that when j did: d = X_k + t_k v_k - X_j - t_j v_j, with X where a scan shows the sample at its
-middle, and t how much later than that its rows passed the overlap.
+middle, v the velocity in tip coordinates, and t how much later than its middle its rows passed the overlap.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,77 +31,84 @@ class Link:
 
     Attributes:
         number: of the reference.
-        scan_delay_s: t_k.
+        scan_delay_s, reference_delay_s: t_k and t_j.
         offset_m: (2,) what is known of d besides the state.
         noise_m2: (2, 2) of that.
     """
 
     number: int
     scan_delay_s: float
+    reference_delay_s: float
     offset_m: Array
     noise_m2: Array
 
     def rows(self, states: int, scan_at: int) -> Array:
         """(2, states) whose product with the state is d - offset; the scan's own position is at `scan_at`."""
-        rows = np.zeros((2, states))
+        rows, first = np.zeros((2, states)), 4 + 4 * self.number
         for axis in range(2):
             rows[axis, scan_at + axis] = 1.0
             rows[axis, 2 + axis] += self.scan_delay_s
-            rows[axis, 4 + 2 * self.number + axis] -= 1.0
+            rows[axis, first + axis] -= 1.0
+            rows[axis, first + 2 + axis] -= self.reference_delay_s
         return rows
 
 
 @dataclass(frozen=True, eq=False)
 class Newest:
-    """The scan that is being compared.
+    """The scan that is being compared, and what is known when it is.
 
     Attributes:
-        velocity_m_s, velocity_covariance: (2,), (2, 2) of the sample in tip coordinates.
         compensated_m_s: (2,) velocity with which tip coordinates follow the sample; the state's is more by that.
     """
 
     scan: DriftScan
-    velocity_m_s: Array
-    velocity_covariance: Array
+    filters: Filters
     compensated_m_s: Array
 
     def link(self, number: int, reference: Reference, center_m: Array, displacement_m: Array) -> Link:
         """For an overlap about a position of the reference."""
-        ours_s, our_noise = _delay(self.scan, center_m + displacement_m, self.velocity_m_s)
-        theirs_s, their_noise = _delay(reference.scan, center_m, reference.velocity_m_s)
-        offset = -ours_s * self.compensated_m_s - theirs_s * reference.velocity_m_s
-        return Link(number, ours_s, offset, our_noise + their_noise + theirs_s**2 * reference.velocity_covariance)
+        ours_s, theirs_s = row_delay_s(self.scan, center_m + displacement_m), row_delay_s(reference.scan, center_m)
+        offset, noise = np.zeros(2), np.zeros((2, 2))
+        if ours_s is None:
+            noise += self._either_way(self.scan, center_m + displacement_m, None, self.compensated_m_s)
+        else:
+            offset -= ours_s * self.compensated_m_s
+        if theirs_s is None:
+            noise += self._either_way(reference.scan, center_m, number, reference.compensated_m_s)
+        else:
+            offset += theirs_s * reference.compensated_m_s
+        return Link(number, ours_s or 0.0, theirs_s or 0.0, offset, noise)
 
-    def expected(self, number: int, reference: Reference, filters: Filters) -> tuple[Link, Array, Array]:
-        """The link to a reference, d (2,) as it is expected, and its covariance (2, 2)."""
-        states = filters.mean.shape[1]
-        displacement_m, _ = filters.mixed(Link(number, 0.0, np.zeros(2), np.zeros((2, 2))).rows(states, 0))
+    def _either_way(self, scan: DriftScan, position_m: Array, number: int | None, compensated_m_s: Array) -> Array:
+        """(2, 2) of the displacement between a scan's middle and a position, with its direction not known."""
+        delay_s = row_delay_s(replace(scan, upwards=True), position_m) or 0.0  # as much later as earlier
+        velocity, covariance = self.filters.velocity(number)
+        velocity = velocity - compensated_m_s
+        return np.asarray(delay_s**2 * (np.outer(velocity, velocity) + covariance))
+
+    def expected(self, number: int, reference: Reference) -> tuple[Array, Array]:
+        """d (2,) as it is expected, and its covariance (2, 2)."""
+        states = self.filters.mean.shape[1]
+        middle = Link(number, 0.0, 0.0, np.zeros(2), np.zeros((2, 2)))
+        displacement_m, _ = self.filters.mixed(middle.rows(states, 0))
         center_m = overlap_center_m(reference.scan.region, self.scan.region, displacement_m)
         if center_m is None:
             center_m = np.array(reference.scan.region.center_m)
         link = self.link(number, reference, center_m, displacement_m)
-        mean, covariance = filters.mixed(link.rows(states, 0))
-        return link, mean + link.offset_m, covariance + link.noise_m2
+        mean, covariance = self.filters.mixed(link.rows(states, 0))
+        return mean + link.offset_m, covariance + link.noise_m2
 
-    def prior(self, number: int, reference: Reference, filters: Filters, widening: float) -> Prior:
+    def prior(self, number: int, reference: Reference, widening: float) -> Prior:
         """What an estimator is told to expect: half a pixel wider, so that it looks around."""
-        _, mean, covariance = self.expected(number, reference, filters)
+        mean, covariance = self.expected(number, reference)
         half_px_m = max(*self.scan.pixel_m, *reference.scan.pixel_m) / 2
         covariance = widening * covariance + np.eye(2) * half_px_m**2
         if not _sheared_alike(self.scan, reference.scan):
             return Prior(mean, covariance)
-        both = self.velocity_covariance + reference.velocity_covariance
-        velocity_sd_m_s = float(np.sqrt(np.linalg.eigvalsh(both)[-1]))
-        return Prior(mean, covariance, self.velocity_m_s - reference.velocity_m_s, velocity_sd_m_s)
-
-
-def _delay(scan: DriftScan, position_m: Array, velocity_m_s: Array) -> tuple[float, Array]:
-    """When a scan passes a position after its middle; what is uncertain of the displacement then, (2, 2)."""
-    delay_s = row_delay_s(scan, position_m)
-    if delay_s is not None:
-        return delay_s, np.zeros((2, 2))
-    either_s = row_delay_s(replace(scan, upwards=True), position_m) or 0.0  # as much later as earlier
-    return 0.0, np.outer(velocity_m_s, velocity_m_s) * either_s**2
+        rows = self.filters.velocity_rows() - self.filters.velocity_rows(number)
+        difference, spread = self.filters.mixed(rows)
+        difference = difference - self.compensated_m_s + reference.compensated_m_s
+        return Prior(mean, covariance, difference, float(np.sqrt(np.linalg.eigvalsh(spread)[-1])))
 
 
 def _sheared_alike(first: DriftScan, second: DriftScan) -> bool:
@@ -161,25 +169,36 @@ def agreeing(measured: list[Measured], filters: Filters) -> list[Measured]:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Several results for one scan as one measurement."""
+    """Several results for one scan as one measurement, and the filters that are to learn from it."""
 
     measured: list[Measured]
+    filters: Filters
 
     @property
     def scan_noise_m2(self) -> Array:
         """(2, 2) of the scan's own location error."""
         return np.asarray(np.mean([one.scan_noise_m2 for one in self.measured], axis=0))
 
-    def surprise(self, filters: Filters) -> float:
-        """chi2 (2 degrees of freedom) of the best reference's result, against all filters together."""
+    @cached_property
+    def apart_m(self) -> Array:
+        """(2,) how far the best reference's result is from what all filters together expect."""
+        return self._apart[0]
+
+    @cached_property
+    def surprise(self) -> float:
+        """chi2 (2 degrees of freedom) of that."""
+        apart, covariance = self._apart
+        return float(apart @ np.linalg.solve(covariance, apart))
+
+    @cached_property
+    def _apart(self) -> tuple[Array, Array]:
         best = self.measured[0]
-        expected, covariance = filters.mixed(best.link.rows(filters.mean.shape[1], 0))
-        apart = best.value_m - expected
-        return float(apart @ np.linalg.solve(covariance + best.pair_noise_m2 + self.scan_noise_m2, apart))
+        expected, covariance = self.filters.mixed(best.link.rows(self.filters.mean.shape[1], 0))
+        return best.value_m - expected, covariance + best.pair_noise_m2 + self.scan_noise_m2
 
     def rows(self, states: int) -> tuple[Array, Array, Array]:
         """Rows (m, states), values (m,) and noise (m, m); the scan is the last one in the state."""
-        rows = np.concatenate([one.link.rows(states, states - 2) for one in self.measured])
+        rows = np.concatenate([one.link.rows(states, states - 4) for one in self.measured])
         values = np.concatenate([one.value_m for one in self.measured])
         noise = np.zeros((len(values), len(values)))
         for n, one in enumerate(self.measured):

@@ -22,25 +22,26 @@ class Reference:
     """A scan that is kept.
 
     Attributes:
-        velocity_m_s, velocity_covariance: (2,) and (2, 2) of the sample in tip coordinates when it was taken.
+        compensated_m_s: (2,) velocity with which tip coordinates followed the sample then.
         anchor: it stands for its part of the sample from now on.
+        adrift: it could not be compared with any that was not, so it is where it was predicted.
         refusals: how often in a row it could not be registered while another one could.
         used: number of the scan that was last registered with it.
     """
 
     scan: DriftScan
-    velocity_m_s: Array
-    velocity_covariance: Array
+    compensated_m_s: Array
     anchor: bool
+    adrift: bool = False
     refusals: int = 0
     used: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "scan": saving.scan_to_dict(self.scan),
-            "velocity_m_s": self.velocity_m_s,
-            "velocity_covariance": self.velocity_covariance,
+            "compensated_m_s": self.compensated_m_s,
             "anchor": self.anchor,
+            "adrift": self.adrift,
             "refusals": self.refusals,
             "used": self.used,
         }
@@ -49,9 +50,9 @@ class Reference:
     def from_dict(cls, table: Table[str, Any]) -> Reference:
         return cls(
             saving.scan_from_dict(table["scan"]),
-            np.asarray(table["velocity_m_s"], dtype=np.float64),
-            np.asarray(table["velocity_covariance"], dtype=np.float64),
+            np.asarray(table["compensated_m_s"], dtype=np.float64),
             bool(table["anchor"]),
+            bool(table["adrift"]),
             int(table["refusals"]),
             int(table["used"]),
         )
@@ -72,7 +73,7 @@ class Choice:
         alike: share of a scan that an anchor must have seen, at half its resolution at least, to stand for it.
     """
 
-    compared: int = 4
+    compared: int = 5
     recent: int = 4
     anchors: int = 8
     most_bytes: int = 256_000_000
@@ -98,7 +99,7 @@ class References:
     def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:
         """Numbers of those that a scan is to be compared with, the best first.
 
-        An anchor comes first, then the oldest, which have been averaged over most.
+        Anchors of the same resolution come first, then the newest: the others show what may have changed since.
 
         Args:
             drift_m: (2,) expected in the scan.
@@ -111,8 +112,8 @@ class References:
                 continue
             shared = overlap_ratio(kept.scan.region, scan.region, drift_m - drifts_m[number])
             if anywhere or shared >= self.choice.overlap_min:
-                # a little more in common is no reason to prefer a younger one
-                rank = (-round(4 * shared), not kept.anchor, -_alike(kept.scan, scan), number)
+                other_kind = _alike(kept.scan, scan) < 0.5
+                rank = (other_kind, -round(4 * shared), not kept.anchor, number if kept.anchor else -number)
                 fitting.append((rank, number))
         return [number for _, number in sorted(fitting)][: self.choice.compared]
 

@@ -32,6 +32,7 @@ class BankSettings:
             to each of its scans.
         widening: of the covariance of an expected displacement, where the estimator is told to search.
         doubt: chi2 above which a result is not believed before the next scan says so too.
+        second_looks: references that are searched without an expectation where none was found where it was expected.
         lost_after: scans in a row that should have matched something and did not.
     """
 
@@ -46,6 +47,7 @@ class BankSettings:
     inflation: float = 2.0
     widening: float = 4.0
     doubt: float = 36.0
+    second_looks: int = 2
     lost_after: int = 3
 
     def __post_init__(self) -> None:

@@ -1,0 +1,432 @@
+"""The default tracker: near the best there is, not thrown off, lost and found, in any place and at any size."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from trackers_lab import FRAME_S, INTERVAL_S, SIZE_M, World, follow, scan_at, steady
+
+from afspm.drift.trackers import BankTracker, PaperTracker, forecast_from_dict, tracker
+from afspm.drift.tracking import Prediction
+from afspm.errors import ConfigError, InvalidValue
+
+Array = NDArray[np.float64]
+Drift = Callable[[float], Array]
+
+NM = 1e-9
+STEADY = steady((0.05 * NM, -0.03 * NM))
+
+
+def night(seed: int) -> Drift:
+    """Relaxations of hours and of half an hour, a day's wave, and a random walk of 1 nm in 15 minutes."""
+    random = np.random.default_rng(seed)
+    slow, fast, daily = (v / np.linalg.norm(v) for v in random.standard_normal((3, 2)))
+    times_s = np.arange(0.0, 120 * INTERVAL_S, 60.0)
+    walk = np.cumsum(random.standard_normal((len(times_s), 2)), axis=0) * NM * np.sqrt(60.0 / 900.0)
+
+    def drift(time_s: float) -> Array:
+        relaxed = 1500 * NM * slow * (1 - np.exp(-time_s / 10800)) + 300 * NM * fast * (1 - np.exp(-time_s / 1800))
+        walked = np.array([np.interp(time_s, times_s, walk[:, axis]) for axis in range(2)])
+        return np.asarray(relaxed + 150 * NM * daily * np.sin(2 * np.pi * time_s / 86400) + walked)
+
+    return drift
+
+
+def error_m(world: World, prediction: Prediction, start_s: float = FRAME_S) -> Array:
+    """What it says less the truth; positions are counted from the first scan."""
+    drift = world.drift_m(prediction.time_s) - world.drift_m(start_s)
+    return np.asarray(-prediction.mapping.translation_m - drift)
+
+
+def rms_m(errors: list[Array]) -> float:
+    return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
+
+
+def test_it_predicts_better_than_the_last_step_does() -> None:
+    """Late misplacement of the same nights: at most 0.85 of the paper's scheme with the same estimator."""
+    late: dict[type, list[Array]] = {BankTracker: [], PaperTracker: []}
+    for seed in range(3):
+        for kind, errors in late.items():
+            world = World(night(seed), seed=seed)
+            errors += [error_m(world, update.before) for update in follow(kind(world), 60)[8:]]
+    assert rms_m(late[BankTracker]) < 3.0 * NM
+    assert rms_m(late[BankTracker]) < 0.85 * rms_m(late[PaperTracker])
+
+
+def test_it_knows_how_well_it_knows() -> None:
+    """Neither over-confident nor careless, before a scan and after it."""
+    before, after = [], []
+    for seed in range(4):
+        world = World(night(seed), seed=seed)
+        for update in follow(BankTracker(world), 50)[8:]:
+            for chi2, known in ((before, update.before), (after, update.after)):
+                error = error_m(world, known)
+                chi2.append(error @ np.linalg.solve(known.covariance_m2, error) / 2)
+    assert 0.1 < np.mean(before) < 1.2
+    assert 0.1 < np.mean(after) < 2.5
+
+
+def test_errors_do_not_accumulate() -> None:
+    world = World(night(1), noise_m=0.3 * NM)
+    updates = follow(BankTracker(world, compared=2), 110)
+    assert rms_m([error_m(world, update.after) for update in updates[-20:]]) < 1.0 * NM
+
+
+def test_the_first_scan_is_where_positions_are_counted_from() -> None:
+    update = BankTracker(World(STEADY)).add(scan_at(5000.0))
+    assert update.matched
+    assert not update.lost
+    assert np.array_equal(update.before.mapping.matrix, np.eye(3))
+    assert np.array_equal(update.after.mapping.matrix, np.eye(3))
+    assert update.after.rate_covariance[0, 0] > 0.0
+
+
+@pytest.mark.parametrize("upwards", [True, False])
+def test_an_overlap_off_the_middle_biases_nothing(*, upwards: bool) -> None:
+    """At a fifth of the frame from its middle, what drifts by 26 nm a frame is 5 nm further."""
+    world = World(steady((0.0, 0.1 * NM)), noise_m=0.0)
+    following = BankTracker(world)
+    for k, offset in enumerate((0.0, 0.4, -0.4, 0.3, -0.3)):
+        scan = scan_at(FRAME_S + k * INTERVAL_S, (0.0, offset * SIZE_M), pixels=64, upwards=upwards, key=str(k))
+        update = following.add(scan)
+        assert update.matched
+    assert np.linalg.norm(error_m(world, update.after)) < 0.3 * NM
+    assert update.after.rate_m_s == pytest.approx((0.0, 0.1 * NM), abs=1e-3 * NM)
+
+
+def test_a_direction_that_is_not_known_is_no_bias_but_uncertainty() -> None:
+    world = World(steady((0.0, 0.1 * NM)), noise_m=0.0)
+    errors, deviations = [], []
+    following = BankTracker(world)
+    for k, offset in enumerate((0.0, 0.4, -0.4, 0.4)):
+        update = following.add(scan_at(FRAME_S + k * INTERVAL_S, (0.0, offset * SIZE_M), upwards=None, key=str(k)))
+        errors.append(float(np.linalg.norm(error_m(world, update.after))))
+        deviations.append(update.after.sd_m)
+    assert update.matched
+    assert max(errors) > 1.0 * NM
+    assert all(error < 3.0 * sd for error, sd in zip(errors[1:], deviations[1:], strict=True))
+
+
+def test_one_wrong_pair_does_not_throw_it_off() -> None:
+    wrong = np.array([40.0, -20.0]) * NM
+    world = World(night(2), wrong={"scan 20": wrong})
+    updates = follow(BankTracker(world), 25)
+    assert not updates[20].matched
+    assert "standard deviations" in updates[20].reason
+    assert not updates[20].lost
+    for update in updates[20:]:
+        assert np.linalg.norm(error_m(world, update.after)) < 10.0 * NM
+        assert np.linalg.norm(error_m(world, update.before)) < 12.0 * NM
+
+
+def test_one_wrong_reference_of_several_is_left_out() -> None:
+    world = World(night(2))
+    following = BankTracker(world)
+    follow(following, 20)
+    honest = world.register
+
+    def lying(reference, scan, prior=None):  # type: ignore[no-untyped-def]
+        found = honest(reference, scan, prior)
+        if reference.key == "scan 0":
+            found.displacement_m[:] += 15.0 * NM
+        return found
+
+    world.register = lying  # type: ignore[method-assign]
+    update = follow(following, 1, first=20)[0]
+    assert update.matched
+    assert update.quality["references"] == len(update.registrations) - 1
+    assert np.linalg.norm(error_m(world, update.after)) < 1.5 * NM
+
+
+def test_a_jump_that_stays_is_believed_the_second_time() -> None:
+    calm = night(3)
+    world = World(lambda t: calm(t) + (t > 15.5 * INTERVAL_S) * np.array([25.0, 30.0]) * NM)
+    updates = follow(BankTracker(world), 24)
+    assert not updates[16].matched
+    assert updates[17].matched
+    assert np.linalg.norm(error_m(world, updates[17].after)) < 2.0 * NM
+    assert np.linalg.norm(error_m(world, updates[22].before)) < 15.0 * NM
+
+
+def test_it_says_when_it_is_lost_and_finds_itself_again() -> None:
+    jump = np.array([900.0, -500.0]) * NM
+    unusable = {f"scan {k}" for k in (11, 12, 13)}
+    world = World(lambda t: STEADY(t) + (t > 10.5 * INTERVAL_S) * jump, blind=unusable)
+    updates = follow(BankTracker(world), 20)
+    lost = [update.lost for update in updates]
+    assert lost[:13] == [False] * 13
+    assert lost[13]
+    assert updates[13].after.sd_m > 500.0 * NM
+    assert not any(lost[14:])
+    assert updates[14].matched
+    assert np.linalg.norm(error_m(world, updates[14].after)) < 5.0 * NM
+    assert np.linalg.norm(error_m(world, updates[19].after)) < 2.0 * NM
+    searched = [prior for _, scan, prior in world.asked if scan == "scan 14"]
+    assert all(prior is None for prior in searched)
+
+
+def test_scans_that_could_not_match_anything_do_not_make_it_lost_soon() -> None:
+    following = BankTracker(World())
+    follow(following, 8)
+    for k in range(3):
+        time_s = FRAME_S + (8 + k) * INTERVAL_S
+        update = following.add(scan_at(time_s, ((k + 1) * 3 * SIZE_M, 0.0), key=f"far {k}"))
+        assert not update.matched
+        assert not update.lost
+        assert update.reason == "no earlier scan of this part of the sample is kept"
+
+
+def test_it_is_lost_when_positions_are_too_uncertain() -> None:
+    world = World(night(4))
+    following = BankTracker(world)
+    follow(following, 3)
+    week_s = 7 * 86400.0
+    update = following.add(scan_at(week_s, (5 * SIZE_M, 0.0), key="elsewhere"))
+    assert update.lost
+    assert update.after.sd_m > 0.35 * SIZE_M
+
+
+def test_a_jump_of_half_a_scan_is_found_at_once_and_believed_the_second_time() -> None:
+    jump = np.array([900.0, -500.0]) * NM
+    world = World(lambda t: STEADY(t) + (t > 10.5 * INTERVAL_S) * jump)
+    updates = follow(BankTracker(world), 20)
+    assert [update.matched for update in updates[10:13]] == [True, False, True]
+    assert not any(update.lost for update in updates)
+    for update in updates[12:]:
+        assert np.linalg.norm(error_m(world, update.after)) < 2.0 * NM
+    assert np.linalg.norm(error_m(world, updates[14].before)) < 20.0 * NM
+
+
+def test_a_new_velocity_is_learned_within_three_scans() -> None:
+    turn_s = FRAME_S + 15 * INTERVAL_S
+    turned = steady((-0.4 * NM, 0.2 * NM))
+    world = World(lambda t: STEADY(t) + turned(max(t - turn_s, 0.0)))
+    updates = follow(BankTracker(world), 24)
+    assert np.linalg.norm(error_m(world, updates[16].before)) > 300.0 * NM
+    # while the velocity is not known, neither is what the sample did between the middle and the overlap
+    assert np.linalg.norm(error_m(world, updates[17].after)) < 2.0 * updates[17].after.sd_m
+    assert all(np.linalg.norm(error_m(world, update.after)) < 2.0 * NM for update in updates[18:])
+    assert np.linalg.norm(error_m(world, updates[19].before)) < 20.0 * NM
+
+
+def test_an_unusable_picture_is_passed_over() -> None:
+    world = World(night(5), blind={"scan 12", "scan 13"})
+    updates = follow(BankTracker(world), 20)
+    assert [update.matched for update in updates[11:15]] == [True, False, False, True]
+    assert updates[12].reason == "blind"
+    assert np.linalg.norm(error_m(world, updates[14].after)) < 2.0 * NM
+
+
+def test_an_anchor_that_can_not_be_recognised_any_more_is_given_up() -> None:
+    """The tip has changed: new scans match each other, old ones do not match them."""
+    world = World(night(6))
+    following = BankTracker(world)
+    follow(following, 10)
+    world.blind |= {f"scan {k}" for k in range(9)}
+    updates = follow(following, 12, first=10)
+    assert all(update.matched for update in updates)
+    assert "scan 0" not in updates[-1].registrations
+    anchors = {min(int(key.split()[1]) for key in update.registrations) for update in updates[-3:]}
+    assert len(anchors) == 1
+    assert np.linalg.norm(error_m(world, updates[-1].after)) < 2.0 * NM
+
+
+def test_the_first_scan_stays_the_anchor_while_it_is_recognised() -> None:
+    updates = follow(BankTracker(World(night(7))), 40)
+    assert all("scan 0" in update.registrations for update in updates[1:])
+
+
+def test_other_places_get_anchors_of_their_own() -> None:
+    """Two places, scanned in turn: what is known of one holds for the other, and for what is certain."""
+    world = World(night(8), noise_m=0.3 * NM)
+    following = BankTracker(world)
+    places = [(0.0, 0.0), (3.5 * SIZE_M, 1.0 * SIZE_M)]
+    updates = []
+    for k in range(40):
+        time_s = FRAME_S + k * INTERVAL_S
+        tip = following.forecast.at(time_s).mapping.inverse.apply(places[k % 2])
+        updates.append(following.add(scan_at(time_s, tip, key=f"{k % 2}-{k}")))
+    assert not updates[1].matched
+    assert all(update.matched for update in updates[3:])
+    assert all("0-0" in update.registrations for update in updates[4::2])
+    assert all("1-1" in update.registrations for update in updates[5::2])
+    assert rms_m([error_m(world, update.before) for update in updates[20:]]) < 6.0 * NM
+
+
+def test_a_wide_scan_and_narrow_ones_in_it() -> None:
+    world = World(night(9))
+    following = BankTracker(world)
+    following.add(scan_at(FRAME_S, size_m=4 * SIZE_M, pixels=16, key="wide"))
+    updates = []
+    for k in range(1, 16):
+        time_s = FRAME_S + k * INTERVAL_S
+        place = ((k % 3 - 1) * 1.2 * SIZE_M, 0.5 * SIZE_M)
+        tip = following.forecast.at(time_s).mapping.inverse.apply(place)
+        updates.append(following.add(scan_at(time_s, tip, size_m=SIZE_M, key=f"narrow {k}")))
+    assert all(update.matched for update in updates)
+    assert all("wide" in update.registrations for update in updates[:3])
+    assert np.linalg.norm(error_m(world, updates[-1].after)) < 2.0 * NM
+
+
+def test_without_correction_anchors_follow_each_other() -> None:
+    """The region stays in tip coordinates, and the sample drifts out of it."""
+    world = World(steady((0.3 * NM, 0.0)))
+    following = BankTracker(world)
+    for k in range(40):
+        update = following.add(scan_at(FRAME_S + k * INTERVAL_S, key=str(k)))
+        assert update.matched
+    assert world.drift_m(update.after.time_s)[0] > 4 * SIZE_M
+    assert np.linalg.norm(error_m(world, update.after)) < 4.0 * NM
+
+
+def test_memory_is_bounded_in_scans_and_in_bytes() -> None:
+    following = BankTracker(World(), anchors=3, recent=2)
+    for k in range(30):
+        following.add(scan_at(FRAME_S + k * INTERVAL_S, (k * SIZE_M / 4, 0.0), key=str(k)))
+        assert len(following.state()["references"]) <= 5
+    small = BankTracker(World(), most_bytes=3 * 8 * 8 * 8)
+    for k in range(10):
+        small.add(scan_at(FRAME_S + k * INTERVAL_S, key=str(k)))
+        assert len(small.state()["references"]) <= 3
+    assert {one["scan"]["key"] for one in small.state()["references"]} >= {"0", "9"}
+
+
+def test_saved_and_restored_it_goes_on_with_the_same_bits() -> None:
+    def world() -> World:
+        return World(night(10), blind={"scan 5"}, wrong={"scan 8": np.array([60.0, 0.0]) * NM})
+
+    whole = follow(BankTracker(world()), 12)
+    for cut in range(12):
+        same = world()
+        before = BankTracker(same)
+        follow(before, cut)
+        after = BankTracker(same)
+        after.restore(before.state())
+        assert after.forecast.to_dict() == before.forecast.to_dict()
+        for update, expected in zip(follow(after, 12 - cut, first=cut), whole[cut:], strict=True):
+            assert update.forecast.to_dict() == expected.forecast.to_dict()
+            assert list(update.registrations) == list(expected.registrations)
+
+
+def test_the_same_scans_give_the_same_numbers() -> None:
+    first, second = (follow(BankTracker(World(night(11))), 10) for _ in range(2))
+    assert first[-1].forecast.to_dict() == second[-1].forecast.to_dict()
+
+
+def test_a_forecast_survives_json_and_speaks_of_any_time() -> None:
+    world = World(STEADY, noise_m=0.01 * NM)
+    following = BankTracker(world)
+    follow(following, 12)
+    forecast = forecast_from_dict(json.loads(json.dumps(following.forecast.to_dict(), allow_nan=False)))
+    newest_s = FRAME_S + 11 * INTERVAL_S
+    for time_s in (newest_s - 3000.0, newest_s, newest_s + 60.0, newest_s + 5000.0):
+        ours, theirs = following.forecast.at(time_s), forecast.at(time_s)
+        assert np.array_equal(ours.mapping.matrix, theirs.mapping.matrix)
+        assert np.array_equal(ours.covariance_m2, theirs.covariance_m2)
+        assert np.linalg.norm(error_m(world, ours)) < 2.0 * NM
+    deviations = [forecast.at(newest_s + s).sd_m for s in (0.0, 900.0, 3600.0)]
+    assert deviations == sorted(deviations)
+    assert ours.rate_m_s == pytest.approx(STEADY(1.0), abs=1e-3 * NM)
+
+
+@pytest.mark.parametrize("table", [{}, {"kind": "other"}, {"kind": "bank", "time_s": 1.0}, {"kind": "paper"}])
+def test_a_damaged_forecast_is_refused(table: dict[str, object]) -> None:
+    with pytest.raises(InvalidValue, match="forecast"):
+        forecast_from_dict(table)
+
+
+def test_a_measured_velocity_cuts_the_first_jump() -> None:
+    jumps = []
+    for told in (False, True):
+        world = World(STEADY)
+        following = BankTracker(world)
+        follow(following, 1)
+        if told:
+            following.set_velocity(FRAME_S, STEADY(1.0), np.eye(2) * (0.002 * NM) ** 2)
+        jumps.append(float(np.linalg.norm(error_m(world, following.forecast.at(FRAME_S + INTERVAL_S)))))
+    assert jumps[0] > 40.0 * NM
+    assert jumps[1] < 5.0 * NM
+
+
+def test_a_velocity_before_the_first_scan_is_refused() -> None:
+    with pytest.raises(InvalidValue, match="first scan"):
+        BankTracker(World()).set_velocity(0.0, (0.0, 0.0), np.eye(2))
+
+
+def compensating(drift: Drift, since_s: float, velocity: Array) -> Drift:
+    """What is left in tip coordinates when a controller follows."""
+    return lambda t: drift(t) - velocity * max(t - since_s, 0.0)
+
+
+def test_a_rate_that_the_controller_takes_over_is_taken_off() -> None:
+    calm = night(12)
+    changed_s = FRAME_S + 10.4 * INTERVAL_S
+    velocity = (calm(changed_s) - calm(changed_s - 900.0)) / 900.0
+    predicted = {}
+    for told in (False, True):
+        world = World(compensating(calm, changed_s, velocity))
+        following = BankTracker(world)
+        follow(following, 11)
+        if told:
+            following.compensated(changed_s, velocity)
+            assert following.forecast.at(changed_s + 1.0).rate_m_s == pytest.approx((0.0, 0.0), abs=0.02 * NM)
+        updates = follow(following, 8, first=11)
+        predicted[told] = [float(np.linalg.norm(error_m(world, update.before))) for update in updates]
+    assert predicted[True][0] < 10.0 * NM
+    assert predicted[False][0] > 2 * predicted[True][0]
+    assert predicted[True][-1] < 10.0 * NM
+
+
+def test_compensation_may_be_told_while_a_scan_is_taken_and_survives_a_kill() -> None:
+    """The file of a scan that was half done at that time comes after the news."""
+    velocity = np.array([0.05, -0.03]) * NM
+    changed_s = FRAME_S + 9 * INTERVAL_S + 30.0
+    world = World(compensating(STEADY, changed_s, velocity), noise_m=0.01 * NM)
+    following = BankTracker(world)
+    follow(following, 9)
+    following.compensated(changed_s, velocity)
+    again = BankTracker(world)
+    again.restore(following.state())
+    for update in follow(again, 4, first=9):
+        assert update.matched
+        assert np.linalg.norm(error_m(world, update.before)) < 1.0 * NM
+    assert np.linalg.norm(update.after.rate_m_s) < 0.003 * NM
+
+
+def test_compensation_that_is_told_too_late_is_refused() -> None:
+    following = BankTracker(World())
+    follow(following, 2)
+    with pytest.raises(InvalidValue, match="before the next scan"):
+        following.compensated(0.0, (0.0, 0.0))
+
+
+def test_an_older_scan_is_refused_and_changes_nothing() -> None:
+    following = BankTracker(World(STEADY))
+    follow(following, 3)
+    before = following.forecast.to_dict()
+    with pytest.raises(InvalidValue, match="order of time"):
+        following.add(scan_at(0.0))
+    assert following.forecast.to_dict() == before
+
+
+@pytest.mark.parametrize(
+    "settings", [{"forgett": 1.0}, {"densities_m2_s3": []}, {"inflation": 1.0}, {"walk_m2_s": 0.0}, {"forget": "x"}]
+)
+def test_settings_without_a_meaning_are_refused(settings: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        tracker({"class": "bank", **settings}, World())
+
+
+def test_trackers_have_names() -> None:
+    assert isinstance(tracker("bank", World()), BankTracker)
+    assert isinstance(tracker("paper", World()), PaperTracker)
+    assert isinstance(tracker({"compared": 2}, World()), BankTracker)
+    assert isinstance(tracker("afspm.drift.trackers.paper.PaperTracker", World()), PaperTracker)
+    with pytest.raises(ConfigError, match="did you mean 'paper'"):
+        tracker("papper", World())
+    with pytest.raises(ConfigError, match="no tracker"):
+        tracker({"class": "collections.OrderedDict"}, [])  # type: ignore[arg-type]
