@@ -6,23 +6,27 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from afspm.components.drift_table import DriftTable
     from afspm.components.feedback_analysis import FeedbackAnalysis
     from afspm.components.feedback_tuner import FeedbackTuner
     from afspm.components.log_collector import LogCollector
     from afspm.components.metadata import Metadata
     from afspm.components.night_picture import NightPicture
     from afspm.components.planned_scans import RegionGrid, ScanList, ScanSeries
+    from afspm.components.rescanner import Rescanner
     from afspm.components.spectroscopy_grid import SpectroscopyGrid
     from afspm.components.tip_classifier import TipClassifier
     from afspm.components.tip_corrector import TipCorrector
 
 _MODULES = {
+    "DriftTable": "drift_table",
     "FeedbackAnalysis": "feedback_analysis",
     "FeedbackTuner": "feedback_tuner",
     "LogCollector": "log_collector",
     "Metadata": "metadata",
     "NightPicture": "night_picture",
     "RegionGrid": "planned_scans",
+    "Rescanner": "rescanner",
     "ScanList": "planned_scans",
     "ScanSeries": "planned_scans",
     "SpectroscopyGrid": "spectroscopy_grid",
@@ -31,12 +35,14 @@ _MODULES = {
 }
 
 __all__ = [
+    "DriftTable",
     "FeedbackAnalysis",
     "FeedbackTuner",
     "LogCollector",
     "Metadata",
     "NightPicture",
     "RegionGrid",
+    "Rescanner",
     "ScanList",
     "ScanSeries",
     "SpectroscopyGrid",

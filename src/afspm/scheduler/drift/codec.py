@@ -30,6 +30,7 @@ class DriftWireCodec(WireCodec):
             filename=scan.scan.filename,
             center=scan.scan.region.center_m,
             correcting=correcting,
+            rescan=registered.rescan,
         ).SerializeToString()
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import queue
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from afspm.scheduler.drift.settings import DriftSettings
 from afspm.scheduler.drift.told import Forecasted, NotRegistered, Registered, ScanJob, WorkerGone, WorkerSaid
 
 _FAREWELL_S = 1.0
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Registrar:
@@ -46,8 +48,9 @@ class Registrar:
         self._life += 1
         command = (sys.executable, "-m", "afspm.scheduler.drift.worker")
         try:
-            # it writes to our error output; its own end is ours
-            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            # it complains where we do; small matrices are not worth more threads than one
+            environment = {**dict.fromkeys(_THREADS, "1"), **os.environ}
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
         except OSError as error:
             self._tell(self._life, WorkerGone(f"it can't be started: {error}"))
             return

@@ -43,19 +43,24 @@ class _Worker:
     """Answers what it is asked, one after the other."""
 
     def __init__(self, settings: dict[str, Any], answers: IO[bytes]) -> None:
+        from afspm.scheduler.drift.store import Store
+
+        self._drift = DriftSettings.from_table(settings["drift"])
+        self._store = Store(Path(settings["file"]) if settings["file"] else None)
+        self._answers = answers
+        self._begin()
+        self._tell_forecast()
+
+    def _begin(self) -> None:
+        """As it was when a scan was registered last."""
         from afspm.drift.estimators import estimator
         from afspm.drift.trackers import tracker
         from afspm.scheduler.drift.estimation import Estimation
-        from afspm.scheduler.drift.store import Store
 
-        drift = DriftSettings.from_table(settings["drift"])
-        store = Store(Path(settings["file"]) if settings["file"] else None)
-        made = tracker(drift.tracker, estimator(drift.estimator))
-        self._estimation = Estimation(made, drift.rescan, store.save)
-        self._answers = answers
-        if (state := store.load()) is not None:
+        made = tracker(self._drift.tracker, estimator(self._drift.estimator))
+        self._estimation = Estimation(made, self._drift.rescan, self._store.save)
+        if (state := self._store.load()) is not None:
             self._estimation.restore(state)
-        self._tell_forecast()
 
     def take(self, head: dict[str, Any], data: bytes) -> None:
         if head["do"] == "register":
@@ -72,6 +77,7 @@ class _Worker:
             answer = self._estimation.register(*pipe.job_from_head(head, data))
         except Exception as error:  # of a user's own estimator or tracker, too: it is the reason
             reason = str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"
+            self._begin()  # what was half done is not to be built on
             pipe.write(self._answers, {"is": "not registered", "key": head["key"], "reason": reason})
             return
         pipe.write(self._answers, {"is": "registered", **asdict(answer)})

@@ -1,0 +1,66 @@
+"""`DriftTable`: what was told of drift, scan by scan, as a table in the run folder."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from afspm.components.metadata import iso_utc
+from afspm.components.records import LineFile
+from afspm.drift.record import COLUMNS as RECORD
+from afspm.drift.record import drift_at
+from afspm.runtime.component import Component
+
+COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "units", *RECORD, "lost", "correcting")
+
+
+class DriftTable(Component):
+    """Writes `drift_correction.csv`: for each scan the offset between tip and sample coordinates, and its rate.
+
+    The offset is x_sample - x_tip. The columns from `scan` to `reason` are those of `afspm.drift.record`, which reads
+    the table. Whatever is killed, there is one header and no row is there twice.
+
+    Args:
+        file: its name in the run folder.
+    """
+
+    listens: ClassVar = ("DriftMapping",)
+
+    def __init__(self, file: str = "drift_correction.csv") -> None:
+        self.file = file
+
+    def on_start(self) -> None:
+        self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
+        self._written = {tuple(row[:2]) for row in csv.reader(self._table.lines())}
+
+    def on_drift_mapping(self, message: Any) -> None:
+        row = drift_row(message)
+        if tuple(row[:2]) in self._written:
+            return  # replayed after a restart
+        line = io.StringIO()
+        csv.writer(line, lineterminator="").writerow(row)
+        self._table.append([line.getvalue().replace("\n", " ")])
+        self._written.add(tuple(row[:2]))
+
+
+def drift_row(message: Any) -> list[str]:
+    """A DriftMapping as a row."""
+    time_ns = message.timestamp.ToNanoseconds()
+    drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
+    xx, xy, _, yy = message.covariance
+    numbers = (*message.center, drift_x, drift_y, xx, yy, xy, *message.rate)
+    return [
+        iso_utc(time_ns),
+        message.filename,
+        *(f"{value:.9g}" for value in (-drift_x, -drift_y, *message.rate)),
+        "m; m/s",
+        message.filename,
+        f"{time_ns * 1e-9:.6f}",
+        *(f"{value:.9g}" for value in numbers),
+        *("yes" if message.matched else "no", message.reason),
+        *("yes" if flag else "no" for flag in (message.lost, message.correcting)),
+    ]

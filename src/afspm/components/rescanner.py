@@ -1,0 +1,155 @@
+"""`Rescanner`: takes the scans again that the Drift Compensated Scheduler asks for (paper, "Overarching Workflow")."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from afspm import wire
+from afspm.errors import ConfigError, ControlLost, Refused
+from afspm.model import Problem, Region, ScanParameters, names
+from afspm.runtime.component import Component
+from afspm.runtime.events import Events
+
+WANTED, TOLD = "DriftRescan", "DriftMapping"
+AGAIN, OPPOSITE, SEARCH = 1, 2, 3
+"""The numbers of RescanKind."""
+FLAGGED_WITHIN_S = 5.0
+Pixels = tuple[int, int] | None
+
+_IN_WORDS = {AGAIN: "the same region again", OPPOSITE: "the other direction", SEARCH: "a wider region"}
+
+
+class Rescanner(Component):
+    """Waits to be asked by a `DriftRescan`, and takes the region again, or in the other direction, or a wider one.
+
+    Meanwhile thermal-drift is flagged, so that nobody else scans. It tries a few times. A scan that still lies too far
+    off is then told, and the experiment goes on; where the sample is not found again a person is needed, for which it
+    flags device-malfunction.
+
+    Args:
+        attempts: scans for one request.
+        widen: by how much each search is wider than the one before it.
+        most_pixels: of a side of a search, whose pixels are those of the scans before as far as this allows.
+        problem: what it solves.
+    """
+
+    solves: ClassVar = ("thermal-drift",)
+    flags: ClassVar = ("thermal-drift", "device-malfunction")
+    listens: ClassVar = (WANTED, TOLD)
+
+    def __init__(
+        self, attempts: int = 3, widen: float = 2.0, most_pixels: int = 512, problem: str = "thermal-drift"
+    ) -> None:
+        if attempts < 1 or not widen > 1.0 or most_pixels < 2:
+            raise ConfigError(f"attempts = {attempts}, widen = {widen}, most_pixels = {most_pixels} can't be")
+        self.attempts, self.widen, self.most_pixels = attempts, widen, most_pixels
+        self.problem = problem
+
+    def run(self) -> None:
+        with self.scope.events(WANTED) as wanted, self.scope.events(TOLD, timeout_s=0.0) as told:
+            for event in wanted:
+                if event.message.timestamp.ToNanoseconds() <= int(self.memory.get("done_ns", -1)):
+                    continue  # of a scan of ours, or from before a restart
+                try:
+                    self._obey(event.message, told)
+                except ControlLost as lost:
+                    self.log.info("no more to be scanned again: %s", lost.what)
+                self.memory["done_ns"] = self.clock.now_ns()
+                self.memory.save()
+
+    def _obey(self, message: Any, told: Events) -> None:
+        parameters: ScanParameters = wire.decode("ScanParameters2d", message.params.SerializeToString())
+        if not isinstance(parameters.region, Region):
+            self.log.error("asked to scan again, but not where: %s", message.reason)
+            return
+        self.log.info("%s: %s", _IN_WORDS.get(message.kind, "a scan"), message.reason)
+        if not self._is_flagged():
+            self.scope.flag(self.problem)
+            self.scope.wait_until(self._is_flagged, timeout_s=FLAGGED_WITHIN_S)
+        with self.scope.control(solving=self.problem):
+            found = self._take(message, parameters, told)
+            self.scope.clear(self.problem)
+        if found:
+            return
+        if message.kind == SEARCH:
+            self.log.critical("the sample is not found again: a person has to look, nothing is scanned until then")
+            self.scope.flag(Problem.DEVICE_MALFUNCTION)
+        else:
+            self.log.error(
+                "%d scans did not help: the experiment goes on as it is. A person should look", self.attempts
+            )
+
+    def _take(self, message: Any, parameters: ScanParameters, told: Events) -> bool:
+        """Scan until it is as it was asked for. What was changed for that is set back."""
+        region, shape = parameters.region, parameters.shape
+        assert isinstance(region, Region)
+        assert shape is None or isinstance(shape, tuple)
+        direction = self._turn(message)
+        try:
+            for attempt in range(self.attempts):
+                self._forget(told)
+                if message.kind == SEARCH:
+                    wider, pixels = self._wider(region, shape, attempt + 1)
+                    self.scope.scan(wider, shape=pixels)
+                else:
+                    self.scope.scan(region, shape=shape)
+                if self._is_as_asked(message.kind, told):
+                    return True
+            return False
+        finally:
+            if direction is not None:
+                self.scope.set(names.SCAN_DIRECTION, direction)
+            if message.kind == SEARCH:
+                self._set_back(region, shape)
+
+    def _turn(self, message: Any) -> str | None:
+        """Set the direction that is wanted; returns that in force before, where it is another."""
+        if not message.HasField("upwards"):
+            return None
+        wanted = names.UP if message.upwards else names.DOWN
+        before = str(self.scope.get(names.SCAN_DIRECTION))
+        self.scope.set(names.SCAN_DIRECTION, wanted)
+        return None if before == wanted else before
+
+    def _wider(self, region: Region, shape: Pixels, times: int) -> tuple[Region, Pixels]:
+        factor = self.widen**times
+        width, height = region.size_m
+        wider = Region(region.center_m, (width * factor, height * factor), region.angle_rad)
+        if shape is None:
+            return wider, None
+        rows, columns = (min(round((n - 1) * factor) + 1, max(self.most_pixels, n)) for n in shape)
+        return wider, (rows, columns)
+
+    def _set_back(self, region: Region, shape: Pixels) -> None:
+        """The region of the scans before: the next scan may take what it finds."""
+        (left, low), (width, height) = region.top_left_m, region.size_m
+        values = {names.SCAN_SIZE_X: width, names.SCAN_SIZE_Y: height}
+        values |= {names.SCAN_TOP_LEFT_X: left, names.SCAN_TOP_LEFT_Y: low}
+        try:
+            for name, value_m in values.items():
+                self.scope.set(name, value_m, "m")
+            if shape is not None:
+                self.scope.set(names.SCAN_RESOLUTION_Y, shape[0])
+                self.scope.set(names.SCAN_RESOLUTION_X, shape[1])
+        except Refused as refused:
+            self.log.warning("the region of the scans before could not be set again: %s", refused.reason)
+
+    def _is_as_asked(self, kind: int, told: Events) -> bool:
+        """Whether the scan was what it was taken for, by what was told of it right before it was published."""
+        mapping = None
+        for event in told:
+            mapping = event.message
+        if mapping is None:
+            self.log.warning("nothing was told of the drift in the scan")
+            return False
+        if kind == SEARCH:
+            return not mapping.lost
+        return bool(mapping.matched and not mapping.lost and (kind == OPPOSITE or not mapping.rescan))
+
+    def _forget(self, told: Events) -> None:
+        """What was told of earlier scans."""
+        for _ in told:
+            pass
+
+    def _is_flagged(self) -> bool:
+        return self.scope.problems.number(self.problem) in self.scope.control_state.problems
