@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,87 +12,8 @@ from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan, Registration
 from afspm.drift.shear import row_delay_s
 from afspm.drift.tracking import Tracker, Update
-from afspm.errors import InvalidValue
-from afspm.model import Scan
 
 Array = NDArray[np.float64]
-
-NS_PER_S = 1_000_000_000
-TOPOGRAPHY = ("height", "topo", "z", "zsensor")
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """One channel of many scans, in the order of time.
-
-    Attributes:
-        channel, unit: of the values.
-        scans: of that channel, with the times of those below.
-        left_out: what can't be followed, and why.
-    """
-
-    channel: str
-    unit: str
-    scans: tuple[DriftScan, ...]
-    left_out: tuple[str, ...]
-
-
-def chosen(scans: Sequence[Scan], channel: str = "") -> Chosen:
-    """The scans of a channel that can be followed; without one named, of the topography.
-
-    Args:
-        scans: all channels of all files.
-
-    Raises:
-        InvalidValue: there is no such channel, or no two scans of it.
-    """
-    name = channel or topography([scan.channel for scan in scans])
-    found: list[DriftScan] = []
-    left_out: list[str] = []
-    units = []
-    for scan in scans:
-        if scan.channel != name:
-            continue
-        told = scan.filename or "a scan"
-        if scan.time_ns is None:
-            left_out.append(f"{told}: it does not say when it was taken")
-        elif min(scan.shape) < 2:
-            left_out.append(f"{told}: {scan.shape[1]} x {scan.shape[0]} pixels")
-        else:
-            found.append(timed(scan))
-            units.append(scan.unit)
-    found.sort(key=lambda one: one.mid_s)
-    if len(found) < 2:
-        there = ", ".join(sorted({scan.channel for scan in scans})) or "none"
-        raise InvalidValue(
-            f"drift needs two scans of the channel {name!r} at least, not {len(found)}", hint=f"channels: {there}"
-        )
-    return Chosen(name, units[0], tuple(found), tuple(left_out))
-
-
-def topography(channels: Sequence[str]) -> str:
-    """The channel that most likely is the topography: by its name, the forward one, as most files call it.
-
-    Raises:
-        InvalidValue: there are no channels.
-    """
-    names = list(dict.fromkeys(channels))
-    if not names:
-        raise InvalidValue("there are no scans")
-
-    def rank(name: str) -> tuple[int, int, int]:
-        lower = name.lower()
-        words = next((k for k, word in enumerate(TOPOGRAPHY) if lower.startswith(word)), len(TOPOGRAPHY))
-        backwards = any(word in lower for word in ("retrace", "backward", "bwd"))
-        return words, int(backwards), names.index(name)
-
-    return min(names, key=rank)
-
-
-def timed(scan: Scan) -> DriftScan:
-    """As drift sees it. Where a scan does not say how long it took, it counts as taken when it was finished."""
-    end_s = (scan.time_ns or 0) / NS_PER_S
-    return DriftScan(scan.values, scan.region, end_s, end_s, key=scan.filename)
 
 
 def followed(scans: Sequence[DriftScan], tracker: Tracker) -> Iterator[Update]:

@@ -1,4 +1,4 @@
-"""Scans from files: which are followed, and what a pair says of the time in between."""
+"""What a pair of scans says of the time in between, and what is drawn of a run."""
 
 from __future__ import annotations
 
@@ -9,17 +9,11 @@ import numpy as np
 import pytest
 from test_record import record
 
-from afspm.drift.offline import against_first, chosen, spread_pairs, topography
+from afspm.drift.offline import against_first, spread_pairs
 from afspm.drift.registration import DriftScan, Registration
-from afspm.errors import InvalidValue
-from afspm.model import Region, Scan
+from afspm.model import Region
 
 REGION = Region((1e-6, 0.0), (2e-6, 1e-6))
-
-
-def scan(channel: str = "Height", at_s: float | None = 0.0, filename: str = "a.nc", pixels: int = 8) -> Scan:
-    time_ns = None if at_s is None else int(at_s * 1e9)
-    return Scan(REGION, channel, "m", np.zeros((pixels, pixels)), time_ns, filename)
 
 
 def found(displacement_m: tuple[float, float], *, center_m: tuple[float, float] = REGION.center_m) -> Registration:
@@ -31,36 +25,6 @@ def found(displacement_m: tuple[float, float], *, center_m: tuple[float, float] 
         linear=np.zeros((2, 2)),
         center_m=np.array(center_m),
     )
-
-
-@pytest.mark.parametrize(
-    ("channels", "expected"),
-    [
-        (["Phase", "Height Retrace", "Height"], "Height"),
-        (["Amplitude", "HeightRetrace"], "HeightRetrace"),
-        (["Current", "Z"], "Z"),
-        (["M-Xp-Topo", "Topo"], "Topo"),
-        (["Deflection", "Phase"], "Deflection"),
-    ],
-)
-def test_the_topography_is_found_by_its_name(channels: list[str], expected: str) -> None:
-    assert topography(channels) == expected
-
-
-def test_the_scans_of_a_channel_come_in_the_order_of_time_and_what_has_none_is_told() -> None:
-    series = chosen([scan(at_s=900.0, filename="b.nc"), scan("Phase"), scan(), scan(at_s=None, filename="c.nc"),
-                     scan(pixels=1, filename="d.nc")])  # fmt: skip
-    assert series.channel == "Height"
-    assert [one.key for one in series.scans] == ["a.nc", "b.nc"]
-    assert [one.mid_s for one in series.scans] == [0.0, 900.0]
-    assert series.left_out == ("c.nc: it does not say when it was taken", "d.nc: 1 x 1 pixels")
-
-
-def test_a_channel_without_two_scans_is_refused_with_those_there_are() -> None:
-    with pytest.raises(InvalidValue, match=r"'Phase'.*channels: Height, Phase"):
-        chosen([scan(), scan(at_s=1.0), scan("Phase")], "Phase")
-    with pytest.raises(InvalidValue, match="no scans"):
-        chosen([])
 
 
 def test_a_pair_speaks_of_the_rows_that_both_show_and_is_brought_to_the_middle_of_both() -> None:

@@ -1,0 +1,171 @@
+"""`afspm drift FILE…`, what it does: read, follow on all cores while bars grow, print, write."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from afspm.drift.estimators import estimator
+from afspm.drift.offline import against_first, followed
+from afspm.drift.record import DriftRecord
+from afspm.drift.registration import DriftScan, Registration
+from afspm.drift.stack import corrected
+from afspm.drift.trackers import tracker
+from afspm.errors import AfspmError, FileError, InvalidValue
+from afspm.files import FORMATS, FileContent, read
+from afspm.study.recorded import Series, series
+from afspm.study.workers import on_cores
+
+NM = 1e9
+NM_PER_MIN = 60e9
+_SCANS_OF_A_RUN = "scans"
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """What came of all scans of a channel.
+
+    Attributes:
+        record: of the tracker.
+        pairs: the first scan with each later one.
+        estimates: those, as a record.
+    """
+
+    record: DriftRecord
+    pairs: tuple[Registration, ...]
+    estimates: DriftRecord
+
+
+def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Path, jobs: int) -> None:
+    """Analyse and tell.
+
+    Raises:
+        InvalidValue: nothing in it that can be followed. ConfigError: no such estimator or tracker.
+    """
+    console, aside = Console(file=sys.stdout, highlight=False), Console(stderr=True, highlight=False)
+    contents, unreadable = read_all(paths)
+    for told in unreadable:
+        aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    found = series(contents, channel)
+    for told in found.left_out:
+        aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    begun = datetime.fromtimestamp(found.scans[0].mid_s, UTC)
+    console.print(f"{len(found.scans)} scans of {found.channel} from {begun:%Y-%m-%d %H:%M} UTC on", markup=False)
+    analysis = analysed(found.scans, by, following, jobs, aside)
+    console.print(as_table(analysis.record))
+    for path in written(found, analysis, output, aside):
+        console.print(str(path), markup=False, soft_wrap=True)
+
+
+def read_all(paths: Sequence[Path]) -> tuple[list[FileContent], list[str]]:
+    """What is in files and folders, and what could not be read."""
+    contents: list[FileContent] = []
+    unreadable: list[str] = []
+    for path in _files(paths):
+        try:
+            contents.append(read(path))
+        except AfspmError as error:
+            unreadable.append(str(error))
+    return contents, unreadable
+
+
+def _files(paths: Sequence[Path]) -> Iterator[Path]:
+    for path in paths:
+        if not path.is_dir():
+            yield path
+            continue
+        folder = path / _SCANS_OF_A_RUN if (path / _SCANS_OF_A_RUN).is_dir() else path
+        yield from sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in FORMATS)
+
+
+def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registration:
+    """What a worker does."""
+    return estimator(by).register(reference, scan)
+
+
+def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int, console: Console) -> Analysis:
+    """Followed in this process, one scan after the other, while others compare each with the first."""
+    tracking = tracker(following, estimator(by))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as progress, ThreadPoolExecutor(1) as beside:
+        track = progress.add_task("followed", total=len(scans))
+        pair = progress.add_task("compared with the first", total=len(scans) - 1)
+        work = beside.submit(_pairs, scans, by, max(jobs - 1, 1), lambda: progress.advance(pair))
+        updates = []
+        for update in followed(scans, tracking):
+            updates.append(update)
+            progress.advance(track)
+        pairs = work.result()
+    record = DriftRecord.of(scans, updates)
+    return Analysis(record, pairs, against_first(record, scans, pairs))
+
+
+def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], None]) -> tuple[Registration, ...]:
+    tasks = [(by, scans[0], scan) for scan in scans[1:]]
+    pairs = [Registration.refused("")] * len(tasks)
+    for outcome in on_cores(register_pair, tasks, jobs=jobs):
+        pairs[outcome.index] = Registration.refused(outcome.error) if outcome.error else outcome.value
+        done()
+    return tuple(pairs)
+
+
+def as_table(record: DriftRecord) -> Table:
+    """The record for a person: hours since the first scan, nm, and nm a minute."""
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("scan", no_wrap=True, max_width=24)
+    for name in ("h", "x / nm", "y / nm", "± sd", "nm/min x", "y"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("accepted", overflow="fold", min_width=16)
+    hours = (record.time_s - record.time_s[0]) / 3600.0
+    for k, key in enumerate(record.keys):
+        numbers = (*record.drift_m[k] * NM, record.sd_m[k].max() * NM, *record.rate_m_s[k] * NM_PER_MIN)
+        accepted = "yes" if record.matched[k] else f"no: {record.reasons[k]}"
+        table.add_row(Path(key).name, f"{hours[k]:.2f}", *(_number(one) for one in numbers), accepted)
+    return table
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if abs(value) < 1e5 else f"{value:.1e}"
+
+
+def written(found: Series, analysis: Analysis, folder: Path, console: Console) -> Iterator[Path]:
+    """Write all that can be; what can't is said."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"can't be made: {error.strerror or error}", where=str(folder)) from error
+    analysis.record.write(folder / "drift.csv")
+    yield folder / "drift.csv"
+    analysis.estimates.write(folder / "drift_estimates.csv")
+    yield folder / "drift_estimates.csv"
+    try:
+        yield _stack(found, analysis.record, folder / "drift_stack.nc")
+    except InvalidValue as error:
+        console.print(f"no stack: {error}", markup=False, soft_wrap=True)
+    try:
+        from afspm.drift.figures import album
+    except ImportError:
+        console.print('no figures without matplotlib: pip install "afspm[plot]"', markup=False)
+        return
+    part = album.Part("", found.channel, 0, len(found.scans), analysis.estimates)
+    matched = next(((0, k, one) for k, one in enumerate(analysis.pairs, 1) if one.accepted and one.matches), None)
+    yield from album.write(album.Run(found.scans, analysis.record, [part], matched), folder)
+
+
+def _stack(found: Series, record: DriftRecord, path: Path) -> Path:
+    """Only of scans that were matched: where the others lie is a guess."""
+    which = np.flatnonzero(record.matched)
+    scans = [found.scans[k] for k in which]
+    stack = corrected(scans, record.drift_m[which], record.rate_m_s[which])
+    stack.write(path, channel=found.channel, unit=found.unit)
+    return path
