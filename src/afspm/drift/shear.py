@@ -11,12 +11,14 @@ their middles is another, more precise one.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.registration import DriftScan, Estimator, Prior, Registration
+from afspm.errors import InvalidValue
+from afspm.model.undistort import undistorted
 
 Array = NDArray[np.float64]
 
@@ -35,7 +37,8 @@ class DriftVelocity:
         covariance: (2, 2) of it, (m/s)².
         time_s: the middle of the two scans, for which it holds.
         by_shear_m_s, by_displacement_m_s: (2,) what each route says by itself.
-        registrations: what it rests on, the last one used.
+        by_shear_covariance: (2, 2) of the former.
+        registration: what it rests on, or what was refused.
     """
 
     accepted: bool
@@ -44,22 +47,24 @@ class DriftVelocity:
     covariance: Array
     time_s: float
     by_shear_m_s: Array
+    by_shear_covariance: Array
     by_displacement_m_s: Array
-    registrations: tuple[Registration, ...] = ()
+    registration: Registration | None = None
 
     @classmethod
-    def refused(cls, reason: str, time_s: float, registrations: tuple[Registration, ...] = ()) -> DriftVelocity:
+    def refused(cls, reason: str, time_s: float, registration: Registration | None = None) -> DriftVelocity:
         """Nothing that may be used."""
-        unknown = np.full(2, np.nan)
+        nothing, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
         return cls(
             accepted=False,
             reason=reason,
-            velocity_m_s=unknown,
-            covariance=np.full((2, 2), np.nan),
+            velocity_m_s=nothing,
+            covariance=unknown,
             time_s=time_s,
-            by_shear_m_s=unknown,
-            by_displacement_m_s=unknown,
-            registrations=registrations,
+            by_shear_m_s=nothing,
+            by_shear_covariance=unknown,
+            by_displacement_m_s=nothing,
+            registration=registration,
         )
 
 
@@ -111,44 +116,71 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
 def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) -> DriftVelocity:
     """The velocity from an up frame and the down frame after it (or the other way round), of about the same region.
 
-    Registers them freely; where that is refused or contradicts the shear (another site of a lattice), once more with
-    what the shear says as prior.
+    Registers them freely. If that is refused, or displacement and shear contradict each other (another site of a
+    lattice, a picture in which shear hardly shows), what either says is taken as a guess: both scans are freed from
+    that drift and registered again where it lets expect them to be, and what is left of both has to agree.
     """
     first, second = sorted((up, down), key=lambda scan: scan.mid_s)
     time_s = (first.mid_s + second.mid_s) / 2
     if first.upwards is None or second.upwards is None or first.upwards == second.upwards:
         return DriftVelocity.refused("they need to be scanned in opposite directions", time_s)
     free = estimator.register(first, second)
-    result = _combined(first, second, (free,))
-    sheared = velocity_by_shear(first, second, free)
-    if result.accepted or sheared is None:
+    result = _combined(first, second, free, np.zeros(2))
+    if result.accepted:
         return result
-    guided = estimator.register(first, second, _prior_from(first, second, sheared))
-    return _combined(first, second, (free, guided))
+    for guess in _guesses(first, second, free):
+        prior = _prior_from(first, second, free, guess)
+        found = estimator.register(_freed(first, guess), _freed(second, guess), prior)
+        guided = _combined(first, second, found, guess)
+        if guided.accepted:
+            return guided
+    return result
 
 
-def _prior_from(first: DriftScan, second: DriftScan, sheared: tuple[Array, Array]) -> Prior:
-    """The displacement of the second scan that a velocity lets expect."""
-    velocity, covariance = sheared
+def _guesses(first: DriftScan, second: DriftScan, free: Registration) -> list[Array]:
+    """Velocities that the shear and the displacement of a registration mean."""
+    sheared = velocity_by_shear(first, second, free)
+    if sheared is None:
+        return []
+    return [sheared[0], free.displacement_m / _between_s(first, second, free)]
+
+
+def _prior_from(first: DriftScan, second: DriftScan, free: Registration, guess: Array) -> Prior:
+    """The displacement between the middles that a velocity lets expect, as uncertain as the shear."""
+    sheared = velocity_by_shear(first, second, free)
+    covariance = np.zeros((2, 2)) if sheared is None else sheared[1]
     between_s = second.mid_s - first.mid_s
-    half_px = 0.25 * min(first.pixel_m) ** 2
-    return Prior(velocity * between_s, covariance * between_s**2 + half_px * np.eye(2))
+    one_px_m2 = min(first.pixel_m) ** 2
+    return Prior(guess * between_s, covariance * between_s**2 + one_px_m2 * np.eye(2))
 
 
-def _combined(first: DriftScan, second: DriftScan, tried: tuple[Registration, ...]) -> DriftVelocity:
-    """Both routes of the last registration, put together if they agree."""
-    found, time_s = tried[-1], (first.mid_s + second.mid_s) / 2
+def _freed(scan: DriftScan, velocity_m_s: Array) -> DriftScan:
+    x, y = (float(v) for v in velocity_m_s)
+    try:
+        values = undistorted(scan.values, scan.region, (x, y), scan.duration_s, upwards=scan.upwards is not False)
+    except InvalidValue:  # as fast as the scan: no guess
+        return scan
+    return replace(scan, values=values)
+
+
+def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_s: Array) -> DriftVelocity:
+    """Both routes of a registration, put together if they agree.
+
+    Args:
+        freed_m_s: (2,) the drift that the scans have been freed from.
+    """
+    time_s = (first.mid_s + second.mid_s) / 2
     sheared = velocity_by_shear(first, second, found)
     if not found.accepted or sheared is None:
-        reason = found.reason or "there is no shear to be found between them"
-        return DriftVelocity.refused(reason, time_s, tried)
-    by_shear, shear_covariance = sheared
-    there_m = found.center_m + found.displacement_m
-    between_s = second.mid_s + _delay_s(second, there_m) - first.mid_s - _delay_s(first, found.center_m)
-    by_displacement, covariance = found.displacement_m / between_s, found.covariance_m2 / between_s**2
+        return DriftVelocity.refused(found.reason or "there is no shear to be found between them", time_s, found)
+    by_shear, shear_covariance = sheared[0] + freed_m_s, sheared[1]
+    between_s, middles_s = _between_s(first, second, found), second.mid_s - first.mid_s
+    # rows that are freed are all as they were at the middle, but for what the guess was wrong by
+    by_displacement = (found.displacement_m + freed_m_s * (between_s - middles_s)) / between_s
+    covariance = found.covariance_m2 / between_s**2
     difference, both = by_displacement - by_shear, covariance + shear_covariance
     if float(difference @ np.linalg.solve(both, difference)) > _CONTRADICTION:
-        return DriftVelocity.refused("the displacement between them contradicts their shear", time_s, tried)
+        return DriftVelocity.refused("the displacement between them contradicts their shear", time_s, found)
     share = np.linalg.solve(both, covariance).T  # of the shear
     together = covariance - share @ covariance
     return DriftVelocity(
@@ -158,10 +190,14 @@ def _combined(first: DriftScan, second: DriftScan, tried: tuple[Registration, ..
         covariance=(together + together.T) / 2,
         time_s=time_s,
         by_shear_m_s=by_shear,
+        by_shear_covariance=shear_covariance,
         by_displacement_m_s=by_displacement,
-        registrations=tried,
+        registration=found,
     )
 
 
-def _delay_s(scan: DriftScan, position_m: Array) -> float:
-    return row_delay_s(scan, position_m) or 0.0
+def _between_s(first: DriftScan, second: DriftScan, found: Registration) -> float:
+    """From when the first passed the overlap to when the second did."""
+    there_m = found.center_m + found.displacement_m
+    late_s, later_s = row_delay_s(first, found.center_m) or 0.0, row_delay_s(second, there_m) or 0.0
+    return second.mid_s + later_s - first.mid_s - late_s

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from afspm.drift.registration import DriftScan, Estimator, Registration
-from afspm.drift.shear import velocity_by_shear
+from afspm.drift.shear import velocity_from_up_down
 from afspm.drift.trackers import saving
 from afspm.drift.trackers.compensation import Compensation
 from afspm.drift.trackers.filters import Filters
@@ -151,14 +151,12 @@ class BankTracker:
             return filters
         if scan.mid_s - last.mid_s > 3.0 * max(scan.duration_s, last.duration_s):  # too long ago for one velocity
             return filters
-        found = self._estimator.register(last, scan)
-        sheared = velocity_by_shear(last, scan, found)
-        if not found.accepted or sheared is None:
+        found = velocity_from_up_down(last, scan, self._estimator)
+        if not found.accepted:
             return filters
-        between_s = (last.mid_s + scan.mid_s) / 2
-        return self._with_velocity(
-            filters, between_s, sheared[0] + self._compensation.velocity_m_s(between_s), sheared[1]
-        )
+        # The displacement between them will be compared like any other.
+        velocity = found.by_shear_m_s + self._compensation.velocity_m_s(found.time_s)
+        return self._with_velocity(filters, found.time_s, velocity, found.by_shear_covariance)
 
     def _tried(self, newest: Newest, *, anywhere: bool) -> dict[int, Registration]:
         """What the estimator says of the scan and each reference, by its number, the best first."""
