@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from afspm.files import read
     from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
     from afspm.runtime.component import Component
     from afspm.runtime.connect import connect
@@ -25,12 +26,14 @@ __all__ = [
     "ScopeState",
     "Spectrum",
     "connect",
+    "read",
 ]
 
 _HOMES = {
     "Component": "afspm.runtime.component",
     "Scope": "afspm.runtime.scope",
     "connect": "afspm.runtime.connect",
+    "read": "afspm.files",
 }
 
 

@@ -10,11 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from afspm.errors import FileError
-from afspm.microscopes.simulator import netcdf
-from afspm.microscopes.simulator.netcdf import Attributes, Variable
+from afspm.files import netcdf, simulator
+from afspm.files.netcdf import Attributes, Variable
 from afspm.model import Region, Scan, Spectrum
-
-_CONVENTIONS = "afspm simulator 1"
 
 
 @dataclass(frozen=True)
@@ -69,58 +67,19 @@ def load(path: Path) -> list[Scan | Spectrum]:
     Raises:
         FileError: missing, not whole, or something else.
     """
-    variables, attributes = netcdf.read(path)
-    time_ns = int(str(attributes.get("time_ns", "0")))
+    file = netcdf.read(path)
+    if not simulator.is_ours(file):
+        raise FileError("is no file of the simulated controller", where=str(path))
     try:
-        if attributes.get("content") == "spectrum":
-            return [_spectrum(variables, attributes, time_ns, str(path))]
-        return [*_scans(variables, attributes, time_ns, str(path))]
-    except (KeyError, ValueError) as error:
-        raise FileError(f"lacks {error}", where=str(path)) from error
-
-
-def _scans(variables: Mapping[str, Variable], attributes: Attributes, time_ns: int, filename: str) -> list[Scan]:
-    def number(name: str) -> float:
-        return float(attributes[f"region_{name}"])
-
-    region = Region(
-        (number("center_x_m"), number("center_y_m")),
-        (number("size_x_m"), number("size_y_m")),
-        number("angle_rad"),
-    )
-    return [
-        Scan(
-            region,
-            str(variable.attributes["long_name"]),
-            str(variable.attributes["units"]),
-            variable.values,
-            time_ns,
-            filename,
-        )
-        for name, variable in variables.items()
-        if name not in ("x", "y")
-    ]
-
-
-def _spectrum(variables: Mapping[str, Variable], attributes: Attributes, time_ns: int, filename: str) -> Spectrum:
-    position = None
-    if "position_x_m" in attributes:
-        position = (float(attributes["position_x_m"]), float(attributes["position_y_m"]))
-    return Spectrum(
-        position,
-        str(attributes["kind"]),
-        tuple(str(variable.attributes["long_name"]) for variable in variables.values()),
-        tuple(str(variable.attributes["units"]) for variable in variables.values()),
-        np.stack([variable.values for variable in variables.values()], axis=1),
-        time_ns,
-        filename,
-    )
+        return list(simulator.content(file, path))
+    except ValueError as error:
+        raise FileError(f"is not whole: {error}", where=str(path)) from error
 
 
 def _header(content: str, measured: Measured) -> dict[str, str | float]:
     # as text: a float64 has no room for nanoseconds since 1970
     when = datetime.fromtimestamp(measured.time_ns / 1e9, UTC).isoformat()
-    return {"Conventions": _CONVENTIONS, "content": content, "time": when, "time_ns": str(measured.time_ns)}
+    return {"Conventions": simulator.CONVENTIONS, "content": content, "time": when, "time_ns": str(measured.time_ns)}
 
 
 def _identifier(name: str) -> str:

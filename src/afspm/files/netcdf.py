@@ -1,26 +1,29 @@
 """NetCDF, classic format (64-bit offsets): arrays with named dimensions, units and attributes in one file.
 
-xarray, MATLAB, Gwyddion's users' scripts, `ncdump` … read it. Of the format only what a scan needs is here:
-arrays of float64 and attributes that are text or float64. The format: Unidata, "The NetCDF Classic Format
+xarray, MATLAB, Gwyddion's users' scripts, `ncdump` … read it. Of the format only what scans need is here:
+numbers and texts, no records; what is written are float64. The format: Unidata, "The NetCDF Classic Format
 Specification".
 """
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import FileError
-from afspm.runtime.memory import write_whole
 
 _MAGIC = b"CDF\x02"
 _DIMENSIONS, _VARIABLES, _ATTRIBUTES = 10, 11, 12
 _CHAR, _DOUBLE = 2, 6
+_KINDS = {1: ">i1", _CHAR: "S1", 3: ">i2", 4: ">i4", 5: ">f4", _DOUBLE: ">f8"}
+_OFFSETS = {b"CDF\x01": ">i", _MAGIC: ">q"}  # of where arrays begin
 
 Attributes = Mapping[str, str | float]
 
@@ -34,13 +37,13 @@ class Variable:
     attributes: Attributes = field(default_factory=dict)
 
 
-def write(path: Path, variables: Mapping[str, Variable], attributes: Attributes) -> None:
-    """Write a file, whole or not at all.
+@dataclass(frozen=True)
+class File:
+    """What is in a file: arrays of numbers, those of characters as texts, and what is said of the whole."""
 
-    Raises:
-        FileError: it can't be written.
-    """
-    write_whole(path, [encoded(variables, attributes)])
+    variables: Mapping[str, Variable]
+    texts: Mapping[str, str]
+    attributes: Attributes
 
 
 def encoded(variables: Mapping[str, Variable], attributes: Attributes) -> bytes:
@@ -73,8 +76,8 @@ def encoded(variables: Mapping[str, Variable], attributes: Attributes) -> bytes:
     return b"".join([head, described(begins), *data])
 
 
-def read(path: Path) -> tuple[dict[str, Variable], dict[str, str | float]]:
-    """The variables and the global attributes of a file that `write` wrote.
+def read(path: Path) -> File:
+    """The variables and the global attributes of a file of the classic format.
 
     Raises:
         FileError: missing, not whole, or something else.
@@ -83,60 +86,92 @@ def read(path: Path) -> tuple[dict[str, Variable], dict[str, str | float]]:
         content = path.read_bytes()
     except OSError as error:
         raise FileError(f"can't be read: {error}", where=str(path)) from error
-    if content[:4] != _MAGIC:
-        raise FileError("is not a NetCDF file of ours", where=str(path))
+    if content[:4] not in _OFFSETS:
+        raise FileError("is no NetCDF file of the classic format", where=str(path))
     try:
         return _Reader(content).file()
-    except (struct.error, ValueError, IndexError) as error:
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise FileError(f"is not whole: {error}", where=str(path)) from error
 
 
 class _Reader:
     def __init__(self, content: bytes) -> None:
         self._content = content
+        self._offset = _OFFSETS[content[:4]]
         self._at = 8
 
-    def file(self) -> tuple[dict[str, Variable], dict[str, str | float]]:
-        dimensions = [(self._text(), self._take(">i")) for _ in range(self._count())]
+    def file(self) -> File:
+        if self._content[4:8] != bytes(4):
+            raise ValueError("it has records, which is not read")
+        dimensions = [(self._text(), self._take(">i")) for _ in range(self._count(_DIMENSIONS))]
         attributes = self._attributes()
-        variables = {}
-        for _ in range(self._count()):
+        variables: dict[str, Variable] = {}
+        texts: dict[str, str] = {}
+        for _ in range(self._count(_VARIABLES)):
             name = self._text()
-            axes = [dimensions[self._take(">i")] for _ in range(self._take(">i"))]
+            axes = [dimensions[self._index(len(dimensions))] for _ in range(self._size())]
             own = self._attributes()
-            self._take(">i")  # the type: always double
+            kind = self._take(">i")
             self._take(">I")  # the size, which the shape says too
-            shape = tuple(size for _, size in axes)
-            values = np.frombuffer(self._content, ">f8", int(np.prod(shape)), self._take(">q"))
-            variables[name] = Variable(tuple(axis for axis, _ in axes), values.astype(np.float64).reshape(shape), own)
-        return variables, attributes
+            values = self._values(kind, tuple(size for _, size in axes), self._take(self._offset))
+            if kind == _CHAR:
+                texts[name] = _decoded(values.tobytes())
+            else:
+                variables[name] = Variable(tuple(axis for axis, _ in axes), values.astype(np.float64), own)
+        return File(variables, texts, attributes)
+
+    def _values(self, kind: int, shape: tuple[int, ...], begin: int) -> NDArray[Any]:
+        count = math.prod(shape)
+        if min(shape, default=1) < 1 or begin < 0 or kind not in _KINDS:
+            raise ValueError(f"an array of type {kind} and shape {shape} at byte {begin}")
+        return np.frombuffer(self._content, _KINDS[kind], count, begin).reshape(shape)
 
     def _take(self, kind: str) -> int:
         (value,) = struct.unpack_from(kind, self._content, self._at)
         self._at += struct.calcsize(kind)
         return int(value)
 
-    def _count(self) -> int:
-        self._take(">i")  # which list it is, or 0 for none
-        return self._take(">i")
+    def _count(self, tag: int) -> int:
+        found, count = self._take(">i"), self._size()
+        if found != tag and (found, count) != (0, 0):
+            raise ValueError(f"a list of kind {found} where one of {tag} was to be")
+        return count
+
+    def _size(self) -> int:
+        """How many of something follow: no more than there are bytes."""
+        size = self._take(">i")
+        if not 0 <= size <= len(self._content) - self._at:
+            raise ValueError(f"{size} of something in {len(self._content)} bytes")
+        return size
+
+    def _index(self, count: int) -> int:
+        index = self._take(">i")
+        if not 0 <= index < count:
+            raise ValueError(f"number {index} of {count}")
+        return index
+
+    def _raw(self, length: int) -> bytes:
+        raw = self._content[self._at : self._at + length]
+        self._at += length + -length % 4
+        return raw
 
     def _text(self) -> str:
-        length = self._take(">i")
-        text = self._content[self._at : self._at + length].decode()
-        self._at += length + -length % 4
-        return text
+        return self._raw(self._size()).decode()
 
     def _attributes(self) -> dict[str, str | float]:
+        """Text as it is, of numbers the first."""
         found: dict[str, str | float] = {}
-        for _ in range(self._count()):
-            name = self._text()
-            if self._take(">i") == _CHAR:
-                found[name] = self._text()
-            else:
-                self._take(">i")
-                (found[name],) = struct.unpack_from(">d", self._content, self._at)
-                self._at += 8
+        for _ in range(self._count(_ATTRIBUTES)):
+            name, kind, count = self._text(), self._take(">i"), self._size()
+            if kind not in _KINDS:
+                raise ValueError(f"an attribute of type {kind}")
+            raw = self._raw(count * np.dtype(_KINDS[kind]).itemsize)
+            found[name] = _decoded(raw) if kind == _CHAR else float(np.frombuffer(raw, _KINDS[kind], 1)[0])
         return found
+
+
+def _decoded(raw: bytes) -> str:
+    return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
 def _list(tag: int, count: int, entries: bytes) -> bytes:

@@ -1,0 +1,47 @@
+"""What is in a file of a controller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from afspm.model import Scan, Spectrum
+
+_TOPOGRAPHY = ("height", "zsensor", "topo", "zs-topo", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class FileContent:
+    """Everything of one file, in the model's geometry and units of the controller's (lengths in m).
+
+    Attributes:
+        controller: who wrote it, e.g. "Nanonis".
+        scans: one for each channel.
+        spectra: of one file, one in most formats.
+        header: what the file says besides, as it says it.
+        start_ns, end_ns: when it was begun and finished, ns since the Unix epoch; None if that is not known.
+        upwards: whether small y was scanned first; None if that is not known.
+    """
+
+    controller: str
+    scans: tuple[Scan, ...] = ()
+    spectra: tuple[Spectrum, ...] = ()
+    header: Mapping[str, Any] = field(default_factory=dict)
+    start_ns: int | None = None
+    end_ns: int | None = None
+    upwards: bool | None = None
+
+    def __iter__(self) -> Iterator[Scan | Spectrum]:
+        yield from self.scans
+        yield from self.spectra
+
+    @property
+    def topography(self) -> Scan | None:
+        """The first scan of heights; None if there is none."""
+        heights = [scan for scan in self.scans if scan.unit == "m"]
+        for start in _TOPOGRAPHY:
+            for scan in heights:
+                if scan.channel.casefold().startswith(start):
+                    return scan
+        return heights[0] if len(self.scans) == 1 and heights else None

@@ -1,0 +1,145 @@
+"""NetCDF (.nc): GXSM's scans, NetCDF-3 of Gxsm3 and NetCDF-4 (which is HDF5) of Gxsm4, one channel a file; and those of
+the simulated microscope, told by their attribute Conventions.
+
+Values are FloatField * dz; rows come from the top; lengths are in ångström whatever their attributes say; rangex goes
+from the first pixel to the last; offsetx is the centre; alpha is clockwise in degrees.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from datetime import tzinfo
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import FileError
+from afspm.files import hdf5, netcdf, simulator
+from afspm.files.content import FileContent
+from afspm.files.times import NS_PER_S
+from afspm.model import Region, Scan
+from afspm.units import convert
+
+CONTROLLER = "GXSM"
+_ANGSTROM = ("AA", "Å", "Ang")
+_FILE_NAME = re.compile(r"-X([pm])-(.+)\.nc$")
+
+
+@dataclass(frozen=True, eq=False)
+class _Raw:
+    """What is needed of a file, whichever NetCDF it is.
+
+    Attributes:
+        values: FloatField, (time, value, y, x).
+        attributes: of FloatField.
+        numbers, texts: of the other variables.
+    """
+
+    values: NDArray[np.float64]
+    attributes: dict[str, str]
+    numbers: dict[str, float]
+    texts: dict[str, str]
+
+
+def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
+    """A scan. Raises FileError, KeyError and ValueError: something else, or broken."""
+    if hdf5.is_hdf5(path):
+        return _content(_netcdf4(path), path)
+    file = netcdf.read(path)
+    if simulator.is_ours(file):
+        return simulator.content(file, path)
+    return _content(_netcdf3(file), path)
+
+
+def _netcdf3(file: netcdf.File) -> _Raw:
+    name = "FloatField" if "FloatField" in file.variables else "H"
+    if name not in file.variables:
+        raise FileError("a NetCDF file that is neither of GXSM nor of the simulated microscope")
+    field = file.variables[name]
+    numbers = {key: float(v.values.flat[0]) for key, v in file.variables.items() if v.values.size == 1}
+    return _Raw(field.values, {k: str(v) for k, v in field.attributes.items()}, numbers, dict(file.texts))
+
+
+def _netcdf4(path: Path) -> _Raw:
+    with hdf5.opened(path) as file:
+        if "FloatField" not in file:
+            raise FileError("a NetCDF file that is not of GXSM")
+        field = file["FloatField"]
+        numbers: dict[str, float] = {}
+        texts: dict[str, str] = {}
+        for key, node in file.items():
+            if node.dtype.kind == "S":
+                texts[key] = hdf5.text(node[()])
+            elif node.size == 1:
+                numbers[key] = float(np.ravel(node[()])[0])
+        attributes = {key: hdf5.text(v) for key, v in field.attrs.items() if isinstance(v, bytes | str)}
+        return _Raw(hdf5.array(field), attributes, numbers, texts)
+
+
+def _content(raw: _Raw, path: Path) -> FileContent:
+    if raw.values.ndim != 4 or min(raw.values.shape[2:]) < 2:
+        raise FileError(f"holds no scan: an array of shape {raw.values.shape}")
+    region = _region(raw.numbers)
+    start, end = (_ns(raw.numbers, key) for key in ("t_start", "t_end"))
+    upwards = {"TopDown": False, "BottomUp": True}.get(raw.texts.get("spm_scancontrol", "").strip())
+    unit, scale = _unit(raw)
+    layers = raw.values.reshape(-1, *raw.values.shape[2:])
+    name = _channel(raw, path)
+    scans = tuple(
+        Scan(
+            region,
+            name if k == 0 else f"{name} #{k + 1}",
+            unit,
+            convert(_measured(layer, upwards) * scale, "Å", "m") if unit == "m" else _measured(layer, upwards) * scale,
+            end,
+            str(path),
+        )
+        for k, layer in enumerate(layers)
+    )
+    header: dict[str, Any] = {**raw.numbers, **raw.texts}
+    return FileContent(CONTROLLER, scans, header=header, start_ns=start, end_ns=end, upwards=upwards)
+
+
+def _region(numbers: dict[str, float]) -> Region:
+    x, y, width, height = (convert(numbers[key], "Å", "m") for key in ("offsetx", "offsety", "rangex", "rangey"))
+    return Region((x, y), (width, height), math.radians(0.0 - numbers.get("alpha", 0.0)))
+
+
+def _ns(numbers: dict[str, float], key: str) -> int | None:
+    """Zero is what a scan has that was never begun."""
+    seconds = numbers.get(key, 0.0)
+    return round(seconds) * NS_PER_S if seconds > 0.0 else None
+
+
+def _unit(raw: _Raw) -> tuple[str, float]:
+    """Of the values times dz, and dz; ångström is told as m."""
+    unit = raw.attributes.get("ZSrcUnit") or raw.attributes.get("unit", "")
+    return ("m" if unit in _ANGSTROM else unit), raw.numbers["dz"]
+
+
+def _channel(raw: _Raw, path: Path) -> str:
+    """As the program shows it, e.g. "ZS-Topo", which is ZSmTopo in the file's name; the way back is told."""
+    label = raw.attributes.get("ZLabel", "")
+    match = _FILE_NAME.search(raw.texts.get("basename", "")) or _FILE_NAME.search(path.name)
+    if match is None:
+        return label
+    name = label if label.replace("-", "m") == match[2] else match[2]
+    return f"{name} Backward" if match[1] == "m" else name
+
+
+def _measured(image: NDArray[np.float64], upwards: bool | None) -> NDArray[np.float64]:
+    """[y, x], both ascending, from rows that begin at the top. What a stopped scan has not reached is zero, and nothing
+    marks it: whole rows of zeros at its end become NaN (all of them: a signal that was zero)."""
+    rows = image[::-1].copy()
+    zero = (rows == 0.0).all(axis=1)
+    if zero.all():
+        return rows
+    if upwards is not True:  # the low rows come last
+        rows[: int(np.argmin(zero))] = np.nan
+    if upwards is not False:
+        rows[len(rows) - int(np.argmin(zero[::-1])) :] = np.nan
+    return rows

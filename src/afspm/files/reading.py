@@ -1,0 +1,58 @@
+"""`read`: any file that a controller wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import tzinfo
+from importlib import import_module
+from pathlib import Path
+
+from afspm.errors import FileError
+from afspm.files.content import FileContent
+
+Reader = Callable[[Path, tzinfo | None], FileContent]
+
+# By suffix, "module:function" of this package.
+FORMATS = {
+    ".ibw": "asylum:read_igor",
+    ".h5": "nsid:read_nsid",
+    ".hdf5": "nsid:read_nsid",
+    ".sxm": "nanonis:read_scan",
+    ".dat": "nanonis_spectrum:read_spectrum",
+    ".nc": "gxsm:read_netcdf",
+    ".vpdata": "gxsm_spectrum:read_spectrum",
+    ".gsf": "gsf:read_field",
+}
+
+
+def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
+    """The scans and spectra of a file: Asylum (.ibw, NSID .h5), Nanonis (.sxm, .dat), GXSM (.nc, .vpdata), Gwyddion's
+    simple fields (.gsf) and those of the simulated microscope (.nc).
+
+    Args:
+        zone: of the clock of the controller, which most write without saying which it was; None: that of this computer.
+
+    Raises:
+        FileError: missing, not whole, not what its suffix says, without a reader, or its library is missing.
+    """
+    path = Path(path)
+    name = FORMATS.get(path.suffix.lower())
+    if name is None:
+        raise FileError(
+            f"no reader for {path.suffix or 'a file without a suffix'}",
+            where=str(path),
+            hint=f"read: {' '.join(FORMATS)}",
+        )
+    if not path.is_file():
+        raise FileError("no such file", where=str(path))
+    module, _, function = name.partition(":")
+    reader: Reader = getattr(import_module(f"afspm.files.{module}"), function)
+    try:
+        return reader(path, zone)
+    except FileError as error:
+        if error.where:
+            raise
+        raise FileError(error.what, where=str(path), hint=error.hint) from error
+    except Exception as error:  # a reader may stumble in any way over a broken file
+        why = f"{type(error).__name__}: {error}"
+        raise FileError(f"is not readable as {path.suffix}: {why}", where=str(path)) from error

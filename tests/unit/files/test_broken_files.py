@@ -1,0 +1,98 @@
+"""Broken files: what is cut off is refused, and no damage does more than be refused."""
+
+from __future__ import annotations
+
+import contextlib
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import DATA, WHOLE
+
+import afspm
+from afspm.errors import FileError
+from afspm.files import FileContent
+
+pytest.importorskip("h5py")
+pytest.importorskip("scipy")
+
+REAL = [
+    "asylum/DTMicroscope_scan_0001.ibw",
+    "asylum/fmt-igor-fd_SiN_FD_plot.ibw",
+    "nanonis/ProbeFlow_nanonis.sxm",
+    "nanonis/Bias-Spectroscopy002.dat",
+    "gxsm/gxsm3/scan002-M-Xp-Topo.nc",
+    "gxsm/gxsm4/scan002-M-Xp-ZSmTopo.nc",
+    "gxsm/gxsm4/scan006-VP001-VP.vpdata",
+]
+
+
+@cache
+def whole(name: str) -> bytes:
+    if name in WHOLE:
+        with TemporaryDirectory() as folder:
+            WHOLE[name](Path(folder) / name)
+            return (Path(folder) / name).read_bytes()
+    return (DATA / name).read_bytes()
+
+
+def need(name: str) -> None:
+    if name not in WHOLE and not (DATA / name).is_file():
+        pytest.skip(f"{DATA / name} is missing")
+
+
+def reading(content: bytes, name: str) -> FileContent:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / Path(name).name
+        path.write_bytes(content)
+        return afspm.read(path)
+
+
+@pytest.mark.parametrize("name", [*WHOLE, *REAL])
+@settings(max_examples=40)
+@given(data=st.data())
+def test_a_file_that_was_cut_off_is_refused_or_holds_the_same(name: str, data: st.DataObject) -> None:
+    """The same: what follows the last that is needed; and a table of text that ends with a line is a shorter one."""
+    need(name)
+    content = whole(name)
+    length = data.draw(
+        st.one_of(st.integers(0, len(content) - 1), st.integers(max(len(content) - 40, 0), len(content) - 1))
+    )
+    with contextlib.suppress(FileError):
+        cut, full = reading(content[:length], name), reading(content, name)
+        for part, complete in zip(cut, full, strict=True):
+            rows = len(part.values) if name.endswith(".dat") else None
+            np.testing.assert_array_equal(part.values, complete.values[:rows])
+
+
+@pytest.mark.parametrize("name", [n for n in [*WHOLE, *REAL] if not n.endswith(".dat")])
+def test_values_that_are_cut_off_are_refused(name: str) -> None:
+    need(name)
+    content = whole(name)
+    for length in (len(content) // 2, len(content) // 3):
+        with pytest.raises(FileError):
+            reading(content[:length], name)
+
+
+@pytest.mark.parametrize("name", [*WHOLE, *REAL])
+@settings(max_examples=60)
+@given(data=st.data())
+def test_damaged_bytes_are_refused_or_read_and_nothing_else(name: str, data: st.DataObject) -> None:
+    need(name)
+    damaged = bytearray(whole(name))
+    # headers are at the beginning, of some formats at the end
+    places = st.one_of(
+        st.integers(0, min(len(damaged), 3000) - 1),
+        st.integers(max(len(damaged) - 1000, 0), len(damaged) - 1),
+        st.integers(0, len(damaged) - 1),
+    )
+    for place in data.draw(st.lists(places, min_size=1, max_size=8)):
+        damaged[place] = data.draw(st.integers(0, 255))
+    with contextlib.suppress(FileError):
+        for one in reading(bytes(damaged), name):
+            assert one.values.ndim == 2
+            assert one.values.dtype == np.float64
