@@ -1,0 +1,266 @@
+"""`Rig`: a simulated instrument with no vendor's controller around it yet.
+
+An emulator sets what is in force, starts things and asks how far they are; the protocol, the files and the quirks are
+its own. Lengths in m in tip coordinates, angles in rad counter-clockwise, times in experiment seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, wait
+from threading import Thread
+from typing import Any
+
+import numpy as np
+
+from afspm.clock import Clock
+from afspm.emulators.running import Drawn, InAir, Occupied, RunningScan, RunningSpectrum, noise_in_air
+from afspm.errors import AfspmError
+from afspm.model import Feedback, Region
+from afspm.simulation import World
+from afspm.simulation.scanning import Course
+
+Doing = RunningScan | RunningSpectrum | Occupied
+_FEW = (2, 2)  # pixels: enough to see which channels there are
+
+
+class RigBusy(AfspmError):
+    """The instrument does something else, which is to be stopped or waited for first."""
+
+    code = "rig-busy"
+
+
+class Rig:
+    """The instrument. It does one thing at a time. For one thread at a time.
+
+    Args:
+        world_settings: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
+        seed: everything that is left to chance follows from it.
+        background: pictures are worked out while the scan lasts, so that nobody waits for them; False: at its start.
+
+    Attributes:
+        region, shape, line_s, upwards: of the next scan: the frame, (rows, columns), seconds of a line there and back,
+            and whether it begins with the smallest y.
+        feedback, bias_v, slope: in force; `slope` is the compensation of tilt, (x, y).
+        move_speed_m_s: of the probe outside of scans.
+        approach_s: how long coming to the sample or leaving it takes.
+        engaged: whether the tip is at the sample; if not, all that is measured is noise.
+        scan, spectrum: the last one that was started, also when it is over; None before the first.
+        wake: called, from any thread, when something ends that no time was known for.
+        world: the physics, for whoever judges what came of it (`world.truth`).
+    """
+
+    def __init__(self, world_settings: Mapping[str, Any], seed: int, clock: Clock, *, background: bool = True) -> None:
+        self.clock = clock
+        self.seed = seed
+        self.world = World.from_settings(world_settings, seed, clock.now_s())
+        # its channels are known from a few pixels of a world that nothing happens to
+        few = World.from_settings(world_settings, seed, 0.0).scan(Region((0.0, 0.0), (1e-9, 1e-9)), _FEW, 1.0, 0.0)
+        self._units = {name: unit for name, (unit, _) in few.channels().items()}
+        loop = self.world.settings.feedback
+        self.region = Region((0.0, 0.0), (1e-6, 1e-6))
+        self.shape = (128, 128)
+        self.line_s = 1.0
+        self.upwards = True
+        self.feedback = Feedback(loop.on, loop.proportional_gain, loop.integral_gain, loop.setpoint)
+        self.bias_v = 0.1
+        self.slope = (0.0, 0.0)
+        self.move_speed_m_s = 5e-6
+        self.approach_s = 1.0
+        self.engaged = True
+        self.scan: RunningScan | None = None
+        self.spectrum: RunningSpectrum | None = None
+        self.wake: Callable[[], None] = lambda: None
+        self._background = background
+        self._doing: Doing | None = None
+        self._probe_m = self._came_from_m = (0.0, 0.0)
+        self._scans = self._spectra = 0
+
+    # -- what goes on
+
+    @property
+    def channels(self) -> Mapping[str, str]:
+        """The channels of every scan, with their units."""
+        return dict(self._units)
+
+    def doing(self, now_s: float) -> str:
+        """What it is busy with: "scan", "spectrum", "move", "pulse", "crash", "approach" or what `occupy` was told;
+        empty if it is free."""
+        return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
+
+    def busy(self, now_s: float) -> bool:
+        """Whether it is doing anything."""
+        return bool(self.doing(now_s))
+
+    def next_change_s(self, now_s: float) -> float | None:
+        """When it will be free by itself; None if it is, if it is paused, or if `wake` will tell."""
+        if self._doing is None or not self._doing.running(now_s) or self._doing.end_s <= now_s:
+            return None
+        return None if isinstance(self._doing, RunningScan) and self._doing.paused else self._doing.end_s
+
+    def probe_at(self, now_s: float) -> tuple[float, float]:
+        """Where the tip is, also during a move or a scan."""
+        doing = self._doing
+        if isinstance(doing, RunningScan) and doing.running(now_s):
+            return doing.tip_m(now_s)
+        if isinstance(doing, Occupied) and doing.what == "move" and doing.running(now_s):
+            part = (now_s - doing.start_s) / (doing.end_s - doing.start_s)
+            (x0, y0), (x1, y1) = self._came_from_m, self._probe_m
+            return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
+        return self._probe_m
+
+    @property
+    def probe_m(self) -> tuple[float, float]:
+        """Where the probe was sent, (x, y); spectra, pulses and crashes happen there."""
+        return self._probe_m
+
+    # -- what it can be told to do
+
+    def start_scan(self) -> RunningScan:
+        """Scan the frame.
+
+        Raises:
+            RigBusy. InvalidValue: what is in force can't be scanned.
+        """
+        now_s = self._free_now_s()
+        drawn: Future[Drawn] = Future()
+        scan = RunningScan(
+            self._scans + 1,
+            self.region,
+            self.shape,
+            now_s,
+            self.line_s,
+            self.upwards,
+            self.feedback,
+            self.bias_v,
+            _drawn=drawn,
+        )
+        draw = self._drawer(scan)
+        if self._background:
+            self._in_background(draw, drawn)
+        else:
+            drawn.set_result(draw())
+        self._scans += 1
+        self.scan = self._doing = scan
+        return scan
+
+    def stop_scan(self) -> None:
+        """Break the scan off, if one is running. What it has of lines stays to be had from `scan`."""
+        if self.scan is not None:
+            self.scan.stop(self.clock.now_s())
+
+    def start_spectrum(self, kind: str) -> RunningSpectrum:
+        """Take a curve of a kind ("IV", "force") where the probe is.
+
+        Raises:
+            RigBusy. InvalidValue: there is no such kind.
+        """
+        now_s = self._free_now_s()
+        names, units, values = self.world.spectrum(kind, self._probe_m, now_s, self.feedback, self.bias_v)
+        self._spectra += 1
+        if not self.engaged:
+            random = np.random.default_rng((self.seed, 2, self._spectra))
+            for column, unit in list(enumerate(units))[1:]:  # the first is what is swept
+                values[:, column] = noise_in_air(random, values.shape[:1], unit)
+        end_s = now_s + self.world.spectrum_s(kind)
+        self.spectrum = RunningSpectrum(self._spectra, kind, self._probe_m, now_s, end_s, names, units, values)
+        self._doing = self.spectrum
+        return self.spectrum
+
+    def stop_spectrum(self) -> None:
+        """Break the spectrum off, if one is running: it is gone."""
+        if isinstance(self._doing, RunningSpectrum) and self._doing.running(self.clock.now_s()):
+            self._doing = self.spectrum = None
+
+    def move_probe(self, xy_m: tuple[float, float]) -> None:
+        """Move the tip; the way takes its time. A move under way is turned to the new place.
+
+        Raises:
+            RigBusy: with something else than a move.
+        """
+        now_s = self.clock.now_s()
+        if self.doing(now_s) != "move":
+            self._free_now_s()
+        came_from_m = self.probe_at(now_s)
+        self._came_from_m, self._probe_m = came_from_m, (float(xy_m[0]), float(xy_m[1]))
+        self._doing = Occupied("move", now_s, now_s + math.dist(came_from_m, self._probe_m) / self.move_speed_m_s)
+
+    def stop_move(self) -> None:
+        """Stay where the tip is on its way."""
+        now_s = self.clock.now_s()
+        if self.doing(now_s) == "move":
+            self._probe_m, self._doing = self.probe_at(now_s), None
+
+    def pulse(self, voltage_v: float, duration_s: float) -> str:
+        """A bias pulse where the probe is: "cured", "worsened" or "unchanged"."""
+        now_s = self._free_now_s()
+        outcome = self.world.pulse(voltage_v, duration_s, now_s, self._probe_m) if self.engaged else "unchanged"
+        self.occupy("pulse", duration_s)
+        return outcome
+
+    def crash(self, depth_m: float, speed_m_s: float) -> str:
+        """Drive the tip into the sample where the probe is, and out again: as `pulse`."""
+        now_s = self._free_now_s()
+        outcome = self.world.crash(self._probe_m, speed_m_s, now_s) if self.engaged else "unchanged"
+        self.occupy("crash", 2.0 * depth_m / speed_m_s)
+        return outcome
+
+    def engage(self) -> None:
+        """Bring the tip to the sample."""
+        self._free_now_s()
+        self.engaged = True
+        self.occupy("approach", self.approach_s)
+
+    def withdraw(self) -> None:
+        """Take the tip away from the sample, whatever is going on."""
+        self.stop_scan()
+        self.stop_spectrum()
+        self.engaged = False
+        self._doing = None
+        self.occupy("approach", self.approach_s)
+
+    def occupy(self, what: str, lasts_s: float) -> None:
+        """Be busy with anything else for so long. Raises RigBusy."""
+        now_s = self._free_now_s()
+        self._doing = Occupied(what, now_s, now_s + lasts_s)
+
+    # -- inside
+
+    def _free_now_s(self) -> float:
+        """The time. Raises RigBusy; waits for what is left of a picture that nobody wants any more."""
+        now_s = self.clock.now_s()
+        doing = self.doing(now_s)
+        if doing:
+            raise RigBusy(f"the instrument is busy with a {doing}")
+        if self.scan is not None:
+            wait([self.scan._drawn])
+        return now_s
+
+    def _drawer(self, scan: RunningScan) -> Callable[[], Drawn]:
+        direction, slope = ("up" if scan.upwards else "down"), self.slope
+        course = Course(scan.region, scan.shape, scan.line_s, scan.start_s, direction)
+        if not self.engaged:
+            air = InAir(self._units, course, (self.seed, 1, scan.number))
+            return lambda: air
+        return lambda: self.world.scan(
+            scan.region,
+            scan.shape,
+            scan.line_s,
+            scan.start_s,
+            scan.feedback,
+            scan.bias_v,
+            direction=direction,
+            slope=slope,
+        )
+
+    def _in_background(self, draw: Callable[[], Drawn], drawn: Future[Drawn]) -> None:
+        def work() -> None:
+            try:
+                drawn.set_result(draw())
+            except BaseException as error:
+                drawn.set_exception(error)
+            self.wake()
+
+        # not an executor's thread: those are waited for when the process ends
+        Thread(target=work, daemon=True, name="simulated scan").start()

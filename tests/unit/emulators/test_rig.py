@@ -1,0 +1,178 @@
+"""The simulated instrument that emulators are built around."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from afspm.emulators.rig import Rig, RigBusy
+from afspm.errors import InvalidValue
+from afspm.model import Region
+from afspm.simulation import World
+
+
+def test_a_scan_takes_its_time_and_its_lines_come_one_by_one(rig: Rig, clock: Any) -> None:
+    scan = rig.start_scan()
+    assert scan.end_s == 1004.0
+    told = []
+    for t_s in (1000.0, 1000.49, 1000.5, 1002.0, 1003.99, 1004.0):
+        clock.t_s = t_s
+        told.append((scan.lines_done(t_s), rig.doing(t_s)))
+    assert told == [(0, "scan"), (0, "scan"), (1, "scan"), (4, "scan"), (7, "scan"), (8, "")]
+    assert rig.scan is scan
+
+
+def test_lines_not_taken_yet_are_missing_on_the_side_it_has_not_reached(rig: Rig) -> None:
+    rig.upwards = False
+    scan = rig.start_scan()
+    unit, height = scan.channels(1001.0)["Height"]
+    assert unit == "m"
+    assert np.isnan(height[:6]).all()
+    assert np.isfinite(height[6:]).all()
+    assert np.array_equal(scan.channels()["Height"][1][6:], height[6:])
+
+
+def test_it_is_the_same_world_as_the_simulators(rig: Rig) -> None:
+    theirs = World.from_settings({}, 3, 1000.0).scan(rig.region, (8, 16), 0.5, 1000.0, rig.feedback, 0.1)
+    ours = rig.start_scan()
+    assert np.array_equal(ours.channels()["Height"][1], theirs.channels()["Height"][1])
+
+
+def test_what_is_changed_during_a_scan_is_for_the_next(rig: Rig) -> None:
+    scan = rig.start_scan()
+    rig.region, rig.shape = Region((1e-6, 0.0), (2e-6, 1e-6)), (4, 4)
+    assert scan.region == Region((0.0, 0.0), (1e-6, 1e-6))
+    assert scan.channels()["Height"][1].shape == (8, 16)
+
+
+def test_a_stopped_scan_keeps_the_lines_that_it_had(rig: Rig, clock: Any) -> None:
+    scan = rig.start_scan()
+    clock.t_s = 1001.2
+    rig.stop_scan()
+    clock.t_s = 1100.0
+    assert (scan.stopped_s, scan.lines_done(1100.0), rig.busy(1100.0)) == (1001.2, 2, False)
+    assert np.isnan(scan.channels(1100.0)["Height"][1]).all(axis=1).tolist() == [False] * 2 + [True] * 6
+
+
+def test_stopping_a_scan_that_is_over_changes_nothing(rig: Rig, clock: Any) -> None:
+    scan = rig.start_scan()
+    clock.t_s = 1010.0
+    rig.stop_scan()
+    assert (scan.stopped_s, scan.end_s, scan.lines_done(1010.0)) == (None, 1004.0, 8)
+
+
+def test_a_pause_puts_the_end_off(rig: Rig) -> None:
+    scan = rig.start_scan()
+    scan.pause(1001.0)
+    assert scan.running(1500.0)
+    assert scan.lines_done(1500.0) == 2
+    assert rig.next_change_s(1500.0) is None
+    scan.resume(1501.0)
+    assert (scan.end_s, scan.lines_done(1501.5)) == (1504.0, 3)
+    assert np.isfinite(scan.channels(1501.5)["Height"][1]).all(axis=1).sum() == 3
+
+
+def test_what_can_not_be_scanned_is_refused_at_once(rig: Rig) -> None:
+    rig.line_s = 0.0
+    with pytest.raises(InvalidValue, match="line"):
+        rig.start_scan()
+    assert not rig.busy(1000.0)
+
+
+def test_one_thing_at_a_time(rig: Rig) -> None:
+    rig.start_scan()
+    for other in (rig.start_scan, rig.engage, lambda: rig.start_spectrum("IV"), lambda: rig.move_probe((0, 0))):
+        with pytest.raises(RigBusy, match="scan"):
+            other()
+
+
+def test_a_move_takes_as_long_as_the_way_is(rig: Rig, clock: Any) -> None:
+    rig.move_speed_m_s = 1e-6
+    rig.move_probe((3e-6, 4e-6))
+    clock.t_s = 1002.5
+    assert rig.probe_at(1002.5) == pytest.approx((1.5e-6, 2e-6))
+    rig.move_probe((1.5e-6, 0.0))  # on its way it is sent elsewhere
+    assert rig.next_change_s(1002.5) == pytest.approx(1004.5)
+    assert rig.probe_at(1005.0) == (1.5e-6, 0.0)
+    assert not rig.busy(1005.0)
+
+
+def test_a_move_can_be_stopped_on_the_way(rig: Rig, clock: Any) -> None:
+    rig.move_speed_m_s = 1e-6
+    rig.move_probe((4e-6, 0.0))
+    clock.t_s = 1001.0
+    rig.stop_move()
+    assert rig.probe_m == pytest.approx((1e-6, 0.0))
+    assert not rig.busy(1001.0)
+
+
+def test_a_spectrum_is_taken_where_the_probe_is(rig: Rig, clock: Any) -> None:
+    rig.move_probe((1e-7, 0.0))
+    clock.t_s += 1.0
+    spectrum = rig.start_spectrum("IV")
+    assert spectrum.position_m == (1e-7, 0.0)
+    assert spectrum.values.shape == (256, len(spectrum.names))
+    assert rig.doing(1002.9) == "spectrum"
+    assert not rig.busy(spectrum.end_s)
+    assert spectrum.end_s == 1003.0
+
+
+def test_in_air_everything_can_be_done_and_all_is_noise(rig: Rig, clock: Any) -> None:
+    rig.withdraw()
+    assert rig.doing(1000.5) == "approach"
+    clock.t_s = 1001.0
+    in_air = rig.start_scan()
+    assert in_air.channels().keys() == rig.channels.keys()
+    assert np.abs(in_air.channels()["Height"][1]).max() < 1e-10
+    assert np.isnan(in_air.channels(1003.0)["Height"][1]).all(axis=1).tolist() == [False] * 4 + [True] * 4
+    clock.t_s = 1100.0
+    curve = rig.start_spectrum("IV")
+    assert np.ptp(curve.values[:, 0]) == pytest.approx(3.0)  # the sweep goes on
+    assert np.abs(curve.values[:, 1]).max() < 1e-13
+    clock.t_s = 1200.0
+    rig.engage()
+    clock.t_s = 1300.0
+    assert np.ptp(rig.start_scan().channels()["Height"][1]) > 1e-10
+
+
+def test_withdrawing_ends_whatever_is_going_on(rig: Rig, clock: Any) -> None:
+    scan = rig.start_scan()
+    clock.t_s = 1001.0
+    rig.withdraw()
+    assert scan.stopped_s == 1001.0
+    assert rig.doing(1001.5) == "approach"
+
+
+def test_the_tip_goes_to_and_fro_along_a_turned_line(rig: Rig) -> None:
+    rig.region = Region((1e-6, 2e-6), (2e-6, 1e-6), math.pi / 2)
+    rig.start_scan()
+    # turned by 90 degrees the fast axis runs along +y, the slow one along -x
+    assert rig.probe_at(1000.0) == pytest.approx((1.5e-6, 1e-6))
+    assert rig.probe_at(1000.25) == pytest.approx((1.5e-6, 3e-6))
+    assert rig.probe_at(1003.75) == pytest.approx((0.5e-6, 3e-6))
+
+
+def test_pulses_and_crashes_happen_to_the_world(rig: Rig, clock: Any) -> None:
+    assert rig.pulse(8.0, 0.1) in ("cured", "worsened", "unchanged")
+    clock.t_s = 1001.0
+    rig.crash(depth_m=1e-7, speed_m_s=1e-6)
+    assert rig.next_change_s(1001.0) == pytest.approx(1001.2)
+    clock.t_s = 1002.0
+    assert [mark["kind"] for mark in rig.world.truth(1002.0)["marks"]][-1] == "crash"
+
+
+def test_a_picture_drawn_in_the_background_is_the_same_and_wakes_the_emulator(clock: Any) -> None:
+    woken = []
+    at_once, meanwhile = (Rig({}, 3, clock, background=background) for background in (False, True))
+    meanwhile.wake = lambda: woken.append(True)
+    heights = []
+    for rig in (at_once, meanwhile):
+        rig.shape = (8, 16)
+        heights.append(rig.start_scan().channels()["Height"][1])
+    assert np.array_equal(*heights)
+    meanwhile.stop_scan()
+    meanwhile.start_scan().channels()
+    assert woken
