@@ -24,8 +24,8 @@ _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
 _SENT_REMEMBERED = 100
 _UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
-OwnEnd = Callable[[Response, int], Iterable[Effect]]
-"""Told of the answer to a request of the scheduler's own, and of the experiment's time, ns; what follows from it."""
+OwnEnd = Callable[[Response, float, int], Iterable[Effect]]
+"""Told of the answer to a request of the scheduler's own, with now_s and now_ns; what follows from it."""
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 
 
@@ -56,7 +56,7 @@ class Desk:
         self.forwarder = Forwarder(settings.request_timeout_s, settings.patience_s, settings.longest_queue)
         self.guard = Guard(settings.limits)
         self.errands = Errands(self.forwarder, watchdog, codec)
-        self.mover = Mover(self.forwarder, watchdog)
+        self.mover = Mover(watchdog)
         self._once = OnceTable()
         self._codec = codec
         self._watchdog = watchdog
@@ -225,8 +225,12 @@ class Desk:
             return True
         if not self._is_within_limits(event, move, now_ns):
             return True
-        if not self.mover.begin(event, move, now_s):
+        job = self.forwarder.ask_own(move.request, now_s)
+        if job is None:
             return False  # nobody is there to be moved, as the action will be told
+        job.mapped = move
+        self._asked_by_us[job.number] = lambda response, now_s, now_ns: self._moved(job, response, now_s)
+        self.mover.begin(event, job)
         self._once.note(event.name, event.request, Fate.PENDING)
         self.effects.append(self._save())  # with where it is sent: what is told of it is then known after a restart
         return True
@@ -320,17 +324,19 @@ class Desk:
 
     def _own_ended(self, job: Job, end: End, response: Response, now_s: float, now_ns: int) -> None:
         """A request of the scheduler's own came to its end."""
-        if self.mover.owns(job):
-            if (event := self.mover.ended(job, response, now_s)) is not None:
-                self.answer_late(event, response)
-            self.act_when_moved(now_s)
-            return
         if (ended := self._asked_by_us.pop(job.number, None)) is not None:
-            self.effects += ended(response, now_ns)
+            self.effects += ended(response, now_s, now_ns)
             return
         told = self.errands.ended(job, end, response, now_s)
         if told is not None:
             self.effects += [told, self._save()]
+
+    def _moved(self, job: Job, response: Response, now_s: float) -> Iterable[Effect]:
+        """A move before an action was answered."""
+        if (event := self.mover.ended(job, response, now_s)) is not None:
+            self.answer_late(event, response)
+        self.act_when_moved(now_s)
+        return ()
 
     def answer_late(self, event: RequestIn, response: Response) -> None:
         """Answer an action that waited for a move, and was not sent."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from afspm.logic.events import RequestIn
-from afspm.logic.forwarding import Forwarder, Job
-from afspm.logic.frame import Mapped
+from afspm.logic.forwarding import Job
 from afspm.logic.watchdog import Watchdog
 from afspm.model import Response, ScopeState
 
@@ -25,10 +24,9 @@ class _Waiting:
 
 
 class Mover:
-    """Sends the move before the action; the owner reports how that ended, and sends the action when it is `ready`."""
+    """Knows the action that waits; the owner sends the move and reports its end, and the action when it is `ready`."""
 
-    def __init__(self, forwarder: Forwarder, watchdog: Watchdog) -> None:
-        self._forwarder = forwarder
+    def __init__(self, watchdog: Watchdog) -> None:
         self._watchdog = watchdog
         self._waiting: _Waiting | None = None
 
@@ -36,17 +34,12 @@ class Mover:
     def busy(self) -> bool:
         return self._waiting is not None
 
-    def begin(self, event: RequestIn, move: Mapped, now_s: float) -> bool:
-        """Send a move; False: the microscope can't be asked."""
-        job = self._forwarder.ask_own(move.request, now_s)
-        if job is None:
-            return False
-        job.mapped = move
+    def begin(self, event: RequestIn, job: Job) -> None:
+        """An action waits for a move that has been sent."""
         self._waiting = _Waiting(event, job, self._watchdog.states_seen)
-        return True
 
     def ended(self, job: Job, response: Response, now_s: float) -> RequestIn | None:
-        """A request of the scheduler's own was answered. Returns the action that can't be done for it."""
+        """A move was answered. Returns the action that can't be done, since it failed."""
         waiting = self._waiting
         if waiting is None or job is not waiting.job:
             return None
@@ -76,9 +69,6 @@ class Mover:
             return None
         event, self._waiting = self._waiting.event, None
         return event
-
-    def owns(self, job: Job) -> bool:
-        return self._waiting is not None and job is self._waiting.job
 
     def due_s(self) -> float | None:
         """When, in real time, `ready` is to be looked at; before that the forwarder watches over the move."""

@@ -115,7 +115,7 @@ class Consequences:
         return Request(int(ControlRequest.PARAM), parameter, self._codec.encode_parameter(parameter))
 
     def _answered(self, axis: str, total_m_s: list[float]) -> OwnEnd:
-        def ended(response: Response, now_ns: int) -> list[Effect]:
+        def ended(response: Response, now_s: float, now_ns: int) -> list[Effect]:
             if not response.ok:
                 return [Log("ERROR", f"the controller does not take the rate of the drift, {axis}: {response.reason}")]
             self._accepted[axis] = now_ns * 1e-9

@@ -364,7 +364,7 @@ class DriftCore:
         """In which direction it scans, where it tells."""
         parameter = Parameter(names.SCAN_DIRECTION)
         request = Request(int(ControlRequest.PARAM), parameter, self._codec.encode_parameter(parameter))
-        return self.core.ask_own(request, now_s, lambda response, now_ns: ())
+        return self.core.ask_own(request, now_s, lambda response, now_s, now_ns: ())
 
 
 def scan_key(scan: Scan, packet: Packet) -> str:

@@ -52,7 +52,7 @@ class Store:
         if self.path is None or not self.path.exists():
             return None
         try:
-            with np.load(self.path, allow_pickle=False) as arrays:
+            with self.path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 state = json.loads(arrays[_JSON].tobytes())
                 found: dict[str, Any] = _with_arrays(state, arrays)
         except Exception as error:  # a damaged file makes numpy raise whatever it likes

@@ -1,0 +1,252 @@
+"""A drift compensated core to talk to, over the real wire format, with a worker that the test plays."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from afspm import wire
+from afspm.drift.mapping import Mapping
+from afspm.drift.trackers.paper import PaperForecast
+from afspm.logic.events import (
+    Connected,
+    Effect,
+    Forward,
+    Input,
+    PacketIn,
+    Publish,
+    Reply,
+    RequestIn,
+    SaveState,
+    TranslatorCaughtUp,
+    TranslatorReply,
+    TranslatorUp,
+)
+from afspm.logic.limits import Limits
+from afspm.logic.settings import SchedulerSettings
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    Parameter,
+    PositionChange,
+    ProbePosition,
+    Region,
+    Request,
+    Response,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
+)
+from afspm.scheduler.drift.codec import DriftWireCodec
+from afspm.scheduler.drift.core import DriftCore
+from afspm.scheduler.drift.settings import DriftSettings
+from afspm.scheduler.drift.told import Forecasted, Registered, ScanJob, WorkerSaid
+from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as ProbePositionMessage
+
+NS = 10**9
+START_S = 1_750_000_000.0
+HERE = Region((0.0, 0.0), (2e-6, 2e-6))
+SHAPE = (128, 128)
+
+
+class FakeWorker:
+    """Remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.starts = 0
+        self.jobs: list[ScanJob] = []
+        self.velocities: list[tuple[float, tuple[float, float]]] = []
+
+    def start(self) -> None:
+        self.starts += 1
+
+    def register(self, job: ScanJob) -> None:
+        self.jobs.append(job)
+
+    def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
+        self.velocities.append((time_s, velocity_m_s))
+
+
+def forecast(
+    drift_m: tuple[float, float] = (0.0, 0.0),
+    rate_m_s: tuple[float, float] = (0.0, 0.0),
+    *,
+    at_s: float = START_S,
+    angle_rad: float = 0.0,
+    rate_sd_m_s: float = 0.0,
+) -> dict[str, Any]:
+    """A forecast of a sample that has moved by `drift_m` at a time, and moves on; turned, if wanted, about (0, 0)."""
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    linear = np.array([[cos, -sin], [sin, cos]])
+    step = np.zeros((3, 3))
+    step[:2, 2] = -np.array(rate_m_s)
+    covariance = np.eye(2) * rate_sd_m_s**2
+    return PaperForecast(
+        at_s, Mapping.of(linear, -np.array(drift_m)).matrix, step, np.zeros((2, 2)), covariance
+    ).to_dict()
+
+
+def registered(job: ScanJob, plain: dict[str, Any], *, lost: bool = False, rescan: str = "") -> Registered:
+    """What a worker says that knows this forecast."""
+    middle_s = (job.start_s + job.end_s) / 2
+    there = PaperForecast.from_dict(plain).at(middle_s)
+    zero = [[0.0, 0.0], [0.0, 0.0]]
+    return Registered(
+        key=job.key,
+        time_s=middle_s,
+        matrix=there.mapping.matrix.tolist(),
+        covariance_m2=zero,
+        rate_m_s=there.rate_m_s.tolist(),
+        rate_covariance=zero,
+        matched=not lost,
+        lost=lost,
+        reason="nothing is alike" if lost else "",
+        residual_m=[0.0, 0.0],
+        references=[],
+        rescan=rescan,
+        forecast=plain,
+    )
+
+
+def position_message(change: PositionChange) -> ProbePositionMessage:
+    """Half a position, as a peer may ask for it."""
+    message = ProbePositionMessage(units="m")
+    if change.x_m is not None:
+        message.point.x = change.x_m
+    if change.y_m is not None:
+        message.point.y = change.y_m
+    return message
+
+
+class Lab:
+    """A core, what it has done, and short ways to make things happen. Real and experiment time pass alike."""
+
+    def __init__(
+        self,
+        drift: DriftSettings | None = None,
+        limits: Limits | None = None,
+        *,
+        state: dict[str, Any] | None = None,
+        now_s: float = START_S,
+    ) -> None:
+        self.worker = FakeWorker()
+        self.now_s = now_s
+        settings = SchedulerSettings(limits=limits or Limits())
+        self.core = DriftCore(settings, drift or DriftSettings(), DriftWireCodec(), self.worker, "scheduler")
+        if state is not None:
+            self.core.restore(state)
+        self.effects: list[Effect] = []
+        self.asked = 0
+        self.connections: dict[str, int] = {}
+        self.done(self.core.start(self.now_s, self.now_ns))
+        self.step(TranslatorUp())
+        self.step(TranslatorCaughtUp())
+        while forwards := self.forwards():  # one is asked after the other
+            for forward in forwards:
+                self.answer(forward, ControlResponse.PARAM_NOT_SUPPORTED)
+        self.effects.clear()
+
+    @property
+    def now_ns(self) -> int:
+        return round(self.now_s * NS)
+
+    def done(self, effects: list[Effect]) -> list[Effect]:
+        self.effects += effects
+        return effects
+
+    def step(self, event: Input) -> list[Effect]:
+        return self.done(self.core.step(event, self.now_s, self.now_ns))
+
+    def knows(self, plain: dict[str, Any]) -> None:
+        """The worker has this forecast."""
+        self.says(Forecasted(plain))
+
+    def says(self, said: WorkerSaid) -> list[Effect]:
+        """The worker says something."""
+        return self.done(self.core.said(said, self.now_s, self.now_ns))
+
+    # --- components ---
+
+    def ask(self, kind: ControlRequest, subject: Any = None, *, id_: str = "", name: str = "series") -> list[Effect]:
+        if name not in self.connections:
+            self.connections[name] = len(self.connections) + 1
+            self.step(Connected(self.connections[name]))
+        self.asked += 1
+        id_ = id_ or f"{name}/life/{self.asked}"
+        if isinstance(subject, PositionChange):
+            subject = position_message(subject)
+        frames = wire.encode_request(Request(int(kind), subject, id=id_))
+        return self.step(RequestIn(self.connections[name], name, wire.decode_request(frames)))
+
+    def take_control(self, name: str = "series") -> None:
+        self.ask(ControlRequest.REQUEST_CTRL, 0, name=name)
+
+    # --- the microscope ---
+
+    def forwards(self) -> list[Forward]:
+        """What was sent to the translator since this was called last."""
+        found = [effect for effect in self.effects if isinstance(effect, Forward)]
+        self.effects = [effect for effect in self.effects if not isinstance(effect, Forward)]
+        return found
+
+    def sent(self) -> Forward:
+        """The one request that was sent."""
+        (one,) = self.forwards()
+        return one
+
+    def answer(
+        self, forward: Forward, code: ControlResponse = ControlResponse.SUCCESS, told: Parameter | None = None
+    ) -> list[Effect]:
+        payload = b"" if told is None else wire.encode(told)[1]
+        response = Response(int(code), payload, "" if code is ControlResponse.SUCCESS else "no", forward.request.id)
+        return self.step(TranslatorReply(forward.number, response))
+
+    def publish(self, thing: Any, time_s: float | None = None) -> list[Effect]:
+        """The translator publishes something."""
+        self.now_s += 1e-3
+        name, payload = wire.encode(thing)
+        time_ns = self.now_ns if time_s is None else round(time_s * NS)
+        return self.step(PacketIn(Packet(name, payload, time_ns), wire.header(name, payload)))
+
+    def scope_is(self, state: ScopeState) -> list[Effect]:
+        return self.publish(ScopeStatus(state))
+
+    def in_force(self, region: Region = HERE, probe: tuple[float, float] = (0.0, 0.0)) -> None:
+        """What a translator publishes at its start."""
+        self.publish(ScanParameters(region, SHAPE))
+        self.publish(ProbePosition(probe))
+        self.scope_is(ScopeState.FREE)
+        self.effects.clear()
+
+    def scan(
+        self, region: Region = HERE, *, duration_s: float = 256.0, channels: tuple[str, ...] = ("Height",)
+    ) -> None:
+        """A whole scan."""
+        self.scope_is(ScopeState.SCANNING)
+        self.now_s += duration_s
+        end_ns = self.now_ns
+        for channel in channels:
+            unit = "m" if channel.startswith("Height") else "V"
+            self.publish(Scan(region, channel, unit, np.ones(SHAPE), end_ns, f"{end_ns}.nc"))
+        self.scope_is(ScopeState.FREE)
+
+    # --- what came of it ---
+
+    def published(self, prefix: str = "") -> list[Any]:
+        """What was published since the effects were cleared, decoded."""
+        packets = [e.packet for e in self.effects if isinstance(e, Publish) and e.packet.envelope.startswith(prefix)]
+        return [wire.decode(wire.message_of(packet.envelope), packet.payload) for packet in packets]
+
+    def envelopes(self) -> list[str]:
+        return [effect.packet.envelope for effect in self.effects if isinstance(effect, Publish)]
+
+    def replies(self) -> list[Response]:
+        return [effect.response for effect in self.effects if isinstance(effect, Reply)]
+
+    def saved(self) -> dict[str, Any]:
+        """What was saved last."""
+        return [effect.state for effect in self.effects if isinstance(effect, SaveState)][-1]

@@ -1,0 +1,370 @@
+"""Scans wait until they are registered, whatever the worker does; and what is done about what they tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drift_lab import HERE, NS, SHAPE, Lab, forecast, registered
+
+from afspm import wire
+from afspm.logic.events import Log, PacketIn, Publish, RequestIn, Tick, TranslatorCaughtUp
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    Parameter,
+    Problem,
+    Request,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+    names,
+)
+from afspm.scheduler.drift.settings import Compensate, DriftSettings
+from afspm.scheduler.drift.told import NotRegistered, WorkerGone
+
+DRIFT = (100e-9, -50e-9)
+BACK = (-100e-9, 50e-9)
+MOST_ENDS = 4
+
+
+@pytest.fixture
+def lab() -> Lab:
+    made = Lab()
+    made.in_force()
+    return made
+
+
+def centers(lab: Lab) -> list[tuple[float, float]]:
+    return [scan.region.center_m for scan in lab.published("Scan2d")]
+
+
+def logged(lab: Lab, level: str) -> list[str]:
+    return [effect.text for effect in lab.effects if isinstance(effect, Log) and effect.level == level]
+
+
+def test_all_channels_of_a_scan_wait_for_it_and_get_the_same_mapping(lab: Lab) -> None:
+    lab.scan(channels=("Amplitude", "Height", "Height Retrace"))
+    assert lab.envelopes() == ["ScopeStateMsg"]  # SCANNING
+    (job,) = lab.worker.jobs
+    assert job.scan.channel == "Height"
+    lab.says(registered(job, forecast(DRIFT)))
+    assert centers(lab) == [pytest.approx(BACK, abs=1e-16)] * 3
+    assert [e.split("_")[0] for e in lab.envelopes()[1:]] == ["DriftMapping", *["Scan2d"] * 3, "ScopeStateMsg"]
+    np.testing.assert_array_equal(lab.published("Scan2d")[0].values, np.ones(SHAPE))
+
+
+def test_the_middle_of_a_scan_is_between_its_beginning_and_its_own_end(lab: Lab) -> None:
+    """However late its file comes."""
+    lab.scope_is(ScopeState.SCANNING)
+    began_s = lab.now_s
+    end_s = began_s + 200.0
+    lab.now_s += 500.0
+    lab.publish(Scan(HERE, "Height", "m", np.ones(SHAPE), round(end_s * NS), "late.nc"))
+    (job,) = lab.worker.jobs
+    assert (job.start_s, job.end_s) == pytest.approx((began_s, end_s), abs=1e-6)
+
+
+def test_what_comes_after_a_scan_waits_in_order(lab: Lab) -> None:
+    lab.scan()
+    lab.scan()
+    assert len(lab.worker.jobs) == 1  # one after the other
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
+    assert len(lab.worker.jobs) == 2
+    lab.says(registered(lab.worker.jobs[1], forecast(DRIFT)))
+    states = [told.state for told in lab.published("ScopeStateMsg")]
+    assert states == [ScopeState.SCANNING, ScopeState.FREE] * 2
+    assert len(lab.published("Scan2d")) == 2
+
+
+def test_requests_do_not_wait_for_a_scan(lab: Lab) -> None:
+    lab.scan()
+    lab.take_control()
+    assert lab.replies()[-1].code == ControlResponse.SUCCESS
+
+
+def test_a_scan_without_the_channel_goes_out_as_predicted_at_its_end(lab: Lab) -> None:
+    lab.knows(forecast(DRIFT))
+    lab.scan(channels=("Amplitude", "Phase"))
+    assert centers(lab) == [pytest.approx(BACK, abs=1e-16)] * 2
+    assert not lab.worker.jobs
+    assert "can't be seen" in logged(lab, "WARNING")[0]
+
+
+def test_the_channel_may_be_said() -> None:
+    lab = Lab(DriftSettings(channel="Amplitude"))
+    lab.in_force()
+    lab.scan(channels=("Height", "Amplitude"))
+    assert lab.worker.jobs[0].scan.channel == "Amplitude"
+
+
+def test_a_scan_that_takes_too_long_goes_out_as_predicted_and_the_worker_is_started_anew(lab: Lab) -> None:
+    lab.knows(forecast(DRIFT))
+    lab.scan()
+    lab.now_s = lab.core.deadline_s() or 0.0
+    lab.step(Tick())
+    assert centers(lab) == [pytest.approx(BACK, abs=1e-16)]
+    assert lab.worker.starts == 2
+    assert "30 s" in logged(lab, "ERROR")[0]
+    # and what that worker still says of the scan is of no use
+    lab.says(registered(lab.worker.jobs[0], forecast((1e-6, 0.0))))
+    assert len(centers(lab)) == 1
+
+
+def test_before_its_deadline_nothing_is_given_up(lab: Lab) -> None:
+    lab.scan()
+    lab.now_s += 29.0
+    lab.step(Tick())
+    assert not centers(lab)
+
+
+def test_a_worker_that_ends_over_a_scan_is_started_again_and_tries_it_once_more(lab: Lab) -> None:
+    lab.scan()
+    lab.says(WorkerGone("killed"))
+    assert lab.worker.starts == 2
+    assert [job.key for job in lab.worker.jobs] == [lab.worker.jobs[0].key] * 2
+    assert not centers(lab)
+    lab.says(WorkerGone("killed again"))
+    assert len(centers(lab)) == 1
+
+
+def test_a_worker_that_ends_whenever_it_is_started_is_left_alone_and_nothing_waits_for_it(lab: Lab) -> None:
+    for _ in range(MOST_ENDS):
+        lab.says(WorkerGone("no such estimator"))
+    assert lab.worker.starts == MOST_ENDS
+    assert "no such estimator" in logged(lab, "CRITICAL")[0]
+    lab.scan()
+    assert len(centers(lab)) == 1
+
+
+def test_a_scan_that_can_not_be_registered_goes_out_as_predicted(lab: Lab) -> None:
+    lab.knows(forecast(DRIFT))
+    lab.scan()
+    lab.says(NotRegistered(lab.worker.jobs[0].key, "ZeroDivisionError: oh"))
+    assert centers(lab) == [pytest.approx(BACK, abs=1e-16)]
+    assert "oh" in logged(lab, "ERROR")[0]
+
+
+def test_a_scan_that_comes_again_has_the_same_mapping_and_is_not_registered_again(lab: Lab) -> None:
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
+    published = lab.published("Scan2d")[0]
+    again = Lab(state=lab.saved())
+    again.knows(forecast((1e-6, 1e-6)))
+    again.effects.clear()
+    name, payload = wire.encode(lab.worker.jobs[0].scan)
+    time_ns = next(
+        e.source_ns for e in lab.effects if isinstance(e, Publish) and e.packet.envelope.startswith("Scan2d")
+    )
+    again.step(PacketIn(Packet(name, payload, time_ns), wire.header(name, payload)))
+    assert again.published("Scan2d")[0].region == published.region
+    assert not again.worker.jobs
+
+
+def test_it_is_saved_before_it_is_published(lab: Lab) -> None:
+    lab.scan()
+    lab.effects.clear()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
+    kinds = [type(effect).__name__ for effect in lab.effects]
+    assert kinds.index("SaveState") < kinds.index("Publish")
+    beside = lab.saved()["frame"]["beside"]
+    assert beside["knowledge"]["forecast"] == forecast(DRIFT)
+    assert beside["scans"][0][0] == lab.worker.jobs[0].key
+
+
+def test_a_restarted_scheduler_announces_itself_after_the_scans_that_wait(lab: Lab) -> None:
+    lab.take_control()
+    state = lab.saved()
+    again = Lab(state=state)
+    again.core = type(again.core)(again.core.core._settings, again.core._settings, again.core._codec, again.worker, "s")
+    again.core.restore(state)
+    again.effects.clear()
+    again.done(again.core.start(again.now_s, again.now_ns))
+    again.scan()
+    again.step(TranslatorCaughtUp())
+    assert "ControlState" not in again.envelopes()
+    again.says(registered(again.worker.jobs[0], forecast()))
+    assert [e.split("_")[0] for e in again.envelopes()][-3:] == ["Scan2d", "ScopeStateMsg", "ControlState"]
+
+
+def test_what_was_measured_is_published_before_the_end(lab: Lab) -> None:
+    lab.scan()
+    lab.ask(ControlRequest.END_EXPERIMENT)
+    kinds = [type(effect).__name__ for effect in lab.effects]
+    assert len(centers(lab)) == 1
+    assert kinds.index("Kill") > max(i for i, kind in enumerate(kinds) if kind == "Publish")
+
+
+def test_a_mapping_is_told_with_all_that_is_known_of_it(lab: Lab) -> None:
+    lab.scan()
+    (job,) = lab.worker.jobs
+    lab.says(registered(job, forecast(DRIFT, (1e-12, 2e-12)), rescan="too far"))
+    (told,) = lab.published("DriftMapping")
+    assert told.timestamp.ToNanoseconds() == pytest.approx((job.start_s + job.end_s) / 2 * NS, abs=NS / 1000)
+    assert (told.filename, told.matched, told.lost, told.correcting) == (job.scan.filename, True, False, True)
+    assert told.rescan == "too far"
+    assert list(told.rate) == pytest.approx([1e-12, 2e-12])
+    matrix = np.array(told.matrix).reshape(2, 3)
+    np.testing.assert_array_equal(matrix[:, :2], np.eye(2))
+    assert [len(part) for part in (told.covariance, told.rate_covariance, told.residual, told.center)] == [4, 4, 2, 2]
+
+
+# --- directions ---
+
+
+def set_direction(lab: Lab, direction: str) -> None:
+    lab.take_control()
+    lab.forwards()
+    lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_DIRECTION, direction))
+    lab.answer(lab.sent(), told=Parameter(names.SCAN_DIRECTION, direction))
+
+
+@pytest.mark.parametrize(("direction", "upwards"), [("up", True), ("down", False), ("sideways", None)])
+def test_the_direction_of_a_scan_is_that_in_force_when_it_began(lab: Lab, direction: str, upwards: bool | None) -> None:
+    set_direction(lab, direction)
+    lab.scope_is(ScopeState.SCANNING)
+    set_direction(lab, "down" if upwards else "up")
+    lab.now_s += 100.0
+    lab.publish(Scan(HERE, "Height", "m", np.ones(SHAPE), lab.now_ns, "a.nc"))
+    assert lab.worker.jobs[0].upwards is upwards
+
+
+# --- what follows ---
+
+
+def rescans(lab: Lab) -> list[tuple[int, str]]:
+    return [(told.kind, told.reason) for told in lab.published("DriftRescan")]
+
+
+def problems(lab: Lab) -> tuple[int, ...]:
+    return lab.core.control_state.problems
+
+
+def test_a_scan_too_far_off_is_wanted_again_where_it_was_asked_for(lab: Lab) -> None:
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), rescan="too far off"))
+    assert rescans(lab) == [(1, "too far off")]
+    told = lab.published("DriftRescan")[0]
+    wanted = wire.decode("ScanParameters2d", told.params.SerializeToString())
+    assert wanted.region == HERE
+    assert wanted.shape == SHAPE
+    assert lab.envelopes()[-1] == "DriftRescan"  # after the scan itself
+    assert not problems(lab)
+
+
+def test_lost_is_flagged_and_a_search_wanted_and_found_is_cleared(lab: Lab) -> None:
+    lab.take_control()
+    lab.scan()
+    lab.effects.clear()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), lost=True))
+    assert problems(lab) == (Problem.THERMAL_DRIFT,)
+    assert lab.core.control.holder is None
+    assert rescans(lab)[0][0] == 3
+    assert not [f.request.subject for f in lab.forwards() if f.request.kind == ControlRequest.ACTION]  # none to stop
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[1], forecast(DRIFT)))
+    assert not problems(lab)
+
+
+def test_who_searches_puts_its_region_back_before_the_flag_goes(lab: Lab) -> None:
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), lost=True))
+    lab.ask(ControlRequest.REQUEST_CTRL, int(Problem.THERMAL_DRIFT), name="rescanner")
+    assert lab.core.control.holder == "rescanner"
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[1], forecast(DRIFT)))
+    assert problems(lab) == (Problem.THERMAL_DRIFT,)
+    lab.ask(ControlRequest.RMV_EXP_PRBLM, int(Problem.THERMAL_DRIFT), name="rescanner")
+    assert not problems(lab)
+
+
+def test_a_flag_of_somebody_else_is_not_touched(lab: Lab) -> None:
+    lab.ask(ControlRequest.ADD_EXP_PRBLM, int(Problem.THERMAL_DRIFT), name="somebody")
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
+    assert problems(lab) == (Problem.THERMAL_DRIFT,)
+
+
+def test_at_the_start_the_first_scan_is_wanted_in_the_other_direction() -> None:
+    lab = Lab(DriftSettings(at_start="up-down"))
+    lab.in_force()
+    set_direction(lab, "up")
+    lab.scan()
+    lab.effects.clear()
+    lab.says(registered(lab.worker.jobs[0], forecast()))
+    (told,) = lab.published("DriftRescan")
+    assert (told.kind, told.upwards) == (2, False)
+    assert problems(lab) == (Problem.THERMAL_DRIFT,)
+    again = Lab(DriftSettings(at_start="up-down"), state=lab.saved())
+    again.scan()
+    again.effects.clear()
+    again.says(registered(again.worker.jobs[0], forecast()))
+    assert not again.published("DriftRescan")  # once in an experiment
+
+
+def test_a_microscope_that_tells_no_direction_is_not_waited_for() -> None:
+    lab = Lab(DriftSettings(at_start="up-down"))
+    lab.in_force()
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast()))
+    assert not problems(lab)
+    assert names.SCAN_DIRECTION in logged(lab, "WARNING")[0]
+
+
+def test_without_correction_drift_is_told_and_nothing_is_done_about_it() -> None:
+    lab = Lab(DriftSettings(correct=False, at_start="up-down"))
+    lab.in_force()
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), lost=True, rescan="far off"))
+    assert centers(lab) == [HERE.center_m]
+    assert not lab.published("DriftMapping")[0].correcting
+    assert not lab.published("DriftRescan")
+    assert not problems(lab)
+
+
+# --- a controller that compensates by itself ---
+
+
+def test_a_rate_that_is_known_is_handed_over_and_the_worker_hears_since_when() -> None:
+    lab = Lab(DriftSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
+    lab.in_force()
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT, (1e-10, -2e-10), at_s=lab.now_s, rate_sd_m_s=1e-11)))
+    first = lab.sent()
+    assert first.request.subject == Parameter("x-rate-x", "1e-10", "m/s")
+    lab.answer(first)
+    second = lab.sent()
+    assert second.request.subject == Parameter("x-rate-y", "-2e-10", "m/s")
+    lab.answer(second)
+    (velocity,) = lab.worker.velocities
+    assert velocity == (pytest.approx(lab.now_s), (1e-10, -2e-10))
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[1], forecast(DRIFT, (1e-12, 0.0), at_s=lab.now_s, rate_sd_m_s=1e-11)))
+    assert not lab.forwards()  # what is left is not known to be anything
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[2], forecast(DRIFT, (5e-11, 0.0), at_s=lab.now_s, rate_sd_m_s=1e-11)))
+    assert lab.sent().request.subject == Parameter("x-rate-x", "1.5e-10", "m/s")
+
+
+def test_a_controller_that_does_not_take_the_rate_is_told_of() -> None:
+    lab = Lab(DriftSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
+    lab.in_force()
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT, (1e-10, -2e-10), at_s=lab.now_s)))
+    lab.answer(lab.sent(), ControlResponse.PARAM_NOT_SUPPORTED)
+    assert "x-rate-x" in logged(lab, "ERROR")[0]
+    lab.answer(lab.sent())
+    assert not lab.worker.velocities
+
+
+def test_a_packet_that_is_no_scan_is_passed_on_as_it_is(lab: Lab) -> None:
+    lab.step(PacketIn(Packet("Scan2d", b"\x0a\x00", lab.now_ns), wire.header("Scan2d", b"\x0a\x00")))
+    assert not lab.worker.jobs
+    lab.publish(ScopeStatus(ScopeState.FREE))
+    assert "ScopeStateMsg" in lab.envelopes()
+
+
+def test_the_plain_scheduler_s_answers_are_the_same(lab: Lab) -> None:
+    """A drop-in: what is not about places is decided by the same core."""
+    lab.step(RequestIn(99, "stranger", Request(int(ControlRequest.ACTION), names.START_SCAN, b"", "stranger/1/1")))
+    assert lab.replies()[-1].code == ControlResponse.NOT_IN_CONTROL

@@ -1,0 +1,237 @@
+"""The worker: what it knows survives a kill, and what a user's own estimator does stays in there."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drift_parts import Brightest
+
+from afspm.drift.registration import DriftScan
+from afspm.drift.trackers import tracker
+from afspm.errors import ConfigError, FileError
+from afspm.model import Frame, Region, Scan
+from afspm.scheduler.drift.estimation import Estimation
+from afspm.scheduler.drift.registrar import Registrar
+from afspm.scheduler.drift.settings import DriftSettings, RescanRule
+from afspm.scheduler.drift.store import Store
+from afspm.scheduler.drift.told import Forecasted, NotRegistered, Registered, ScanJob, WorkerGone, WorkerSaid
+
+DEADLINE_S = 30.0
+HERE = Region((0.0, 0.0), (63e-9, 63e-9))
+
+
+def picture(x: int, y: int) -> np.ndarray:
+    values = np.zeros((64, 64))
+    values[y, x] = 1.0
+    return values
+
+
+def job(number: int, x: int, y: int, asked: Region | None = None) -> ScanJob:
+    scan = Scan(HERE, "Height", "m", picture(x, y), None, f"{number}.nc")
+    return ScanJob(f"{number}.nc 0", scan, number * 100.0, number * 100.0 + 50.0, None, asked)
+
+
+def drift_scan(number: int, x: int, y: int) -> DriftScan:
+    return DriftScan(picture(x, y), HERE, number * 100.0, number * 100.0 + 50.0, None, f"{number}.nc 0")
+
+
+def estimation(store: Store, rule: RescanRule | None = None) -> Estimation:
+    made = Estimation(tracker("paper", Brightest()), rule or RescanRule(), store.save)
+    if (state := store.load()) is not None:
+        made.restore(state)
+    return made
+
+
+# --- what it does ---
+
+
+def test_a_scan_is_answered_again_and_not_taken_twice(tmp_path: Path) -> None:
+    store = Store(tmp_path / "drift.npz")
+    first = estimation(store)
+    first.register(drift_scan(0, 30, 30))
+    answer = first.register(drift_scan(1, 33, 28))
+    np.testing.assert_allclose(np.array(answer.matrix)[:2, 2], [-3e-9, 2e-9], atol=1e-18)
+    assert answer.residual_m == pytest.approx([3e-9, -2e-9])
+    assert answer.references == ["0.nc 0"]
+    second = estimation(store)  # after a kill
+    assert second.register(drift_scan(1, 33, 28)) == answer
+    assert second.forecast == answer.forecast
+    third = estimation(store)
+    assert third.register(drift_scan(2, 36, 26)) == second.register(drift_scan(2, 36, 26))
+
+
+def test_before_the_first_scan_nothing_is_known(tmp_path: Path) -> None:
+    assert estimation(Store(None)).forecast is None
+
+
+@pytest.mark.parametrize(
+    ("rule", "again"),
+    [
+        (RescanRule("tolerance", tolerance=10e-9), True),
+        (RescanRule("tolerance", tolerance=40e-9), False),
+        (RescanRule("tolerance"), True),
+        (RescanRule("paper", f_rescan=0.75), True),
+        (RescanRule("paper", f_rescan=0.5), False),
+        (RescanRule("never"), False),
+    ],
+)
+def test_a_scan_too_far_from_where_it_was_asked_for_is_wanted_again(rule: RescanRule, again: bool) -> None:
+    asked = Region((0.0, 0.0), HERE.size_m, frame=Frame.SAMPLE)
+    made = estimation(Store(None), rule)
+    assert not made.register(drift_scan(0, 20, 20), asked).rescan  # nothing was known before
+    assert bool(made.register(drift_scan(1, 35, 28), asked).rescan) is again
+    assert not made.register(drift_scan(2, 60, 60), None).rescan  # nobody asked for it
+
+
+def test_a_tracker_that_can_not_follow_a_compensation_says_so() -> None:
+    with pytest.raises(ConfigError, match="compensates"):
+        estimation(Store(None)).compensated(0.0, (1e-9, 0.0))
+
+
+# --- on disk ---
+
+
+def test_what_is_stored_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    state = {"a": [1, {"b": np.array([[0.1, np.nan], [-0.0, 1e300]])}], "c": "ü", "d": None, "e": np.float64(0.1)}
+    Store(tmp_path / "deep" / "drift.npz").save(state)
+    found = Store(tmp_path / "deep" / "drift.npz").load()
+    assert found is not None
+    assert found["a"][1]["b"].tobytes() == state["a"][1]["b"].tobytes()  # type: ignore[index]
+    assert (found["a"][0], found["c"], found["d"], found["e"]) == (1, "ü", None, 0.1)
+
+
+def test_nothing_stored_is_no_error_and_damage_is_one(tmp_path: Path) -> None:
+    assert Store(tmp_path / "drift.npz").load() is None
+    (tmp_path / "drift.npz").write_bytes(b"PK\x03\x04 half")
+    with pytest.raises(FileError, match="can't be read"):
+        Store(tmp_path / "drift.npz").load()
+
+
+def test_what_is_stored_is_no_code(tmp_path: Path) -> None:
+    np.savez(tmp_path / "drift.npz", json=np.array([{"x": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(FileError):
+        Store(tmp_path / "drift.npz").load()
+
+
+# --- as a process ---
+
+
+class Heard:
+    """What a worker's process has said, waited for."""
+
+    def __init__(self, registrar: Registrar) -> None:
+        self.registrar = registrar
+        self.all: list[WorkerSaid] = []
+        self._changed = threading.Condition()
+        registrar.wake = self._wake
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def next(self, kind: type[WorkerSaid], count: int = 1) -> WorkerSaid:
+        def found() -> list[WorkerSaid]:
+            self.all += self.registrar.said()
+            return [one for one in self.all if isinstance(one, kind)]
+
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(found()) >= count, DEADLINE_S), self.all
+            return found()[count - 1]
+
+
+@pytest.fixture
+def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Heard]]:
+    """Starts workers with an estimator of `drift_parts`."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    made: list[Registrar] = []
+
+    def start(estimator: str = "Brightest") -> Heard:
+        settings = DriftSettings(estimator=f"drift_parts.{estimator}", tracker="paper")
+        made.append(Registrar(settings, tmp_path / "drift.npz", logging.getLogger("test")))
+        heard = Heard(made[-1])
+        made[-1].start()
+        return heard
+
+    yield start
+    for one in made:
+        one.close()
+
+
+def test_a_user_s_own_estimator_registers_scans(work: Callable[..., Heard]) -> None:
+    heard = work("Talks")
+    assert heard.next(Forecasted) == Forecasted(None)
+    heard.registrar.register(job(0, 30, 30))
+    heard.registrar.register(job(1, 33, 28))
+    answer = heard.next(Registered, 2)
+    assert isinstance(answer, Registered)
+    assert answer.mapping.translation_m == pytest.approx([-3e-9, 2e-9], abs=1e-18)
+
+
+def test_a_worker_that_is_killed_knows_everything_when_it_is_started_again(work: Callable[..., Heard]) -> None:
+    heard = work()
+    heard.registrar.register(job(0, 30, 30))
+    heard.registrar.register(job(1, 33, 28))
+    answer = heard.next(Registered, 2)
+    assert isinstance(answer, Registered)
+    assert heard.registrar._process is not None
+    heard.registrar._process.kill()
+    assert isinstance(heard.next(WorkerGone), WorkerGone)
+    heard.registrar.start()
+    heard.registrar.register(job(1, 33, 28))
+    assert heard.next(Registered, 3) == answer
+    assert Forecasted(answer.forecast) in heard.all
+
+
+def test_an_estimator_that_takes_the_process_with_it_is_told_of(work: Callable[..., Heard]) -> None:
+    heard = work("Dies")
+    heard.registrar.register(job(0, 30, 30))
+    heard.registrar.register(job(1, 33, 28))
+    gone = heard.next(WorkerGone)
+    assert gone == WorkerGone("exit code 7")
+
+
+def test_a_worker_that_hangs_is_killed_by_being_started_anew(work: Callable[..., Heard]) -> None:
+    heard = work("Hangs")
+    heard.registrar.register(job(0, 30, 30))
+    heard.next(Registered)
+    heard.registrar.register(job(1, 33, 28))
+    former = heard.registrar._process
+    assert former is not None
+    heard.registrar.start()
+    assert former.wait(DEADLINE_S) != 0
+    heard.registrar.register(job(0, 30, 30))
+    heard.next(Registered, 2)  # what it had registered it remembers
+    assert not [one for one in heard.all if isinstance(one, WorkerGone)]  # on purpose
+
+
+def test_settings_that_can_not_work_are_the_reason(work: Callable[..., Heard]) -> None:
+    gone = work("NoSuch").next(WorkerGone)
+    assert isinstance(gone, WorkerGone)
+    assert "NoSuch" in gone.reason
+
+
+def test_a_scan_out_of_its_turn_is_refused_and_the_next_is_not(work: Callable[..., Heard]) -> None:
+    heard = work()
+    heard.registrar.register(job(5, 30, 30))
+    heard.registrar.register(job(2, 30, 30))
+    heard.registrar.register(job(6, 31, 30))
+    refused = heard.next(NotRegistered)
+    assert isinstance(refused, NotRegistered)
+    assert refused.key == "2.nc 0"
+    answer = heard.next(Registered, 2)
+    assert isinstance(answer, Registered)
+    assert answer.references == ["5.nc 0"]
+
+
+def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard]) -> None:
+    heard = work()
+    heard.next(Forecasted)
+    process = heard.registrar._process
+    assert process is not None
+    heard.registrar.close()
+    assert process.returncode == 0
