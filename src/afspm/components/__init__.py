@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from afspm.components.drift_pictures import DriftPictures
     from afspm.components.drift_table import DriftTable
     from afspm.components.feedback_analysis import FeedbackAnalysis
     from afspm.components.feedback_tuner import FeedbackTuner
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from afspm.components.tip_corrector import TipCorrector
 
 _MODULES = {
+    "DriftPictures": "drift_pictures",
     "DriftTable": "drift_table",
     "FeedbackAnalysis": "feedback_analysis",
     "FeedbackTuner": "feedback_tuner",
@@ -35,6 +37,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "DriftPictures",
     "DriftTable",
     "FeedbackAnalysis",
     "FeedbackTuner",

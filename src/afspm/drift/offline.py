@@ -48,16 +48,14 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
 
 
 def spread_pairs(record: DriftRecord, apart_s: float, count: int) -> list[tuple[int, int]]:
-    """Indices of matched scans that are about so far apart in time, spread over the run, for the eye."""
+    """Indices of matched scans that are about so far apart in time, spread over the run, for the eye. Of a run that is
+    too short, its ends."""
     good = np.flatnonzero(record.matched)
-    pairs: list[tuple[int, int]] = []
-    for first in good:
-        later = good[good > first]
-        if not len(later):
-            break
-        second = later[np.argmin(np.abs(record.time_s[later] - record.time_s[first] - apart_s))]
-        pairs.append((int(first), int(second)))
-    if not pairs:
+    if len(good) < 2:
         return []
-    even = np.linspace(0, len(pairs) - 1, count).round().astype(int)
-    return [pairs[k] for k in dict.fromkeys(even.tolist())]
+    time_s = record.time_s[good]
+    apart_s = min(apart_s, float(time_s[-1] - time_s[0]))
+    starts = np.flatnonzero(time_s <= time_s[-1] - 0.95 * apart_s)
+    chosen = dict.fromkeys(np.linspace(0, len(starts) - 1, count).round().astype(int).tolist())
+    ends = [int(np.argmin(np.abs(time_s - time_s[start] - apart_s))) for start in starts[list(chosen)]]
+    return [(int(good[start]), int(good[end])) for start, end in zip(starts[list(chosen)], ends, strict=True)]

@@ -1,0 +1,174 @@
+"""`DriftPictures`: what drift did in the night, and how well it was followed, as figures."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+
+from afspm.components.drift_table import DriftTable
+from afspm.errors import AfspmError, FileError
+
+if TYPE_CHECKING:
+    from afspm.drift.figures.album import Part
+    from afspm.drift.record import DriftRecord
+    from afspm.drift.registration import DriftScan, Registration
+
+_ALBUM = "afspm.drift.figures.album"
+
+
+@dataclass(frozen=True)
+class Told:
+    """A scan of the table: its file, and whether components were given sample coordinates when it was told."""
+
+    file: str
+    correcting: bool
+
+
+def parts(told: Sequence[Told]) -> list[tuple[str, int, int]]:
+    """Name, start and stop of the scans without and with correction. The one that was taken while correction was
+    switched on, and may have been asked for before, is in neither."""
+    first_on = next((k for k, one in enumerate(told) if one.correcting), len(told))
+    found = [("off", 0, first_on), ("on", first_on + 1 if first_on else 0, len(told))]
+    return [part for part in found if part[2] > part[1]]
+
+
+class DriftPictures(DriftTable):
+    """Writes the table of `DriftTable`, and when the experiment ends draws the figures of drift in the run folder.
+
+    While the experiment goes on, it compares each scan with the first by itself, once for the scans before correction
+    was switched on and once for those after: what is left of drift then, estimated apart from what the scheduler
+    follows. Where the microscope is simulated, the true errors are drawn too. It reads the files that the microscope
+    saves, and needs matplotlib (`pip install "afspm[plot]"`).
+
+    Args:
+        channel: of the scans that are compared.
+        estimator: that compares them.
+        features: an estimator of matched features, for the figure of those.
+        title: above the figure of the offset.
+        file: the table's name in the run folder.
+    """
+
+    longest_step_s: ClassVar[float] = 60.0
+    period_s = 2.0
+    period_time: Literal["experiment", "real"] = "real"
+
+    def __init__(
+        self,
+        channel: str = "Height",
+        estimator: str = "least-squares",
+        features: str = "brief",
+        title: str = "",
+        file: str = "drift_correction.csv",
+    ) -> None:
+        super().__init__(file)
+        self.channel, self.estimator, self.features, self.title = channel, estimator, features, title
+        self._pairs: dict[tuple[str, str], Registration] = {}
+        self._drawing_is_loaded = False
+
+    def on_tick(self) -> None:
+        if not self._drawing_is_loaded and importlib.util.find_spec("matplotlib"):
+            importlib.import_module(_ALBUM)  # now, when there is time: at the end all must be quick
+        self._drawing_is_loaded = True
+
+    def on_drift_mapping(self, message: Any) -> None:
+        super().on_drift_mapping(message)
+        told = self._told()
+        newest = next(k for k, one in enumerate(told) if one.file == message.filename)
+        for _, start, stop in parts(told):
+            if start < newest < stop:
+                self._compared(told[start], told[newest])
+
+    def on_end(self) -> None:
+        told = self._told()
+        if len(told) < 2:
+            self.log.info("drift of %d scans, no pictures", len(told))
+        elif importlib.util.find_spec("matplotlib") is None:
+            self.log.error('no pictures without matplotlib: pip install "afspm[plot]"; the table is in %s', self.file)
+        else:
+            self._draw(told)
+
+    def _draw(self, told: list[Told]) -> None:
+        from afspm.components.simulated_truth import true_drift
+        from afspm.drift.figures import album
+        from afspm.drift.record import DriftRecord
+
+        folder = Path(self.run_dir)
+        record = DriftRecord.read(folder / self.file)
+        scans = [self._scan(one) for one in told]
+        truth = true_drift(folder) if self.simulated else None
+        run = album.Run(
+            scans=scans,
+            record=record,
+            parts=self._parts(told, record, scans),
+            matched=self._matched(told, scans),
+            truth_m=None if truth is None else truth(np.array([scan.mid_s for scan in scans])),
+        )
+        title = f"{self.title} (simulated)".strip() if self.simulated else self.title
+        for path in album.write(run, folder, title=title):
+            self.log.info("drawn: %s", path)
+
+    def _parts(self, told: list[Told], record: DriftRecord, scans: list[DriftScan]) -> list[Part]:
+        """With what was estimated off-line."""
+        from afspm.drift.figures.album import Part
+        from afspm.drift.offline import against_first
+
+        made = []
+        for name, start, stop in parts(told):
+            pairs = [self._compared(told[start], one) for one in told[start + 1 : stop]]
+            estimates = against_first(record[start:stop], scans[start:stop], pairs)
+            made.append(Part(name, f"correction {name}", start, stop, estimates))
+        return made
+
+    def _matched(self, told: list[Told], scans: list[DriftScan]) -> tuple[int, int, Registration] | None:
+        """The first scan and the last without correction that has features in common with it: drift is seen best."""
+        from afspm.drift.estimators import estimator
+
+        try:
+            by = estimator(self.features)
+        except AfspmError as error:
+            self.log.warning("no picture of features: %s", error)
+            return None
+        without = [k for k, one in enumerate(told) if not one.correcting] or list(range(len(told)))
+        for second in reversed(without[1:]):
+            found = by.register(scans[without[0]], scans[second])
+            if found.accepted:
+                return without[0], second, found
+        return None
+
+    def _compared(self, first: Told, other: Told) -> Registration:
+        """Of two scans, which are compared only once."""
+        from afspm.drift.estimators import estimator
+        from afspm.drift.registration import Registration
+
+        pair = (first.file, other.file)
+        if pair not in self._pairs:
+            try:
+                self._pairs[pair] = estimator(self.estimator).register(self._scan(first), self._scan(other))
+            except FileError as error:
+                self._pairs[pair] = Registration.refused(str(error))
+        return self._pairs[pair]
+
+    def _scan(self, told: Told) -> DriftScan:
+        """As the microscope saved it, in tip coordinates."""
+        from afspm.files import read
+        from afspm.study.recorded import drift_scan
+
+        content = read(told.file)
+        for scan in content.scans:
+            if scan.channel == self.channel:
+                return drift_scan(scan, content)
+        raise FileError(f"has no channel {self.channel!r}", where=told.file)
+
+    def _told(self) -> list[Told]:
+        path = Path(self.run_dir) / self.file
+        if not path.exists():
+            return []
+        with path.open(newline="", encoding="utf-8") as file:
+            return [Told(row["filename"], row["correcting"] == "yes") for row in csv.DictReader(file)]

@@ -1,0 +1,116 @@
+"""The figures of a drifting night, from what was told and what was saved."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runtime_lab import Lab, context_of, run
+
+from afspm import wire
+from afspm.components.drift_pictures import DriftPictures, Told, parts
+from afspm.components.simulated_truth import true_drift
+from afspm.drift.record import DriftRecord
+from afspm.errors import FileError
+from afspm.microscopes.simulator.files import Measured, encode_scan
+from afspm.model import Region
+from afspm.runtime.exit_codes import ExitCode
+from afspm.simulation import World
+
+pytest.importorskip("matplotlib")
+SETTINGS = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (60e-12, -30e-12, 0.0)}}
+PIXELS, EVERY_S, SWITCHED_ON = 48, 600.0, 4
+
+
+def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -> None:
+    told = [Told(str(k), k >= 3) for k in range(6)]
+    assert parts(told) == [("off", 0, 3), ("on", 4, 6)]
+    assert parts([Told("0", True), Told("1", True)]) == [("on", 0, 2)]
+    assert parts([Told("0", False)]) == [("off", 0, 1)]
+    assert parts([]) == []
+
+
+def saved(folder: Path) -> list[tuple[Path, Region, float]]:
+    """Nine scans, from the fourth on in a frame that follows the sample, and what is true of them."""
+    world = World.from_settings(SETTINGS, seed=1, start_s=0.0)
+    (folder / "scans").mkdir()
+    found = []
+    for k in range(9):
+        middle_s = EVERY_S * k + PIXELS / 2
+        x, y, _ = world.drift_m(middle_s) - world.drift_m(PIXELS / 2)
+        region = Region((float(x), float(y)) if k >= SWITCHED_ON else (0.0, 0.0), (1e-6, 1e-6))
+        scan = world.scan(region, (PIXELS, PIXELS), 1.0, EVERY_S * k)
+        path = folder / "scans" / f"scan-{k}.nc"
+        measured = Measured(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
+        path.write_bytes(encode_scan(region, scan.channels(), measured))
+        found.append((path, region, middle_s))
+    start = {"n": 1, "time_s": 0.0, "event": "start", "settings": SETTINGS, "seed": 1}
+    (folder / "truth.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")
+    return found
+
+
+def mapping(path: Path, region: Region, middle_s: float, *, correcting: bool) -> object:
+    """What the scheduler would tell that follows it without an error."""
+    velocity = np.array(SETTINGS["drift"]["velocity_m_per_s"][:2])
+    drift = velocity * (middle_s - PIXELS / 2)
+    message = wire.message_type("DriftMapping")(
+        matrix=[1.0, 0.0, -drift[0], 0.0, 1.0, -drift[1]],
+        covariance=[1e-18, 0.0, 0.0, 1e-18],
+        rate=velocity,
+        rate_covariance=[1e-30, 0.0, 0.0, 1e-30],
+        matched=True,
+        filename=str(path),
+        center=region.center_m,
+        correcting=correcting,
+    )
+    message.timestamp.FromNanoseconds(round(middle_s * 1e9))
+    return message
+
+
+def night(folder: Path) -> Lab:
+    lab = Lab("drift_pictures")
+    for k, one in enumerate(saved(folder)):
+        told = mapping(*one, correcting=k >= SWITCHED_ON)
+        lab.at(100.0 * (k + 1), lambda told=told: lab.publish(told, "DriftMapping"))  # type: ignore[misc]
+    return lab
+
+
+@pytest.mark.timeout(60)
+def test_the_table_and_all_figures_are_there_when_the_experiment_has_ended(tmp_path: Path) -> None:
+    lab = night(tmp_path)
+    lab.at(1500.0, lab.kill)
+    component = DriftPictures(estimator="correlation", features="correlation")
+    assert run(component, lab, tmp_path / "state", run_dir=str(tmp_path), simulated=True) == ExitCode.ENDED
+    assert len(DriftRecord.read(tmp_path / "drift_correction.csv")) == 9
+    drawn = {path.stem for path in tmp_path.glob("*.png")}
+    assert drawn == {
+        "drift_offset", "drift_pairs", "drift_estimates_off", "drift_histogram_off", "drift_estimates_on",
+        "drift_histogram_on", "drift_errors",
+    }  # fmt: skip
+
+
+@pytest.mark.timeout(60)
+def test_a_restart_loses_nothing(tmp_path: Path) -> None:
+    lab = night(tmp_path)
+    lab.at(450.0, lab.parent_goes)
+    DriftPictures(estimator="correlation").run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
+    lab.restart_component()
+    lab.at(1500.0, lab.kill)
+    run(DriftPictures(estimator="correlation"), lab, tmp_path / "state", run_dir=str(tmp_path))
+    record = DriftRecord.read(tmp_path / "drift_correction.csv")
+    assert [Path(key).name for key in record.keys] == [f"scan-{k}.nc" for k in range(9)]
+    assert (tmp_path / "drift_estimates_on.png").exists()
+    assert not (tmp_path / "drift_errors.png").exists(), "the truth is for simulated microscopes"
+
+
+def test_the_truth_is_that_of_the_simulated_world(tmp_path: Path) -> None:
+    assert true_drift(tmp_path) is None
+    saved(tmp_path)
+    truth = true_drift(tmp_path)
+    assert truth is not None
+    np.testing.assert_allclose(truth(np.array([0.0, 100.0])), [(0.0, 0.0), (6e-9, -3e-9)], atol=1e-15)
+    (tmp_path / "truth.jsonl").write_text("{}\n", encoding="utf-8")
+    with pytest.raises(FileError, match="what was simulated"):
+        true_drift(tmp_path)
