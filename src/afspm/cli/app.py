@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from afspm.cli import check, drift, graph, keys, run
+from afspm.cli import check, drift, emulate, graph, keys, run
 
 app = typer.Typer(
     name="afspm",
@@ -18,4 +18,5 @@ app.command("run")(run.run)
 app.command("check")(check.check)
 app.command("graph")(graph.graph)
 app.command("keys")(keys.keys)
+app.command("emulate")(emulate.emulate)
 app.add_typer(drift.app, name="drift")

@@ -108,4 +108,11 @@ SHORT_NAME_PACKAGES: Final[tuple[str, ...]] = (
     "afspm.scheduler",
     "afspm.microscopes",
     "afspm.microscopes.simulator",
+    "afspm.microscopes.image",
+    "afspm.microscopes.nanonis",
+    "afspm.microscopes.asylum",
+    "afspm.microscopes.gxsm",
+    "afspm.emulators.nanonis",
+    "afspm.emulators.asylum",
+    "afspm.emulators.gxsm",
 )

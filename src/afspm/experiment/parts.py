@@ -20,6 +20,8 @@ OWN_KEYS: Final = frozenset(
 )
 SIMULATED = "simulated"
 """For a translator that is a command: whether its microscope is simulated, as a class says by an attribute."""
+EMULATED = "emulated"
+"""An attribute by which a class says that it is the controller, emulated: the translator then talks to it."""
 DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")
 
 

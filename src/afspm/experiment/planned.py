@@ -9,7 +9,12 @@ from typing import Any
 from afspm.logic.limits import Guard, Limits
 from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
 
-PURE = ("afspm.components", "afspm.microscopes.simulator", "afspm.scheduler")
+PURE = (
+    "afspm.components",
+    "afspm.emulators",
+    "afspm.scheduler",
+    *(f"afspm.microscopes.{one}" for one in ("asylum", "gxsm", "image", "nanonis", "simulator")),
+)
 """Classes from here, and those derived from them, do nothing in `__init__` but to keep and to check their settings."""
 
 

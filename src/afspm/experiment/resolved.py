@@ -14,7 +14,7 @@ from afspm.experiment.caching import Caching
 from afspm.experiment.classes import Declared
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
-from afspm.experiment.parts import SIMULATED, Part, Parts, Role
+from afspm.experiment.parts import EMULATED, SIMULATED, Part, Parts, Role
 from afspm.experiment.wiring import Net, Wires
 from afspm.logic.limits import Limits
 from afspm.model import ProblemNames
@@ -72,8 +72,13 @@ class Resolved:
 
     @property
     def simulated(self) -> bool:
-        """Whether the microscope is a simulated one, as its class (a command: its table) says: simulated = True."""
+        """Whether the microscope is a simulated one, as its class (a command: its table) says: simulated = True.
+
+        Also behind an emulator of its controller, which is then a process of the experiment.
+        """
         translators = self.with_role(Role.TRANSLATOR)
+        if any(getattr(self.classes.get(part.name), EMULATED, False) is True for part in self.parts.components):
+            return True
         return bool(translators) and all(
             (part.own.get(SIMULATED) if part.command else getattr(self.classes.get(part.name), SIMULATED, False))
             is True

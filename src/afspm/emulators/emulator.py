@@ -1,0 +1,240 @@
+"""`Emulator`: a vendor's controller with the simulated instrument behind it, as a process of an experiment or alone."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from afspm.clock import Clock, ExperimentClock
+from afspm.emulators.faults import Fault, Faults
+from afspm.emulators.rig import Rig
+from afspm.errors import AfspmError
+from afspm.runtime.exit_codes import ExitCode
+from afspm.transport.launching import open_port
+from afspm.transport.port import Killed
+from afspm.transport.wakeup import WakeUp
+
+if TYPE_CHECKING:
+    from afspm.runtime.process import Context
+
+LOOPBACK = "127.0.0.1"
+LONGEST_WAIT_S = 60.0
+FAREWELL_S = 0.5
+"""So long, real time, a controller stays there when the experiment has ended: the translator stops the tip first."""
+
+
+class Crashed(AfspmError):
+    """The emulated controller is to vanish without another word, as one that crashes does."""
+
+    code = "emulator-crashed"
+
+
+class Emulator(ABC):
+    """A vendor's controller, emulated. Write the abstract methods; all are called from one thread::
+
+        class Mine(Emulator):
+            vendor = "Mine"
+            usual_port = 1234
+            fault_kinds = {"no-reply": "a request is not answered"}
+
+            def open(self): ...bind; return f"127.0.0.1:{port}"
+            def serve(self, timeout_s): ...wait for a request or `self.woken`, and answer
+            def tick(self, now_s): ...end scans, write files; return when there is more to do
+
+    Args:
+        port: to listen on; 0: any free one; None: the vendor's usual one.
+        seed: everything that is left to chance follows from it.
+        faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
+            `kind`, `at_s`, `count`, `duration_s`.
+        world: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
+
+    Attributes:
+        clock, log: of the experiment; given before `open`, as is all of the following.
+        folder: where the controller saves its files.
+        rig: the instrument.
+        faults: to ask at each point where something can go wrong.
+        woken: register its `fileno` with whatever `serve` waits by; it becomes readable when `serve` is to return.
+    """
+
+    vendor: ClassVar[str]
+    usual_port: ClassVar[int] = 0
+    fault_kinds: ClassVar[Mapping[str, str]] = {}
+    """Every fault that can be had, with what it does."""
+
+    emulated: ClassVar[bool] = True
+    """An experiment with it is a simulated one: its clock may go at another speed than the real one."""
+    listens: ClassVar[tuple[str, ...]] = ()
+    """It takes no part in the experiment but to end with it."""
+
+    clock: Clock
+    log: logging.Logger
+    folder: Path
+    rig: Rig
+    faults: Faults
+    woken: WakeUp[None]
+
+    def __init__(
+        self,
+        *,
+        port: int | None = None,
+        seed: int = 1,
+        faults: Sequence[str | Mapping[str, Any] | Fault] = (),
+        **world: Any,
+    ) -> None:
+        self.port = self.usual_port if port is None else port
+        self.seed = seed
+        self._world_settings = world
+        self._faults = [Fault.of(fault) for fault in faults]
+        self._stop = threading.Event()
+        self._leave_at_s = math.inf
+
+    def check(self) -> None:
+        """Whether the settings make sense.
+
+        Raises:
+            ConfigError: of the world or the faults. FileError: a sample that can't be read.
+        """
+        from afspm.simulation import World
+
+        World.from_settings(self._world_settings, self.seed, 0.0)
+        Faults(self._faults, self.fault_kinds, 0.0)
+
+    # -- what one writes
+
+    @abstractmethod
+    def open(self) -> str:
+        """Begin to listen. Returns where: what a client is given as the address."""
+
+    @abstractmethod
+    def serve(self, timeout_s: float) -> None:
+        """Wait up to so many real seconds for clients or `woken`, and answer what has come.
+
+        Raises:
+            Crashed: to vanish without an answer.
+        """
+
+    def tick(self, now_s: float) -> float | None:
+        """What happens by itself up to now, experiment time: a scan ends, a file is written.
+
+        Called before every `serve`, so also right after whatever was served.
+
+        Returns:
+            when something else will, besides what the rig and the faults know of themselves.
+        """
+        return None
+
+    @abstractmethod
+    def close(self) -> None:
+        """Listen no more. Also called if `open` failed."""
+
+    # -- what is there for it
+
+    def run(self, clock: Clock, folder: Path, log: logging.Logger, listening: Callable[[str], None]) -> None:
+        """Be the controller until `stop`.
+
+        Args:
+            listening: told the address, once there is one.
+
+        Raises:
+            Crashed: it was told to.
+        """
+        self.clock, self.folder, self.log = clock, folder, log
+        self.woken = WakeUp()
+        if self._stop.is_set():
+            self.woken.post()
+        self.rig = Rig(self._world_settings, self.seed, clock)
+        self.rig.wake = self.woken.post
+        self.faults = Faults(self._faults, self.fault_kinds, clock.now_s())
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            listening(self.open())
+            while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
+                self.serve(self._wait_s())
+                self.woken.take()
+        finally:
+            self.close()
+            self.woken.close()
+
+    def stop(self) -> None:
+        """End `run` soon. From any thread, also before it began."""
+        self._stop.set()
+        if hasattr(self, "woken"):
+            self.woken.post()
+
+    @contextmanager
+    def running(self, folder: Path, clock: Clock | None = None) -> Iterator[str]:
+        """Run in a thread while in the block, for tests and scripts; gives the address.
+
+        Raises:
+            whatever `run` raised before it listened, or by the end of the block; an emulated crash is none.
+        """
+        opened: list[str] = []
+        failed: list[BaseException] = []
+        settled = threading.Event()
+
+        def listening(address: str) -> None:
+            opened.append(address)
+            settled.set()
+
+        def work() -> None:
+            try:
+                self.run(
+                    clock or ExperimentClock.real(), folder, logging.getLogger(f"emulated {self.vendor}"), listening
+                )
+            except Crashed:
+                pass
+            except BaseException as error:
+                failed.append(error)
+            finally:
+                settled.set()
+
+        thread = threading.Thread(target=work, name=f"emulated {self.vendor}", daemon=True)
+        self._stop.clear()
+        thread.start()
+        settled.wait()
+        try:
+            if opened:
+                yield opened[0]
+        finally:
+            self.stop()
+            thread.join()
+        if failed:
+            raise failed[0]
+
+    def run_process(self, context: Context) -> int:
+        """Be a process of an experiment (what the host calls): with its clock, and its files in the run's folder."""
+        context.when_stopping(self.stop)
+        threading.Thread(target=self._until_the_end_of, args=(context,), name="experiment", daemon=True).start()
+
+        def listening(address: str) -> None:
+            context.log.warning("SIMULATED: an emulated %s controller listens at %s", self.vendor, address)
+
+        try:
+            self.run(context.clock, Path(context.launch.run_dir or ".") / context.name, context.log, listening)
+        except Crashed as crash:
+            context.log.warning("an emulated crash: %s", crash)
+            return ExitCode.CRASHED
+        return ExitCode.ORPHAN if self._stop.is_set() else ExitCode.ENDED
+
+    def _until_the_end_of(self, context: Context) -> None:
+        """Hears of the end of the experiment; in a thread of its own, since `serve` waits for the vendor's clients."""
+        port = open_port(context.launch, context.clock)
+        while not any(isinstance(incoming, Killed) for incoming in port.poll(None)):
+            pass
+        self._leave_at_s = context.clock.monotonic_s() + FAREWELL_S
+        self.woken.post()
+        port.close()
+
+    def _wait_s(self) -> float:
+        """Real seconds until something happens by itself."""
+        now_s = self.clock.now_s()
+        times = (self.tick(now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
+        due_s = min((at_s for at_s in times if at_s is not None), default=math.inf)
+        leave_in_s = self._leave_at_s - self.clock.monotonic_s()
+        return max(0.0, min(LONGEST_WAIT_S, leave_in_s, self.clock.real_s(due_s - now_s)))

@@ -1,0 +1,36 @@
+"""A controller that says back what it is told, for one client at a time."""
+
+from __future__ import annotations
+
+import select
+import socket
+from typing import Any, ClassVar
+
+from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
+
+
+class Echo(Emulator):
+    vendor = "Echo"
+    fault_kinds: ClassVar = {"crash": "it vanishes without an answer"}
+
+    def __init__(self, *, greeting: str = "", **settings: Any) -> None:
+        super().__init__(**settings)
+        self.greeting = greeting
+
+    def open(self) -> str:
+        self._listener = socket.create_server((LOOPBACK, self.port))
+        return f"{LOOPBACK}:{self._listener.getsockname()[1]}"
+
+    def serve(self, timeout_s: float) -> None:
+        ready, _, _ = select.select([self.woken, self._listener], [], [], timeout_s)
+        if self._listener not in ready:
+            return
+        with self._listener.accept()[0] as client:
+            asked = client.recv(1000).decode()
+            if self.faults.strikes("crash", self.clock.now_s()):
+                raise Crashed("as it was told to")
+            told = str(self.clock.now_s()) if asked == "time" else f"{self.greeting} {asked}, seed {self.seed}"
+            client.sendall(told.encode())
+
+    def close(self) -> None:
+        self._listener.close()

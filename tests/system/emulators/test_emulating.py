@@ -1,0 +1,125 @@
+"""Emulated controllers as processes: alone from the command line, and as part of an experiment."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zmq
+
+from afspm.clock import ExperimentClock
+from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.launch import Launch, Sockets
+
+DEADLINE_S = 30.0
+HERE = Path(__file__).parent
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(HERE), "PYTHONUNBUFFERED": "1"}
+WORDS = " listens at "
+
+
+@contextmanager
+def started(*arguments: str, cwd: Path) -> Iterator[subprocess.Popen[str]]:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-m", *arguments], stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=cwd, env=ENVIRONMENT
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ask(address: str, line: str) -> str:
+    host, port = address.rsplit(":", 1)
+    with socket.create_connection((host, int(port)), timeout=DEADLINE_S) as client:
+        client.sendall(line.encode())
+        return client.recv(1000).decode()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a console can't be sent Ctrl-C from here")
+def test_from_the_command_line_it_says_where_it_listens_and_ends_on_ctrl_c(tmp_path: Path) -> None:
+    arguments = ("afspm", "emulate", "echo.Echo", "greeting=good day", "--port", "0", "--seed", "7", "-o", "files")
+    with started(*arguments, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("SIMULATED Echo controller: listening at 127.0.0.1:")
+        assert str(tmp_path / "files") in line
+        assert ask(line.split(" at ")[1].split(",")[0], "x") == "good day x, seed 7"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(DEADLINE_S) == 0
+    assert (tmp_path / "files").is_dir()
+
+
+def test_a_crash_on_the_command_line_ends_with_1(tmp_path: Path) -> None:
+    with started("afspm", "emulate", "echo.Echo", "--port", "0", "--fault", "crash", cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert ask(process.stdout.readline().split(" at ")[1].split(",")[0], "x") == ""
+        assert process.wait(DEADLINE_S) == 1
+
+
+def test_a_fault_that_it_does_not_have_is_refused_before_it_listens(tmp_path: Path) -> None:
+    with started("afspm", "emulate", "echo.Echo", "--fault", "crush", cwd=tmp_path) as process:
+        out, err = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 1
+    assert out == ""
+    assert "did you mean 'crash'?" in err
+
+
+def launched(settings: dict[str, object], subscribe: str, run_dir: Path) -> str:
+    launch = Launch(
+        name="controller",
+        class_="echo.Echo",
+        settings={"port": 0, **settings},
+        sockets=Sockets(subscribe=(subscribe,)),
+        envelopes=(),
+        clock=ExperimentClock.starting_now(0.0, speed=60.0).as_dict(),
+        run_dir=str(run_dir),
+    )
+    return launch.to_json() + "\n"
+
+
+@contextmanager
+def in_an_experiment(
+    settings: dict[str, object], tmp_path: Path
+) -> Iterator[tuple[subprocess.Popen[str], str, zmq.Socket[bytes]]]:
+    with zmq.Context() as context, context.socket(zmq.XPUB) as scheduler:
+        scheduler.setsockopt(zmq.LINGER, 0)
+        port = scheduler.bind_to_random_port("tcp://127.0.0.1")
+        with started("afspm.runtime.host", cwd=tmp_path) as process:
+            assert process.stdin is not None
+            assert process.stderr is not None
+            process.stdin.write(launched(settings, f"tcp://127.0.0.1:{port}", tmp_path))
+            process.stdin.flush()
+            line = process.stderr.readline()
+            assert line.startswith("WARNING SIMULATED: an emulated Echo controller"), line
+            yield process, line.split(WORDS)[1].strip(), scheduler
+
+
+def test_in_an_experiment_it_has_its_clock_and_ends_with_it(tmp_path: Path) -> None:
+    with in_an_experiment({"greeting": "hello"}, tmp_path) as (process, address, scheduler):
+        assert ask(address, "x") == "hello x, seed 1"
+        assert 0.0 < float(ask(address, "time")) < 3600.0
+        assert (tmp_path / "controller").is_dir()
+        assert scheduler.poll(int(DEADLINE_S * 1000))  # it has subscribed
+        scheduler.send(b"KILL")
+        assert process.wait(DEADLINE_S) == ExitCode.ENDED
+
+
+def test_in_an_experiment_it_ends_when_its_parent_lets_it_go(tmp_path: Path) -> None:
+    with in_an_experiment({}, tmp_path) as (process, _, _):
+        assert process.stdin is not None
+        process.stdin.close()
+        assert process.wait(DEADLINE_S) == ExitCode.ORPHAN
+
+
+def test_in_an_experiment_a_crash_is_one_for_the_supervisor(tmp_path: Path) -> None:
+    with in_an_experiment({"faults": ["crash"]}, tmp_path) as (process, address, _):
+        assert ask(address, "x") == ""
+        assert process.wait(DEADLINE_S) == ExitCode.CRASHED

@@ -1,0 +1,88 @@
+"""What all emulated controllers have in common: how they run, stop, crash, and are named."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+
+from afspm.clock import ExperimentClock
+from afspm.emulators import known
+from afspm.emulators.emulator import Emulator
+from afspm.errors import ConfigError
+
+from .tiny import Tiny, ask
+
+
+def test_it_answers_while_in_the_block_and_is_gone_after_it(tmp_path: Path) -> None:
+    with Tiny(port=0).running(tmp_path) as address:
+        assert ask(address, "hello") == ["1"]
+    with pytest.raises(OSError):  # noqa: PT011 - each system refuses in words of its own
+        ask(address, "hello")
+
+
+def test_it_can_be_run_again(tmp_path: Path) -> None:
+    tiny = Tiny(port=0)
+    for _ in range(2):
+        with tiny.running(tmp_path) as address:
+            assert ask(address, "hello") == ["1"]
+
+
+def test_what_ends_by_itself_is_seen_to_at_that_time_and_not_at_the_next_request(tmp_path: Path) -> None:
+    written = threading.Event()
+
+    class Telling(Tiny):
+        def tick(self, now_s: float) -> float | None:
+            super().tick(now_s)
+            if self.ended:
+                written.set()
+            return None
+
+    tiny = Telling(port=0)
+    # a scan of 20 experiment seconds: 20 ms
+    with tiny.running(tmp_path, ExperimentClock.starting_now(0.0, speed=1000.0)) as address:
+        assert ask(address, "scan") == ["1 scan"]
+        assert written.wait(10.0)
+    assert (tmp_path / "scan.txt").exists()
+    assert tiny.rig.scan is not None
+    assert tiny.ended[0] >= tiny.rig.scan.end_s
+
+
+def test_an_emulated_crash_closes_the_connection_without_an_answer(tmp_path: Path) -> None:
+    with Tiny(port=0, faults=["crash"]).running(tmp_path) as address:
+        assert ask(address, "hello") == [""]
+
+
+def test_a_port_that_is_taken_is_an_error_of_the_block(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(OSError, match=r"use|permitted"):  # noqa: SIM117
+        with Tiny(port=taken.getsockname()[1]).running(tmp_path):
+            pytest.fail("it listens on a taken port")
+
+
+def test_the_usual_port_is_the_vendors() -> None:
+    assert (Tiny().port, Tiny(port=0).port) == (45997, 0)
+
+
+def test_settings_without_sense_are_refused_before_it_runs() -> None:
+    with pytest.raises(ConfigError, match="drifft"):
+        Tiny(drifft={}).check()
+    with pytest.raises(ConfigError, match="no fault 'crush'"):
+        Tiny(faults=["crush"]).check()
+
+
+def test_an_emulator_has_a_name_or_is_one_of_the_users() -> None:
+    assert known.emulator(f"{Tiny.__module__}.Tiny") is Tiny
+    with pytest.raises(ConfigError, match="there is no emulator 'veeco'"):
+        known.emulator("veeco")
+    with pytest.raises(ConfigError, match="is no emulator"):
+        known.emulator("pathlib.Path")
+
+
+@pytest.mark.parametrize("name", known.names())
+def test_those_of_afspm_say_what_they_are(name: str) -> None:
+    found = known.emulator(name)
+    assert issubclass(found, Emulator)
+    assert found.vendor
+    assert all(found.fault_kinds.values())
