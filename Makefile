@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo test check bench bench-drift soak chaos simulate clean
+.PHONY: demo demo-drift test check bench bench-drift soak chaos simulate clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -15,6 +15,10 @@ $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard pr
 ## the paper's control transfer: a night of scans, a tip that changes, and its repair
 demo: $(SETUP)
 	@$(BIN)/afspm run experiments/tip_repair/experiment.toml
+
+## the paper's drift correction: a night on a sample that drifts, two hours without correction and sixteen with it
+demo-drift: $(SETUP)
+	@$(BIN)/afspm run experiments/drift_night/experiment.toml
 
 ## all tests
 test: $(SETUP)
