@@ -10,11 +10,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from afspm.components.simulated_truth import true_drift
 from afspm.drift.estimators import estimator
 from afspm.drift.offline import against_first, followed
 from afspm.drift.record import DriftRecord
@@ -25,6 +27,8 @@ from afspm.errors import AfspmError, FileError, InvalidValue
 from afspm.files import FORMATS, FileContent, read
 from afspm.study.recorded import Series, series
 from afspm.study.workers import on_cores
+
+Array = NDArray[np.float64]
 
 NM = 1e9
 NM_PER_MIN = 60e9
@@ -63,7 +67,7 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     console.print(f"{len(found.scans)} scans of {found.channel} from {begun:%Y-%m-%d %H:%M} UTC on", markup=False)
     analysis = analysed(found.scans, by, following, jobs, aside)
     console.print(as_table(analysis.record))
-    for path in written(found, analysis, output, aside):
+    for path in written(found, analysis, truth_m(found, paths), output, aside):
         console.print(str(path), markup=False, soft_wrap=True)
 
 
@@ -138,7 +142,13 @@ def _number(value: float) -> str:
     return f"{value:.2f}" if abs(value) < 1e5 else f"{value:.1e}"
 
 
-def written(found: Series, analysis: Analysis, folder: Path, console: Console) -> Iterator[Path]:
+def truth_m(found: Series, paths: Sequence[Path]) -> Array | None:
+    """(n, 2) what the drift really was, where the scans are those of one simulated run."""
+    truth = true_drift(paths[0]) if len(paths) == 1 else None
+    return None if truth is None else truth(np.array([scan.mid_s for scan in found.scans]))
+
+
+def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path, console: Console) -> Iterator[Path]:
     """Write all that can be; what can't is said."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -159,7 +169,7 @@ def written(found: Series, analysis: Analysis, folder: Path, console: Console) -
         return
     part = album.Part("", found.channel, 0, len(found.scans), analysis.estimates)
     matched = next(((0, k, one) for k, one in enumerate(analysis.pairs, 1) if one.accepted and one.matches), None)
-    yield from album.write(album.Run(found.scans, analysis.record, [part], matched), folder)
+    yield from album.write(album.Run(found.scans, analysis.record, [part], matched, truth), folder)
 
 
 def _stack(found: Series, record: DriftRecord, path: Path) -> Path:

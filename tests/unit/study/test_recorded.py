@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +62,8 @@ def run_folder(tmp_path: Path) -> Path:
         scan = world.scan(REGION, (PIXELS, PIXELS), 1.0, 600.0 * k)
         measured = Measured(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
         (folder / "scans" / f"scan-{k}.nc").write_bytes(encode_scan(REGION, scan.channels(), measured))
+    start = {"n": 1, "time_s": 0.0, "event": "start", "settings": settings, "seed": 1}
+    (folder / "truth.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")
     (folder / "scans" / "scan-6.nc").write_bytes(b"CDF\x02 half of a file")
     return folder
 
@@ -77,6 +81,7 @@ def test_a_run_folder_is_followed_told_and_drawn(run_folder: Path, tmp_path: Pat
     expected = np.array(VELOCITY_M_S) * (record.time_s - record.time_s[0])[:, None]
     np.testing.assert_allclose(record.drift_m, expected, atol=1e-6 / PIXELS)
     assert {"drift_estimates.csv", "drift_stack.nc"} <= {path.name for path in output.iterdir()}
+    assert (output / "drift_errors.png").exists() == (find_spec("matplotlib") is not None)
     estimates = DriftRecord.read(output / "drift_estimates.csv")
     np.testing.assert_allclose(estimates.drift_m[1:], expected[1:], atol=1e-6 / PIXELS)
 
