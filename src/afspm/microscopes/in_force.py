@@ -20,6 +20,8 @@ FRAME: Final = (
     names.SCAN_RESOLUTION_X,
     names.SCAN_RESOLUTION_Y,
 )
+EXTENT: Final = (names.SCAN_SIZE_X, names.SCAN_RESOLUTION_Y, names.SCAN_RESOLUTION_X, names.SCAN_SIZE_Y)
+"""What, with the speed, a scan's duration depends on: the width, the rows, and perhaps the rest."""
 FEEDBACK: Final = (FEEDBACK_ON, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
 POSITION: Final = (names.PROBE_POS_X, names.PROBE_POS_Y)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from afspm.clock import Clock
 from afspm.errors import AfspmError, Refused
+from afspm.microscopes.pace import EAGER_S
 from afspm.microscopes.parameters import ParameterTable, Value
 from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
 
@@ -116,7 +117,8 @@ class Microscope(ABC):
         parameters: rows added to the table or changed in it by the experiment file.
         actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
             parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`).
-        poll_period_s: the controller is looked at this often, in real seconds.
+        poll_period_s: the controller is looked at this often, in real seconds, when nothing is about to happen; its
+            state more often when a measurement is about to end, as learned from those before.
         result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds.
 
     Attributes:
@@ -127,6 +129,8 @@ class Microscope(ABC):
     """
 
     parameters_file: ClassVar[Path]
+    eager_poll_s: ClassVar[float] = EAGER_S
+    """Real seconds between two looks when a scan may end at any moment."""
     max_pixels: ClassVar[int] = 4096 * 4096
     simulated: ClassVar[bool] = False
     """No tip can break: the experiment's clock may go at another speed than the real one."""

@@ -151,13 +151,18 @@ class ParameterSpec:
         if self.type == "text":
             return str(value)
         if self.type == "bool":
-            return self._checked_word(str(value)) if isinstance(value, str) else bool(value)
+            return self._checked_word(value) if isinstance(value, str) else bool(self._finite(value))
         try:
             number = float(value) * self.sign
-        except ValueError:
+        except (ValueError, TypeError):
             raise refuse_value(self.name, f"the controller says {value!r}, which is not a number") from None
-        number = units.convert(number, self.unit, self.si_unit)
+        number = units.convert(self._finite(number), self.unit, self.si_unit)
         return round(number) if self.type == "int" else number
+
+    def _finite(self, number: float) -> float:
+        if not math.isfinite(number):
+            raise refuse_value(self.name, f"the controller says {number}, which is no value")
+        return number
 
     def told(self, value: Value, unit: str | None = None) -> tuple[str, str]:
         """A value in SI as (text, unit) for a peer, in the unit that it used or in that of the wire."""

@@ -10,16 +10,18 @@ import contextlib
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
 from afspm.clock import Clock
-from afspm.errors import AfspmError, FileError, WireError
+from afspm.errors import AfspmError, ConfigError, FileError, WireError
 from afspm.microscopes import in_force
 from afspm.microscopes.ledger import Ledger
-from afspm.microscopes.microscope import LOST, ControllerLost, Microscope
+from afspm.microscopes.microscope import LOST, MEASURING, ControllerLost, Microscope
 from afspm.microscopes.outbox import Outbox
+from afspm.microscopes.pace import Pace
 from afspm.microscopes.parameters import Value
 from afspm.microscopes.sequence import Complain, Deliver, Discard, Say, Step
 from afspm.microscopes.sequence import Sequence as StateSequence
@@ -71,8 +73,10 @@ class Translator:
         self._outbox = Outbox(microscope, self._kept["outbox"], self._stamp, log)
         self._service = Service(microscope, self._sequence, self._about_to_act, log)
         self._values: dict[str, Value] = {}
-        self._connected = self._started = False
-        self._retry_at_s = 0.0
+        self._connected = self._started = self._told_lost = False
+        self._pace = Pace(microscope.poll_period_s, microscope.eager_poll_s)
+        self._paced = ScopeState.UNDEFINED
+        self._retry_at_s = self._all_at_s = 0.0
         self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
@@ -105,22 +109,49 @@ class Translator:
         """Real seconds until the controller should be looked at again."""
         if not self._connected:
             return max(0.0, self._retry_at_s - self._clock.monotonic_s())
-        wait_s = self.microscope.poll_period_s
-        now_s = self._clock.now_s()
+        real_now_s, now_s = self._clock.monotonic_s(), self._clock.now_s()
+        wait_s = min(self._pace.wait_s(real_now_s), self._all_at_s - real_now_s)
         for at_s in (self.microscope.next_change_s(), self._sequence.deadline_s()):
             if at_s is not None:
-                wait_s = min(wait_s, self._clock.real_s(at_s - now_s))
+                # a change that should have been and was not seen yet is looked for eagerly, and not without a break
+                until_s = self._clock.real_s(at_s - now_s)
+                wait_s = min(wait_s, until_s if until_s > 0.0 else self.microscope.eager_poll_s)
         return max(0.0, wait_s)
 
     # --- looking at the controller ---
 
     def look(self) -> None:
         """See what has changed at the controller and publish it."""
+        self._trusting(self._look)
+
+    def _look(self) -> None:
+        if not (self._connected or self._connect()):
+            return
+        if self._clock.monotonic_s() >= self._all_at_s:
+            self._observe()
+        elif self.microscope.status() != self._sequence.said:
+            # what ends a measurement changes nothing of what is in force; what else happens, may
+            self._observe(values=self._sequence.said.state not in MEASURING)
+
+    def _trusting(self, do: Callable[[], None]) -> bool:
+        """Whether that could be done; if not, the controller is gone, or says what can't be.
+
+        Raises:
+            ConfigError: it can't be connected to with these settings, ever.
+        """
         try:
-            if self._connected or self._connect():
-                self._observe()
+            do()
+            return True
+        except ConfigError as error:
+            if not self._started:
+                raise
+            self._lose(error)
         except (*LOST, AfspmError) as error:
             self._lose(error)
+        except Exception as error:  # whatever a controller says, its translator lives on
+            self._log.debug("while looking at the controller", exc_info=True)
+            self._lose(error)
+        return False
 
     def _connect(self) -> bool:
         if self._clock.monotonic_s() < self._retry_at_s:
@@ -139,25 +170,44 @@ class Translator:
     def _lose(self, error: Exception) -> None:
         self._retry_at_s = self._clock.monotonic_s() + _RECONNECT_S
         was_connected, self._connected = self._connected, False
-        if was_connected or str(error) != self._complaint:
-            self._complaint = str(error)
-            self._log.error("the controller can't be reached, it is tried again: %s", error)
-        if was_connected:
+        complaint = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
+        new = complaint != self._complaint
+        self._complaint = complaint
+        if was_connected or new:
+            self._log.error("the controller can't be reached or trusted, it is tried again: %s", complaint)
+        if was_connected or not self._told_lost:
             # what it was doing is remembered: it may still be at it when it is found again
+            self._told_lost = True
             self._publish(ScopeStatus(ScopeState.UNDEFINED))
 
-    def _observe(self, announce: Sequence[str] = ()) -> None:
+    def _observe(self, announce: Sequence[str] = (), *, values: bool = True) -> None:
+        """Publish what is new.
+
+        Args:
+            announce: messages to publish even if nothing in them changed.
+            values: whether to look at what is in force, too: that takes a question for each parameter.
+        """
+        if values:
+            self._observe_values(announce)
+        # the state first: a result that comes in between then waits for the next look, and is not lost
+        status = self.microscope.status()
+        if self._sequence.said.state in MEASURING and status.state not in MEASURING:
+            self._pace.over(self._clock.monotonic_s())
+        steps = self._sequence.observe(status, self._outbox.look(), self._clock.now_s())
+        if steps:
+            self._save()  # before anything is out: who comes back from a kill must not tell an older story
+            self._play(steps)
+
+    def _observe_values(self, announce: Sequence[str]) -> None:
         values = self._read()
         before, self._values = in_force.messages(self._values), values
         for name, thing in in_force.messages(values).items():
             if name in announce or before.get(name) != thing:
                 self._publish(thing)
-        # the state first: a result that comes in between then waits for the next look, and is not lost
-        status = self.microscope.status()
-        steps = self._sequence.observe(status, self._outbox.look(), self._clock.now_s())
-        if steps:
-            self._save()  # before anything is out: who comes back from a kill must not tell an older story
-            self._play(steps)
+        wait_s, next_s = self.microscope.poll_period_s, self.microscope.next_change_s()
+        if next_s is not None:
+            wait_s = min(wait_s, max(0.0, self._clock.real_s(next_s - self._clock.now_s())))
+        self._all_at_s = self._clock.monotonic_s() + wait_s
 
     def _read(self) -> dict[str, Value]:
         """What is in force; differences below the controller's precision are none."""
@@ -173,6 +223,7 @@ class Translator:
         for step in steps:
             if isinstance(step, Say):
                 self._publish(step.status)
+                self._pace_for(step.status.state)
             elif isinstance(step, Deliver):
                 self._deliver()
             elif isinstance(step, Discard):
@@ -180,6 +231,27 @@ class Translator:
                 self._save()
             elif isinstance(step, Complain):
                 self._log.error("%s", step.text)
+
+    def _pace_for(self, state: ScopeState) -> None:
+        """Look as often as what it now does asks for."""
+        before, self._paced, now_s = self._paced, state, self._clock.monotonic_s()
+        if state in MEASURING:
+            lasts_s, what = self._scan_s() if state is ScopeState.SCANNING else (None, ())
+            self._pace.began((state, *what), now_s, lasts_s)
+        elif state in (ScopeState.FREE, ScopeState.UNDEFINED):
+            self._pace.ended(now_s, as_expected=state is ScopeState.FREE and before in MEASURING)
+        else:
+            self._pace.moved(now_s)
+
+    def _scan_s(self) -> tuple[float | None, tuple[Value, ...]]:
+        """How long, in real seconds, the scan lasts if no time is lost at its edges, and what that depends on."""
+        what = tuple(self._values.get(name, 0.0) for name in in_force.EXTENT)
+        with contextlib.suppress(*LOST, AfspmError, ArithmeticError):
+            if all(what) and names.SCAN_SPEED in self.microscope.table:
+                speed_m_s = float(self.microscope.read([names.SCAN_SPEED])[names.SCAN_SPEED])
+                width_m, rows = float(what[0]), float(what[1])
+                return self._clock.real_s(2.0 * width_m * rows / speed_m_s), (*what, speed_m_s)
+        return None, what
 
     def _deliver(self) -> None:
         packets = self._outbox.take()
@@ -224,13 +296,14 @@ class Translator:
     def _answer(self, request: Request) -> None:
         if not self._connected:
             raise ControllerLost("it is being looked for")
-        if not _only_asks(request):
-            self._observe()  # whether it is free is decided by what it does now, not at the last look
+        # whether it is free is decided by what it does now, not at the last look
+        if not _only_asks(request) and not self._trusting(partial(self._observe, values=False)):
+            raise ControllerLost(self._complaint)
         answer = self._service.answer(request)
         self._finish(request, answer.response)
         self._play(answer.steps)
         if answer.response.ok and (answer.steps or answer.announce):
-            self._observe(answer.announce)
+            self._trusting(partial(self._observe, answer.announce))
 
     def _about_to_act(self, request: Request) -> None:
         self._acting = request
@@ -267,8 +340,12 @@ class Translator:
         """Everything in force, for a scheduler that has just come."""
         for thing in in_force.messages(self._values).values():
             self._publish(thing)
-        if self._sequence.said.state is not ScopeState.UNDEFINED:
-            self._publish(self._sequence.said)
+        said = self._sequence.said
+        if said.state is not ScopeState.UNDEFINED:
+            self._publish(said)
+        if said.state in MEASURING and self._paced not in MEASURING:  # since when is not known: it may end any moment
+            self._paced = said.state
+            self._pace.began(object(), self._clock.monotonic_s())
 
     def _publish(self, thing: in_force.Published | ScopeStatus) -> None:
         name, payload = wire.encode(thing)

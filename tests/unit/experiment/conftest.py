@@ -93,6 +93,15 @@ class Real(Microscope):
     pass
 
 
+class Emulated:
+    emulated = True
+    listens = ()
+
+    def __init__(self, port: int = 0): ...
+
+    def run_process(self, context): ...
+
+
 class Untyped(Component):
     def __init__(self, size=1e-6, label="", typed: str = ""):
         self.size, self.label, self.typed = size, label, typed

@@ -106,6 +106,8 @@ class FakeMicroscope(Microscope):
         self.lost = False
         self.stuck: dict[str, Value] = {}
         self.fails: Exception | None = None
+        self.confused: Exception | None = None
+        self.got = 0
 
     def connect(self) -> None:
         if self.lost:
@@ -114,9 +116,12 @@ class FakeMicroscope(Microscope):
     def status(self) -> ScopeStatus:
         if self.lost:
             raise ConnectionError("unplugged")
+        if self.confused is not None:
+            raise self.confused
         return ScopeStatus(self.state)
 
     def get(self, vendor: str) -> Value:
+        self.got += 1
         return self.values[vendor]
 
     def set(self, values: Mapping[str, Value]) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from afspm import wire
-from afspm.errors import ConfigError
+from afspm.errors import ConfigError, WireError
 from afspm.model import (
     CLOCK_REQUEST,
     ControlRequest,
@@ -322,6 +322,95 @@ def test_a_controller_that_is_gone_is_said_and_found_again(bench: Any) -> None:
     bench.microscope.lost = False
     bench.look(after_s=5.0)
     assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
+
+
+def test_a_controller_that_was_never_there_is_said_once(make_bench: Any, tmp_path: Any) -> None:
+    bench = make_bench()
+    bench.microscope.lost = True
+    bench.start()
+    for _ in range(5):
+        bench.look(after_s=1.0)
+    assert bench.heard() == ["UNDEFINED"]
+    bench.microscope.lost = False
+    bench.look(after_s=1.0)
+    assert bench.heard()[-1] == "FREE"
+
+
+@pytest.mark.parametrize("error", [ValueError("0x1f"), KeyError("status"), WireError("a reply to another question")])
+def test_a_controller_that_says_what_cannot_be_is_not_trusted_until_it_makes_sense(bench: Any, error: Any) -> None:
+    bench.microscope.confused = error
+    bench.look()
+    assert bench.heard() == ["UNDEFINED"]
+    response = bench.ask(ACTION, names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    bench.microscope.confused = None
+    bench.look(after_s=1.0)
+    assert bench.heard()[-1] == "FREE"
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+def test_a_controller_found_confused_by_a_request_does_nothing_of_it(bench: Any) -> None:
+    bench.microscope.confused = ValueError("0x1f")
+    response = bench.ask(ACTION, names.START_SCAN)
+    assert (response.code, bench.microscope.done) == (ControlResponse.NO_RESPONSE, [])
+    assert "ValueError: 0x1f" in response.reason
+    assert bench.heard() == ["UNDEFINED"]
+
+
+def test_a_request_that_was_done_before_the_controller_was_lost_stays_a_success(bench: Any) -> None:
+    def lost_afterwards(values: Any) -> None:
+        type(bench.microscope).set(bench.microscope, values)
+        bench.microscope.confused = ValueError("0x1f")
+
+    bench.microscope.set = lost_afterwards
+    replies = len(bench.port.replies)
+    assert bench.ask(POSITION, ProbePosition((1e-6, 0.0)), request_id="one").code == OK
+    assert len(bench.port.replies) == replies + 1
+    assert bench.heard()[-1] == "UNDEFINED"
+    bench.microscope.confused = None
+    assert bench.ask(POSITION, ProbePosition((1e-6, 0.0)), request_id="one").code == OK
+
+
+@pytest.mark.parametrize(("vendor", "value"), [("X", math.nan), ("P", math.inf), ("Loop", math.nan), ("W", "wide")])
+def test_a_value_that_cannot_be_is_never_published(bench: Any, vendor: str, value: Any) -> None:
+    bench.microscope.values[vendor] = value
+    bench.look()
+    assert bench.heard() == ["UNDEFINED"]
+
+
+def test_settings_with_which_it_can_never_be_connected_end_the_process(make_bench: Any) -> None:
+    bench = make_bench()
+    bench.microscope.connect = lambda: (_ for _ in ()).throw(ConfigError("no such release"))
+    with pytest.raises(ConfigError):
+        bench.start()
+
+
+def test_the_end_of_a_scan_is_looked_for_eagerly_by_its_state_alone(bench: Any, scan: Any) -> None:
+    def measure(number: int) -> list[float]:
+        """Looks as the translator wants to; returns the pauses between them."""
+        bench.ask(ACTION, names.START_SCAN)
+        waits = []
+        for _ in range(4000):
+            waits.append(bench.translator.wait_s())
+            if bench.clock.t_s >= bench.began_s + 30.0 and bench.microscope.state is ScopeState.SCANNING:
+                bench.microscope.files[f"{number}"] = [scan()]
+                bench.microscope.state = ScopeState.FREE
+                bench.late_s = bench.clock.t_s - bench.began_s - 30.0
+            bench.look(waits[-1])
+            if bench.heard()[-1:] == ["FREE"]:
+                return waits
+        raise AssertionError("it is never over")
+
+    bench.began_s = bench.clock.t_s
+    measure(1)
+    for number in (2, 3):
+        bench.began_s, bench.microscope.got = bench.clock.t_s, 0
+        waits = measure(number)
+        assert bench.late_s <= 0.02
+        assert max(waits) == pytest.approx(0.1)
+        assert len(waits) < 400
+        # 14 values at every tenth of a second, as at rest
+        assert bench.microscope.got < 15 * 320
 
 
 def test_actions_and_parameters_of_the_experiment_file(make_bench: Any) -> None:
