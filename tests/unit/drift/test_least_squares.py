@@ -79,21 +79,21 @@ def test_frames_that_are_both_turned(angle_deg: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("region", "shape"),
+    ("region", "shape", "within_m"),
     [
-        (Region((0.0, 0.0), (SIZE_M, SIZE_M)), (160, 160)),
-        (Region((0.0, 0.0), (SIZE_M, SIZE_M)), (70, 110)),
-        (Region((0.1e-6, 0.05e-6), (0.7 * SIZE_M, 0.7 * SIZE_M)), (96, 96)),
-        (Region((0.0, 0.0), (SIZE_M, SIZE_M), math.radians(25.0)), (96, 96)),
-        (Region((0.0, 0.0), (SIZE_M, SIZE_M), math.radians(90.0)), (96, 80)),
+        (Region((0.0, 0.0), (SIZE_M, SIZE_M)), (160, 160), 0.5 * NM),
+        (Region((0.0, 0.0), (SIZE_M, SIZE_M)), (70, 110), 0.5 * NM),
+        (Region((0.1e-6, 0.05e-6), (0.7 * SIZE_M, 0.7 * SIZE_M)), (96, 96), 0.5 * NM),
+        # Rows that lie across each other can't be freed of the same lines: that costs accuracy.
+        (Region((0.0, 0.0), (SIZE_M, SIZE_M), math.radians(25.0)), (96, 96), 2.0 * NM),
+        (Region((0.0, 0.0), (SIZE_M, SIZE_M), math.radians(90.0)), (96, 80), 2.0 * NM),
     ],
     ids=["finer", "other pixels", "smaller", "turned", "turned with pixels that are not square"],
 )
-def test_scans_of_different_geometry(region: Region, shape: tuple[int, int]) -> None:
+def test_scans_of_different_geometry(region: Region, shape: tuple[int, int], within_m: float) -> None:
     scan = scanned(region, shape, DRIFT_M, start_s=900.0)
-    assert_displaced(registered(scan), DRIFT_M, 1.0 * NM)
-    there_and_back = registered(scanned(REGION), scan)
-    assert_displaced(there_and_back, -DRIFT_M, 1.0 * NM)
+    assert_displaced(registered(scan), DRIFT_M, within_m)
+    assert_displaced(registered(scanned(REGION), scan), -DRIFT_M, within_m)
 
 
 def test_the_centre_and_the_linear_part_say_where_any_feature_is() -> None:

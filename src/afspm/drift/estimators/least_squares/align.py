@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.least_squares.rows import Normal, noise_metric, normal_equations, projected
-from afspm.drift.estimators.least_squares.warp import Pair
+from afspm.drift.estimators.least_squares.prepare import flatten_rows
+from afspm.drift.estimators.least_squares.rows import noise_metric, products, seen, without_lines
+from afspm.drift.estimators.least_squares.shrink import denoised
+from afspm.drift.estimators.least_squares.warp import Pair, derivative
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -28,79 +30,87 @@ class Believed:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where it has come to.
+    """Where it has come to, and the equations there, per block of the image and over the variance of the noise.
 
     Attributes:
         theta: (7,), see `Pair`.
-        normal: the equations there, per block, scaled by the variance of the residual.
+        curvature: (n, 7, 7), H'QJ with J the gradient as it is and H what of it is signal.
+        spread: (n, 7, 7), H'QH, the covariance of `slope`.
+        slope: (n, 7), H'Qr.
     """
 
     theta: Array
-    normal: Normal
-    weight: Array
-    metric: Array | None
-    steps: int
+    curvature: Array
+    spread: Array
+    slope: Array
 
 
 def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
     """theta after some steps with plain weights, for the coarse stages."""
     theta = theta.copy()
     for _ in range(steps):
-        columns, known = pair.linearised(theta)
-        normal = normal_equations(columns, known.astype(np.float64), None)
-        theta, moved = _stepped(theta, normal, normal.power / max(known.sum(), 1), believed, free)
+        one, two, known = pair.warped(theta)
+        mean = (one + two) / 2
+        columns = pair.columns(derivative(mean, 1), derivative(mean, 0), mean, two - one)
+        columns_q = seen(columns, known.astype(np.float64), None)
+        normal = np.tensordot(columns_q, columns, ((0, 2), (0, 2)))
+        normal *= max(known.sum(), 1) / max(normal[7, 7], 1e-300)
+        theta, moved = _stepped(theta, normal[:7, :7], normal[:7, 7], believed, free)
         if moved < 0.01:
             break
     return theta
 
 
-def generalised_least_squares(pair: Pair, theta: Array, believed: Believed, steps: int = 6) -> Fit:
-    """theta by rows (see `rows`), with weights that trust outliers and scars less; twice, as the noise is estimated
-    from what the first round has left."""
-    fit: Fit | None = None
-    for _ in range(2):
-        fit = _round(pair, theta, believed, steps)
-        theta = fit.theta
-    assert fit is not None
+def generalised_least_squares(pair: Pair, theta: Array, believed: Believed, rounds: int = 3, steps: int = 3) -> Fit:
+    """theta by rows (see `rows`), where scars count less. The gradient, the noise and the weights are estimated anew in
+    each round, from what the one before has left."""
+    fit = _round(pair, theta, believed, steps)
+    for _ in range(rounds - 1):
+        fit = _round(pair, fit.theta, believed, steps)
     return fit
 
 
 def _round(pair: Pair, theta: Array, believed: Believed, steps: int) -> Fit:
-    columns, known = pair.linearised(theta)
-    mask = known.astype(np.float64)
-    residual = projected(columns[:, 7:], mask, None)[0][:, 0]
-    metric = noise_metric(residual, known)
-    weight = mask * _row_weights(residual, known)[:, None]
-    step = 0
-    for step in range(1, steps + 1):
-        if step > 1:
-            columns, known = pair.linearised(theta)
-            residual = projected(columns[:, 7:], known.astype(np.float64), None)[0][:, 0]
-            weight = known * _row_weights(residual, known)[:, None] * _pixel_weights(residual, known)
-        normal = normal_equations(columns, weight, metric)
-        normal = Normal(normal.blocks * (max(weight.sum(), 1.0) / max(normal.power, 1e-300)))
-        theta, moved = _stepped(theta, normal, 1.0, believed, ALL)
-        if moved < ENOUGH_PX:
+    """Newton's steps to H'Q r + P (theta - mean) = 0. H is free of most of the noise of the gradient (see `shrink`),
+    but it is the gradient with its noise that says how r changes with theta."""
+    one, two, known = pair.warped(theta)
+    mean, residual = (one + two) / 2, two - one
+    gradient = derivative(mean, 1), derivative(mean, 0)
+    left = without_lines(residual, known)
+    signal = pair.columns(*_signal(gradient, left / 2, known), mean, residual)
+    weight = known * _row_weights(left, known)[:, None]
+    signal_q = seen(signal, weight, noise_metric(left, known))
+    signal_q *= max(weight.sum(), 1.0) / max(float(np.vdot(signal_q[:, 7], residual)), 1e-300)
+    signal_q, signal = signal_q[:, :7], signal[:, :7]
+    curvature = products(signal_q, pair.columns(*gradient, mean, residual)[:, :7])
+    slope = products(signal_q, residual[:, None])[:, :, 0]
+    for step in range(steps):
+        theta, moved = _stepped(theta, curvature.sum(axis=0), slope.sum(axis=0), believed, ALL)
+        if moved < ENOUGH_PX or step == steps - 1:
             break
-    return Fit(theta, normal, weight, metric, step)
+        one, two, _ = pair.warped(theta)
+        slope = products(signal_q, (two - one)[:, None])[:, :, 0]
+    return Fit(theta, curvature, products(signal_q, signal), slope)
 
 
-def _stepped(theta: Array, normal: Normal, variance: float, believed: Believed, free: Index) -> tuple[Array, float]:
+def _signal(gradient: tuple[Array, Array], noise: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """What of a gradient is signal. Its rows are flattened first: the step from one row to the next holds the offsets
+    of both, and a patch can't tell them from a feature."""
+    gx, gy = (
+        denoised(flatten_rows(slope, known), without_lines(derivative(noise, axis), known))
+        for slope, axis in zip(gradient, (1, 0), strict=True)
+    )
+    return gx, gy
+
+
+def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, free: Index) -> tuple[Array, float]:
     """One step of what is free, and how far the shift moved, px."""
     sub = np.ix_(free, free)
-    matrix = normal.matrix[sub] / variance + believed.precision[sub]
-    vector = normal.vector[free] / variance + (believed.precision @ (theta - believed.mean))[free]
-    step = -np.linalg.solve(matrix + 1e-12 * np.trace(matrix) / free.size * np.eye(free.size), vector)
+    pull = believed.precision @ (theta - believed.mean)
+    step = -np.linalg.solve((curvature + believed.precision)[sub] + 1e-9 * np.eye(free.size), (slope + pull)[free])
     theta = theta.copy()
     theta[free] += step
     return theta, float(np.hypot(*step[:2]))
-
-
-def _pixel_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
-    """Cauchy's, 1 / (1 + (r / 3 s)²)."""
-    scale = 1.4826 * float(np.median(np.abs(residual[known])))
-    weight: Array = 1.0 / (1.0 + (residual / max(3.0 * scale, 1e-12)) ** 2)
-    return weight
 
 
 def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:

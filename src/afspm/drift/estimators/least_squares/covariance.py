@@ -9,21 +9,25 @@ from afspm.drift.estimators.least_squares.align import Believed, Fit
 
 Array = NDArray[np.float64]
 
-INFLATION = 1.5  # few blocks hold most features: the jackknife's own scatter
 FLOOR_PX = 1e-3
 
 
 def covariance(fit: Fit, believed: Believed) -> Array:
-    """(7, 7) of theta: cluster jackknife over blocks of the image (CV3; MacKinnon, Nielsen and Webb, J. Appl. Econom.
-    38, 671, 2023), which allows for noise that is correlated within a block, and the part that the prior stands for."""
-    blocks = fit.normal.blocks
-    blocks = blocks[np.abs(blocks[:, :7, :7]).max(axis=(1, 2)) > 0.0]
-    n = len(blocks)
-    whole = fit.normal.matrix + believed.precision
-    without = whole - blocks[:, :7, :7]
-    change = np.linalg.solve(without, blocks[:, :7, 7:])[:, :, 0]
+    """(7, 7) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982),
+    scaled by what the shift really varies with the blocks of the image left out.
+
+    The variation is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb, J. Appl. Econom. 38, 671, 2023),
+    which allows for noise that is correlated within a block. Of 7 x 7 numbers it would know little, as few blocks hold
+    most of the features: only its size is taken, and only where it is larger.
+    """
+    used = np.abs(fit.curvature).max(axis=(1, 2)) > 0.0
+    n = int(used.sum())
+    whole = fit.curvature.sum(axis=0) + believed.precision
     inverse = np.linalg.inv(whole)
-    total: Array = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse
-    total *= INFLATION
+    model = inverse @ (fit.spread.sum(axis=0) + believed.precision) @ inverse.T
+    change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
+    varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
+    size = float(np.trace(np.linalg.solve(model[:2, :2], varied[:2, :2]))) / 2
+    total: Array = max(size, 1.0) * (model + model.T) / 2
     total[:2, :2] += FLOOR_PX**2 * np.eye(2)
     return total

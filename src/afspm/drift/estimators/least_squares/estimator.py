@@ -26,7 +26,7 @@ from afspm.drift.estimators.least_squares.align import (
 from afspm.drift.estimators.least_squares.covariance import covariance
 from afspm.drift.estimators.least_squares.grid import Grid, onto_common_grid
 from afspm.drift.estimators.least_squares.prepare import Image, Unusable, decimated, decimation, prepare
-from afspm.drift.estimators.least_squares.rows import projected
+from afspm.drift.estimators.least_squares.rows import without_lines
 from afspm.drift.estimators.least_squares.score import Scorer
 from afspm.drift.estimators.least_squares.search import PixelPrior, candidates, channels
 from afspm.drift.estimators.least_squares.spectra import fine_filtered
@@ -82,7 +82,7 @@ class LeastSquares:
         theta = least_squares(smooth, theta, believed, ALL, steps=4)
         fine = fine_filtered(images)
         fit = generalised_least_squares(_pair((fine[0].values, fine[1].values), images, box), theta, believed)
-        theta, total = shear.averaged(fit.theta, covariance(fit, believed), shear.SCALES, np.zeros(4))
+        theta, total = shear.averaged(fit.theta, covariance(fit, believed), shear.models(), np.zeros(4))
         found = _evidence(images, smooth, fit, theta, total, gap)
         return self._registration(theta, total, box, grid, found, expected=prior is not None)
 
@@ -131,7 +131,7 @@ def _pixel_prior(prior: Prior, grid: Grid) -> PixelPrior:
 
 def _believed(prior: PixelPrior | None) -> Believed:
     mean, precision = np.zeros(7), np.zeros((7, 7))
-    precision[2:, 2:] = np.diag([1.0 / GAIN_SD**2, *[1.0 / WIDEST_SHEAR**2] * 4])
+    precision[2:, 2:] = np.diag([1.0 / GAIN_SD**2, *[1 / 0.01**2, 1 / WIDEST_SHEAR**2] * 2])
     if prior is not None:
         mean[:2], precision[:2, :2] = prior.mean, np.linalg.inv(prior.covariance)
     return Believed(mean, precision)
@@ -139,8 +139,7 @@ def _believed(prior: PixelPrior | None) -> Believed:
 
 def _evidence(images: tuple[Image, Image], smooth: Pair, fit: Fit, theta: Array, total: Array, gap: float) -> Evidence:
     one, two, known = smooth.warped(theta)
-    flat = projected(np.stack([one, two], axis=1), known.astype(np.float64), None)[0]
-    one, two = flat[:, 0], flat[:, 1]
+    one, two = without_lines(one, known), without_lines(two, known)
     bands = [channels(image)[2] for image in images]
     edge1, edge2, _ = _pair((bands[0], bands[1]), images, smooth.box).warped(theta)
     rho, z, above = against_surrogates(one, two, known)

@@ -8,8 +8,6 @@ row tells (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Ed
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,65 +16,39 @@ Array = NDArray[np.float64]
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the fine filter colours them
 
 
-@dataclass(frozen=True, eq=False)
-class Normal:
-    """Normal equations of blocks of the image, to be summed.
-
-    Attributes:
-        blocks: (n, 8, 8), J'QJ with the residual as the last column.
-    """
-
-    blocks: Array
-
-    @property
-    def matrix(self) -> Array:
-        """(7, 7)"""
-        total: Array = self.blocks.sum(axis=0)[:7, :7]
-        return total
-
-    @property
-    def vector(self) -> Array:
-        """(7,)"""
-        total: Array = self.blocks.sum(axis=0)[:7, 7]
-        return total
-
-    @property
-    def power(self) -> float:
-        """r'Qr"""
-        return float(self.blocks[:, 7, 7].sum())
-
-
-def projected(columns: Array, weight: Array, metric: Array | None) -> tuple[Array, Array]:
-    """Rows without their offset and tilt.
+def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
+    """Q f less what lines explain of it, so that the product with another image g is f'Qg free of both their lines.
 
     Args:
         columns: [y, column, x].
-        weight: [y, x] of each pixel; 0 where nothing is known.
+        weight: [y, x] of each pixel; 0 where nothing is known. f and g are multiplied with its root.
         metric: Q, (x, x); None: white noise.
 
     Returns:
-        f and Q f, each like `columns`.
+        Like `columns`; the root of the weight of g is in it.
     """
     root = np.sqrt(weight)[:, None, :]
-    rows = columns * root
     x = np.linspace(-1.0, 1.0, columns.shape[2])
-    nuisance = np.concatenate([root, root * x], axis=1)
-    seen, nuisance_seen = (rows, nuisance) if metric is None else (rows @ metric, nuisance @ metric)
-    gram = nuisance @ nuisance_seen.transpose(0, 2, 1)
-    gram += 1e-9 * np.eye(2)  # rows of which nothing is known
-    fitted = np.linalg.solve(gram, nuisance_seen @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
-    return rows - fitted @ nuisance, seen - fitted @ nuisance_seen
+    rows, lines = columns * root, np.concatenate([root, root * x], axis=1)
+    rows_q, lines_q = (rows, lines) if metric is None else (rows @ metric, lines @ metric)
+    gram = lines @ lines_q.transpose(0, 2, 1) + 1e-9 * np.eye(2)  # there may be rows of which nothing is known
+    fitted = np.linalg.solve(gram, lines_q @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
+    found: Array = (rows_q - fitted @ lines_q) * root
+    return found
 
 
-def normal_equations(columns: Array, weight: Array, metric: Array | None, block_rows: int = 8) -> Normal:
-    """Of blocks of `block_rows` rows and half of their length."""
-    rows, seen = projected(columns, weight, metric)
-    ny, _, nx = rows.shape
-    half = nx // 2
-    parts = [rows[:, :, s] @ seen[:, :, s].transpose(0, 2, 1) for s in (slice(0, half), slice(half, nx))]
-    starts = np.arange(0, ny, block_rows)
-    blocks = np.concatenate([np.add.reduceat(part, starts, axis=0) for part in parts])
-    return Normal((blocks + blocks.transpose(0, 2, 1)) / 2)
+def without_lines(values: Array, known: NDArray[np.bool_]) -> Array:
+    """Each row, [y, x], less the straight line fitted to it; 0 where nothing is known."""
+    return seen(values[:, None], known.astype(np.float64), None)[:, 0]
+
+
+def products(one: Array, two: Array, block_rows: int = 8) -> Array:
+    """Sums over blocks of `block_rows` rows and half of their length of the products of columns, [y, column, x] each:
+    (block, columns of one, columns of two)."""
+    half = one.shape[2] // 2
+    parts = [one[:, :, s] @ two[:, :, s].transpose(0, 2, 1) for s in (slice(0, half), slice(half, None))]
+    starts = np.arange(0, one.shape[0], block_rows)
+    return np.concatenate([np.add.reduceat(part, starts, axis=0) for part in parts])
 
 
 def noise_metric(residual: Array, known: NDArray[np.bool_]) -> Array | None:

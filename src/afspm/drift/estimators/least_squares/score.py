@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from afspm.drift.estimators.least_squares.acceptance import correlated
 from afspm.drift.estimators.least_squares.align import SHIFT, Believed, least_squares
 from afspm.drift.estimators.least_squares.prepare import Image
-from afspm.drift.estimators.least_squares.rows import projected
+from afspm.drift.estimators.least_squares.rows import without_lines
 from afspm.drift.estimators.least_squares.search import PixelPrior, channels
 from afspm.drift.estimators.least_squares.spectra import independent_values
 from afspm.drift.estimators.least_squares.warp import Box, Pair, Spline
@@ -62,7 +62,6 @@ class Scorer:
         likelihood = 0.0 if self._prior is None else -0.5 * float(self._prior.chi2(theta[:2]))
         for first, second, density in self._channels:
             one, two, known = Pair(first, second, box).warped(theta)
-            columns = projected(np.stack([one, two], axis=1), known.astype(np.float64), None)[0]
-            rho = max(correlated(columns[:, 0].ravel(), columns[:, 1].ravel()), 0.0)
+            rho = max(correlated(without_lines(one, known).ravel(), without_lines(two, known).ravel()), 0.0)
             likelihood -= 0.5 * density * known.sum() * np.log1p(-(min(rho, 0.99999) ** 2))
         return Scored(theta[:2], likelihood)

@@ -2,35 +2,62 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SCALES = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)
+DRIFTS = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)  # pixels per row
+TURNS_RAD = (2e-4, 0.002, 0.01)
+ANYTHING = (2e-4, 0.003, 0.01)  # of each element: creep, calibration
 
 
-def averaged(theta: Array, covariance: Array, scales: tuple[float, ...], mean: Array) -> tuple[Array, Array]:
-    """Bayesian model averaging over the standard deviation of the linear map (Hoeting, Stat. Sci. 14, 382, 1999).
+def of_drift(sd: float) -> Array:
+    """Covariance of (axx, axy, ayx, ayy) when drift during the scans shears them: each row is displaced against the one
+    before, so what depends on y varies alone."""
+    return sd**2 * np.diag([0.0, 1.0, 0.0, 1.0])
 
-    Each scale is a model in which the elements of the map are normal about `mean` with that deviation: it conditions
-    the shift on what the map may be, and weighs by how likely the map found is in it.
+
+def of_turn(sd_rad: float) -> Array:
+    """The same of a small rotation."""
+    turn = np.array([0.0, 1.0, -1.0, 0.0])
+    return sd_rad**2 * np.outer(turn, turn)
+
+
+def models(drift: float | None = None) -> list[Array]:
+    """What the linear map may be: covariances of it.
+
+    Args:
+        drift: pixels per row; None: not known, so all are tried.
+    """
+    besides = [of_turn(t) + ANYTHING[0] ** 2 * np.eye(4) for t in TURNS_RAD] + [a**2 * np.eye(4) for a in ANYTHING[1:]]
+    return [of_drift(d) + more for d, more in itertools.product(DRIFTS if drift is None else (drift,), besides)]
+
+
+def averaged(theta: Array, covariance: Array, covariances: Iterable[Array], mean: Array) -> tuple[Array, Array]:
+    """Bayesian model averaging over what the linear map may be (Hoeting, Stat. Sci. 14, 382, 1999).
+
+    Where features are few, shift and shear are nearly the same thing, and what shear is plausible decides the shift.
+    Each model says that the map is normal about `mean` with its covariance; it conditions the shift on that, and weighs
+    by how likely the map found is in it.
 
     Returns:
         theta and its covariance, the moments of the mixture.
     """
-    weights, thetas, covariances = [], [], []
-    for scale in scales:
-        spread = covariance[3:, 3:] + scale**2 * np.eye(4)
-        off = theta[3:] - mean
+    weights, thetas, totals = [], [], []
+    off = theta[3:] - mean
+    for model in covariances:
+        spread = covariance[3:, 3:] + model
         gain = covariance[:, 3:] @ np.linalg.inv(spread)
         weights.append(-0.5 * off @ np.linalg.solve(spread, off) - 0.5 * np.linalg.slogdet(spread)[1])
         thetas.append(theta - gain @ off)
-        covariances.append(covariance - gain @ covariance[3:])
-    w = np.exp(np.array(weights) - max(weights))
-    w /= w.sum()
-    all_thetas = np.array(thetas)
-    best: Array = w @ all_thetas
-    off = all_thetas - best
-    total: Array = np.einsum("k,kij->ij", w, np.array(covariances)) + np.einsum("k,ki,kj->ij", w, off, off)
+        totals.append(covariance - gain @ covariance[3:])
+    weight = np.exp(np.array(weights) - max(weights))
+    weight /= weight.sum()
+    best: Array = weight @ np.array(thetas)
+    apart = np.array(thetas) - best
+    total: Array = np.tensordot(weight, np.array(totals), 1) + np.einsum("k,ki,kj->ij", weight, apart, apart)
     return best, total

@@ -93,18 +93,11 @@ class Pair:
         two, known2 = self.second.at(x + dx / 2, y + dy / 2)
         return np.exp(theta[2] / 2) * one, np.exp(-theta[2] / 2) * two, known1 & known2
 
-    def linearised(self, theta: Array) -> tuple[Array, Mask]:
-        """What Gauss-Newton needs.
-
-        Returns:
-            [y, 8, x]: the derivatives of the residual by theta, then the residual r = second - first; and where known.
-        """
-        one, two, known = self.warped(theta)
-        mean = (one + two) / 2
+    def columns(self, gx: Array, gy: Array, mean: Array, residual: Array) -> Array:
+        """[y, 8, x]: the derivatives of the residual by theta, given the gradient of the mean; and the residual."""
         cx, cy = self.box.center
         x, y = self.box.x[None, :] - cx, self.box.y[:, None] - cy
-        gx, gy = derivative(mean, axis=1), derivative(mean, axis=0)
-        return np.stack([gx, gy, -mean, gx * x, gx * y, gy * x, gy * y, two - one], axis=1), known
+        return np.stack([gx, gy, -mean, gx * x, gx * y, gy * x, gy * y, residual], axis=1)
 
 
 def derivative(values: Array, axis: int) -> Array:
