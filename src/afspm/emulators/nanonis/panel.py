@@ -1,0 +1,328 @@
+"""What Nanonis' software has set and is doing, with the simulated instrument behind it, and the files that it saves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PureWindowsPath
+from typing import Any, Final
+
+import numpy as np
+
+from afspm.clock import Clock
+from afspm.emulators.faults import Faults
+from afspm.emulators.nanonis import files
+from afspm.emulators.rig import Rig
+from afspm.emulators.running import RunningScan, RunningSpectrum
+from afspm.model import Region
+
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    "file-late": "a file appears only after the duration",
+    "half-file": "a file is half written, and whole only after the duration",
+    "file-missing": "a file is announced and never written",
+    "autosave-off": "scans and spectra are not saved for the duration, whatever is set",
+    "safe-tip": "the safe tip withdraws the tip and ends the scan",
+    "panel-stop": "somebody stops the scan at the panel",
+}
+MODULES: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
+_PIXELS_AT_ONCE: Final = 16
+_SIGNALS: Final = {"Current": 0, "Height": 14, "Phase": 16, "Amplitude": 17}
+_NAMES: Final = {"Height": "Z"}
+_COLUMNS: Final = {"Bias": "Bias calc", "Z": "Z rel"}
+_EXPERIMENTS: Final = {"IV": "bias spectroscopy", "force": "Z spectroscopy"}
+_BASE_NAMES: Final = {"IV": "Bias-Spectroscopy", "force": "Z-Spectroscopy"}
+
+
+@dataclass
+class Scanning:
+    """A scan that was started: as the panel was then."""
+
+    scan: RunningScan
+    frame: tuple[float, float, float, float, float]
+    line_s: tuple[float, float]
+    channels: list[int]
+
+
+class Panel:
+    """The state of the software.
+
+    Args:
+        folder: the session folder; told to clients as `session_path`.
+
+    Attributes:
+        frame: x, y, width, height in m, angle clockwise in degrees.
+        speed: forward, backward in m/s and s a line, whether the time is kept (and not the speed), their ratio.
+        autosave: "all", "next" or "off".
+        ends: how many scans have ended; `last_path` where the last was saved.
+        z_controller: "off", "on" or "safe"; `z_follows_s` is when it follows what was set.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        faults: Faults,
+        clock: Clock,
+        folder: Path,
+        *,
+        session_path: str,
+        range_m: float,
+        release: int,
+        rows_as_recorded: bool,
+    ) -> None:
+        self.rig, self.faults, self.clock = rig, faults, clock
+        self.folder, self.session_path = folder, session_path or str(folder)
+        self.range_m = (range_m, range_m, 2e-6)
+        self.signals = _signal_names(rig.channels)
+        self.channels = sorted(_SIGNALS[name] for name in rig.channels if name in _SIGNALS)
+        self.pixels, self.lines = 128, 128
+        self.frame = (0.0, 0.0, 1e-6, 1e-6, 0.0)
+        self.speed = (2e-6, 2e-6, 0.5, 0.5, 0, 1.0)
+        self.continuous = self.bouncy = False
+        self.autosave, self.series, self.comment, self.modules = "all", "unnamed", "", ["Z-Controller"]
+        self.scanning: Scanning | None = None
+        self.last: Scanning | None = None
+        self.curve: RunningSpectrum | None = None
+        self.curve_name, self.curves_ended = "", 0
+        self.autosave_curves = {"BiasSpectr": True, "ZSpectr": True}
+        self.curve_names = dict(_BASE_NAMES)
+        self.ends, self.last_path = 0, ""
+        self.z_controller = "on" if rig.feedback.on else "off"
+        self.z_follows_s = 0.0
+        self.own_speed, self.own_speed_m_s = True, rig.move_speed_m_s
+        self.registers: dict[str, tuple[Any, ...]] = {}
+        self._late: list[tuple[float, Path, bytes]] = []
+        self._saved = {".sxm": 0, ".dat": 0}
+        self.release, self.rows_as_recorded = release, rows_as_recorded
+
+    # --- what happens by itself ---
+
+    def advance(self, now_s: float) -> float | None:
+        """Up to now; returns when a file is to be written."""
+        self._go_wrong(now_s)
+        if self.scanning is not None and not self.scanning.scan.running(now_s):
+            self._end_scan(self.scanning, now_s)
+        if self.curve is not None and not self.curve.running(now_s):
+            self._end_curve(self.curve, now_s)
+        due = [late for late in self._late if late[0] <= now_s]
+        self._late = [late for late in self._late if late[0] > now_s]
+        for _, path, content in due:
+            path.write_bytes(content)
+        return min((late[0] for late in self._late), default=None)
+
+    def _go_wrong(self, now_s: float) -> None:
+        if self.scanning is not None and self.faults.strikes("panel-stop", now_s):
+            self.rig.stop_scan()
+        if self.faults.strikes("safe-tip", now_s):
+            self.rig.withdraw()
+            self.z_controller = "safe"
+
+    def start_scan(self, upwards: bool) -> None:
+        """Raises RigBusy."""
+        x, y, width, height, clockwise_deg = self.frame
+        size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
+        self.rig.region = Region((x, y), size_m, -math.radians(clockwise_deg))
+        self.rig.shape = (self.lines, self.pixels)
+        forward_s, backward_s = self.speed[2:4]
+        self.rig.line_s, self.rig.upwards = forward_s + backward_s, upwards
+        scan = self.rig.start_scan()
+        self.scanning = self.last = Scanning(scan, self.frame, (forward_s, backward_s), list(self.channels))
+
+    def _end_scan(self, ended: Scanning, now_s: float) -> None:
+        self.scanning = None
+        finished = ended.scan.stopped_s is None
+        self.last_path = self.save_scan(ended, now_s) if finished and self._saves(now_s) else ""
+        self.ends += 1
+        if finished and self.continuous:
+            self.start_scan(ended.scan.upwards != self.bouncy)
+
+    def _saves(self, now_s: float) -> bool:
+        if self.autosave == "off" or self.faults.lasts("autosave-off", now_s):
+            return False
+        self.autosave = "off" if self.autosave == "next" else self.autosave
+        return True
+
+    def start_curve(self, module: str, base_name: str) -> None:
+        """Raises RigBusy."""
+        kind = MODULES[module]
+        self.curve_names[kind] = base_name or self.curve_names[kind]
+        self.curve = self.rig.start_spectrum(kind)
+
+    def stop_curve(self) -> None:
+        if self.curve is not None:
+            self.rig.stop_spectrum()
+            self.curve = None
+            self.curves_ended += 1
+
+    def _end_curve(self, curve: RunningSpectrum, now_s: float) -> None:
+        self.curve = None
+        self.curves_ended += 1
+        module = next(name for name, kind in MODULES.items() if kind == curve.kind)
+        if self.autosave_curves[module] and not self.faults.lasts("autosave-off", now_s):
+            content = files.dat(self._curve_header(curve, now_s), curve_columns(curve), curve.values)
+            self._save(self._next_name(self.curve_names[curve.kind], 5, ".dat"), content, now_s)
+
+    # --- what is set ---
+
+    def set_buffer(self, channels: list[int], pixels: int, lines: int) -> None:
+        """The pixels of a line come in packages of 16: any other number is made one of those."""
+        ratio = self.lines / self.pixels
+        self.channels = channels or self.channels
+        self.pixels = max(_PIXELS_AT_ONCE, round(pixels / _PIXELS_AT_ONCE) * _PIXELS_AT_ONCE)
+        self.lines = lines or max(1, round(self.pixels * ratio))
+
+    def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> None:
+        """What does not fit into the scanner's range is made to."""
+        width, height = min(width, self.range_m[0]), min(height, self.range_m[1])
+        x, y = (
+            float(np.float32(np.clip(value, (size - whole) / 2, (whole - size) / 2)))
+            for value, size, whole in zip((x, y), (width, height), self.range_m, strict=False)
+        )
+        self.frame = (x, y, width, height, angle_deg)
+        forward, backward, forward_s, backward_s, keeps_time, ratio = self.speed
+        if keeps_time:
+            forward, backward = width / forward_s, width / backward_s
+        else:
+            forward_s, backward_s = width / forward, width / backward
+        self.speed = (forward, backward, forward_s, backward_s, keeps_time, ratio)
+
+    def set_z_controller(self, now_s: float, *, on: bool, off_delay_s: float = 0.0) -> None:
+        """It follows after the delay; switched on it brings a withdrawn tip back."""
+        self.z_controller = "on" if on else "off"
+        self.z_follows_s = now_s + (0.0 if on else off_delay_s)
+        self.rig.feedback = replace(self.rig.feedback, on=on)
+        if on:
+            self.rig.engaged = True
+
+    def z_status(self, now_s: float) -> int:
+        """Off 1, on 2, hold 3, switching off 4, safe tip 5, withdrawing 6."""
+        if self.rig.doing(now_s) == "approach" and not self.rig.engaged:
+            return 6
+        if self.z_controller == "off" and now_s < self.z_follows_s:
+            return 4
+        return {"off": 1, "on": 2, "safe": 5}[self.z_controller]
+
+    def z_is_on(self, now_s: float) -> bool:
+        """As the real-time part has it."""
+        return self.z_status(now_s) in (2, 4)
+
+    # --- pictures and files ---
+
+    def images(self, scanning: Scanning, until_s: float | None) -> dict[int, tuple[str, str, np.ndarray, np.ndarray]]:
+        """By channel: name, unit, forward and backward [y, x], lines not yet scanned NaN."""
+        drawn = scanning.scan.channels(until_s)
+        found = {}
+        for channel, (unit, values) in drawn.items():
+            if channel in _SIGNALS:
+                back = drawn.get(f"{channel} Retrace", (unit, values))[1]
+                found[_SIGNALS[channel]] = (_NAMES.get(channel, channel), unit, values, back)
+        nothing = np.zeros(scanning.scan.shape)
+        for index in scanning.channels:
+            if index not in found:
+                name, _, unit = self.signals[index].removesuffix(")").rpartition(" (")
+                found[index] = (name, unit, nothing, nothing)
+        return {index: found[index] for index in scanning.channels}
+
+    def save_scan(self, ended: Scanning, now_s: float) -> str:
+        """Save it, as well as the faults allow. Returns where it is said to be."""
+        name = self._next_name(self.series, 3, ".sxm")
+        path = self.told_path(name)
+        scan, feedback = ended.scan, ended.scan.feedback
+        images = self.images(ended, scan.stopped_s)
+        x, y, width, height, angle_deg = ended.frame
+        integral = feedback.integral_gain or 0.0
+        z = (
+            "log Current",
+            bool(feedback.on),
+            feedback.setpoint or 0.0,
+            "A",
+            feedback.proportional_gain or 0.0,
+            integral,
+        )
+        saved = files.SavedScan(
+            path,
+            scan.start_s,
+            scan.end_s - scan.start_s,
+            (x, y),
+            (width, height),
+            angle_deg,
+            scan.upwards,
+            ended.line_s,
+            scan.bias_v,
+            z,
+            self.comment,
+            [(index, *image) for index, image in images.items()],
+            self._settings(ended, images),
+        )
+        self._save(name, files.sxm(saved), now_s)
+        return path
+
+    def told_path(self, name: str) -> str:
+        """How a file of the session is called on the controller's computer."""
+        windows = "\\" in self.session_path
+        return str(PureWindowsPath(self.session_path) / name) if windows else str(Path(self.session_path) / name)
+
+    def _settings(
+        self, ended: Scanning, images: Mapping[int, tuple[str, str, np.ndarray, np.ndarray]]
+    ) -> dict[str, str]:
+        scan, number = ended.scan, files.engineering
+        return {
+            "NanonisMain>Session Path": self.session_path,
+            "NanonisMain>SW Version": "Generic 5",
+            "Bias>Bias (V)": number(scan.bias_v),
+            "Z-Controller>Controller status": "ON" if scan.feedback.on else "OFF",
+            "Z-Controller>Setpoint": number(scan.feedback.setpoint or 0.0),
+            "Scan>Scanfield": ";".join(number(value) for value in ended.frame),
+            "Scan>series name": self.series,
+            "Scan>channels": ";".join(f"{name} ({unit})" for name, unit, _, _ in images.values()),
+            "Scan>pixels/line": str(scan.shape[1]),
+            "Scan>lines": str(scan.shape[0]),
+            "Scan>speed forw. (m/s)": number(ended.frame[2] / ended.line_s[0]),
+            "Scan>speed backw. (m/s)": number(ended.frame[2] / ended.line_s[1]),
+        }
+
+    def _curve_header(self, curve: RunningSpectrum, now_s: float) -> dict[str, str]:
+        (x, y), number = curve.position_m, files.engineering
+        return {
+            "Experiment": _EXPERIMENTS[curve.kind],
+            "Saved Date": files.moment(now_s),
+            "User": "",
+            "Date": "",
+            "X (m)": number(x),
+            "Y (m)": number(y),
+            "Z (m)": number(0.0),
+            "Start time": files.moment(curve.start_s),
+            "Bias>Bias (V)": number(self.rig.bias_v),
+        }
+
+    def _next_name(self, base: str, digits: int, suffix: str) -> str:
+        self._saved[suffix] += 1
+        return f"{base}{self._saved[suffix]:0{digits}d}{suffix}"
+
+    def _save(self, name: str, content: bytes, now_s: float) -> None:
+        path = self.folder / name
+        if self.faults.strikes("file-missing", now_s):
+            return
+        late, half = self.faults.strikes("file-late", now_s), self.faults.strikes("half-file", now_s)
+        if late or half:
+            self._late.append((now_s + (late or half).duration_s, path, content))  # type: ignore[union-attr]
+        if not late:
+            path.write_bytes(content[: len(content) // 2] if half else content)
+
+
+def curve_columns(curve: RunningSpectrum) -> list[str]:
+    """As Nanonis names them: "Current [bwd] (A)"."""
+    columns = []
+    for name, unit in zip(curve.names, curve.units, strict=True):
+        forward = name.removesuffix(" Retrace")
+        columns.append(f"{_COLUMNS.get(forward, forward)}{'' if forward == name else ' [bwd]'} ({unit})")
+    return columns
+
+
+def _signal_names(units: Mapping[str, str]) -> list[str]:
+    """128 of them, as the signals manager has."""
+    signals = [f"Input {number + 1} (V)" for number in range(128)]
+    for name, index in _SIGNALS.items():
+        signals[index] = f"{_NAMES.get(name, name)} ({units.get(name, 'V')})"
+    signals[24] = "Bias (V)"
+    return signals

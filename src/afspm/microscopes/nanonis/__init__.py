@@ -1,0 +1,320 @@
+"""Nanonis (SPECS), over the TCP programming interface of its own software. See the README beside this."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.errors import ConfigError, FileError, Refused
+from afspm.microscopes.in_force import FRAME, frame
+from afspm.microscopes.microscope import ControllerLost, Microscope, action
+from afspm.microscopes.nanonis import fetched, groups, protocol
+from afspm.microscopes.nanonis.activity import Activity
+from afspm.microscopes.nanonis.harvest import SCAN, Harvest
+from afspm.microscopes.nanonis.session import MODULES, Session
+from afspm.microscopes.nanonis.told import Told
+from afspm.microscopes.parameters import Value
+from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.units import Duration
+
+_AT_FIRST: Final[dict[str, Value]] = {
+    names.SCAN_DIRECTION: names.UP,
+    names.SPEC_KIND: "IV",
+    names.PULSE_VOLTAGE: 4.0,
+    names.PULSE_DURATION: 0.1,
+    names.CRASH_SPEED: 10e-9,
+    names.CRASH_DEPTH: 1e-9,
+}
+_AT_ONCE: Final = 0
+"""To what could also wait until it is done."""
+
+
+class Nanonis(Microscope):
+    """The microscope behind a Nanonis controller.
+
+    Args:
+        address: "host:port,port": two of the ports at File > Settings > TCP, as each serves one client. One is enough
+            for an emulator.
+        session_dir: where Nanonis' session folder is seen from here; left out: Nanonis runs on this computer.
+            What can't be seen is fetched over TCP.
+        release: of Nanonis' software (Help > Info), where it can't tell or tells wrong.
+        reply_timeout_s: how long it may take to answer, in real time.
+        autosave: whether Nanonis is to save every scan; if not, what its panel says is left alone.
+        grabbed_rows, grabbed_backward: see `fetched.Grabbing`.
+        parameters, actions, poll_period_s, result_timeout_s, live_lines_s: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    max_pixels: ClassVar[int] = 8192 * 8192
+
+    def __init__(
+        self,
+        *,
+        address: str = "127.0.0.1:6501,6502",
+        session_dir: str | None = None,
+        release: int | None = None,
+        reply_timeout_s: Duration = 5.0,
+        autosave: bool = True,
+        grabbed_rows: str = "top-first",
+        grabbed_backward: str = "mirrored",
+        parameters: Mapping[str, Mapping[str, Any]] | None = None,
+        actions: Mapping[str, Mapping[str, Any]] | None = None,
+        poll_period_s: Duration = 0.1,
+        result_timeout_s: Duration = 10.0,
+        live_lines_s: Duration | None = None,
+    ) -> None:
+        super().__init__(
+            parameters=parameters,
+            actions=actions,
+            poll_period_s=poll_period_s,
+            result_timeout_s=result_timeout_s,
+            live_lines_s=live_lines_s,
+        )
+        self._addresses = _addresses(address)
+        self._session_dir = None if session_dir is None else Path(session_dir)
+        self._release = release
+        self._reply_timeout_s = reply_timeout_s
+        self._autosave = autosave
+        self._grabbing = fetched.Grabbing(grabbed_rows, grabbed_backward)
+        self._session: Session | None = None
+        self._told = Told()
+        self._probe = groups.Probe()
+        self._groups: list[groups.Group] = []
+
+    def connect(self) -> None:
+        """Both connections, the release, and the modules that only answer once they are open."""
+        self.close()
+        session = self._session = Session(
+            self._addresses,
+            self._reply_timeout_s,
+            self._release,
+            monotonic_s=self.clock.monotonic_s,
+            wake=self.wake,
+            log=self.log,
+        )
+        if not self._groups:
+            self._kept: dict[str, Any] = self.memory.setdefault("kept", {})
+            kept = groups.Kept(self._kept, _AT_FIRST)
+            on = groups.FeedbackOn(self.clock.monotonic_s, self._reply_timeout_s)
+            self._groups = [*groups.OTHERS, self._probe, on, kept]
+            own_folder = (self.run_dir / "scans").resolve()
+            patience_s = self.result_timeout_s / 2
+            self._harvest = Harvest(self.memory, self._session_dir, own_folder, patience_s, self.log)
+        self._activity = Activity(session, self._harvest, self._probe, self.clock, self.log)
+        folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
+        if not folder.is_dir():
+            self.log.warning("%s can't be seen from here: all data is fetched over TCP (set session_dir)", folder)
+
+    def close(self) -> None:
+        """End both connections. What was begun goes on."""
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def _ask(self, name: str, *arguments: Any) -> tuple[Any, ...]:
+        if self._session is None:
+            raise ControllerLost("Nanonis is not connected")
+        return self._session.ask(name, *arguments)
+
+    def status(self) -> ScopeStatus:
+        """What Nanonis is doing now."""
+        return self._activity.status()
+
+    def next_change_s(self) -> float | None:
+        """When a move, a pulse or the wait for a file is over."""
+        return self._activity.next_change_s()
+
+    # --- parameters ---
+
+    def read(self, wanted: Collection[str]) -> dict[str, Value]:
+        """What is in force: as it was set, where Nanonis has it to a float32."""
+        found: dict[str, Value] = {}
+        for group in self._groups:
+            if not set(group.names).isdisjoint(wanted):
+                found.update(group.read(self._ask))
+        found.update(super().read([name for name in wanted if name not in found]))
+        exact = self._told.exactly(found)
+        return {name: exact[name] for name in wanted}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        """Each group by one command, those of a single value last."""
+        left = dict(values)
+        for group in self._groups:
+            asked = {name: left.pop(name) for name in group.names if name in left}
+            if asked and group is self._probe:
+                self._send_probe(asked)
+            elif asked:
+                group.write(self._ask, asked)
+        super().write(left)
+        self._told.keep(values)
+
+    def get(self, vendor: str) -> Value:
+        """By the name of a pair of functions: "Bias." is Bias.Get."""
+        value: Value = groups.numbers(self._ask, f"{vendor}Get")[0]
+        return value
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        """By the names of pairs of functions, one after the other."""
+        for vendor, value in values.items():
+            self._ask(f"{vendor}Set", value)
+
+    def _send_probe(self, asked: Mapping[str, Value]) -> None:
+        before = self._probe.read(self._ask)
+        self._probe.write(self._ask, asked)
+        after = self._probe.read(self._ask)
+        way_m = math.hypot(*(float(after[name]) - float(before[name]) for name in self._probe.names))
+        speed_m_s = float(self.read([names.MOVE_SPEED])[names.MOVE_SPEED])
+        self._activity.sets_out(way_m / speed_m_s if speed_m_s > 0.0 else 0.0)
+
+    # --- results ---
+
+    def results(self) -> Sequence[str]:
+        """The last files that Nanonis saved, and of ours with what it did not."""
+        return self._harvest.results(self.clock.now_s(), self._fetch)
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        """Read a file."""
+        return self._harvest.load(result)
+
+    def _fetch(self, ended: Mapping[str, Any]) -> Sequence[Scan | Spectrum]:
+        if ended["what"] == SCAN:
+            x, y, width, height, angle = ended["frame"]
+            region = Region((x, y), (width, height), angle)
+            found = fetched.images(self._ask, self._grabbing)
+            return [Scan(region, image.name, image.unit, image.values) for image in found]
+        curve, self._activity.curve = self._activity.curve, None
+        if curve is None:
+            raise FileError("Nanonis was not asked for its data")
+        return [fetched.spectrum(curve, ended["what"], (ended["position"][0], ended["position"][1]))]
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        """From Nanonis' memory, where lines that were not scanned yet are NaN."""
+        region, _ = frame(self.read(FRAME))
+        return fetched.new_lines(fetched.images(self._ask, self._grabbing), region, start)
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once, in the direction of `x-scan-direction`."""
+        self._activity.refuse_safe_tip()
+        self._prepare_panel()
+        self._activity.begin_scan(frame(self.read(FRAME))[0])
+        start = 0
+        try:
+            self._ask("Scan.Action", start, int(self._kept[names.SCAN_DIRECTION] == names.UP))
+        except protocol.NanonisError:
+            self._activity.forget()
+            raise
+        self._activity.settle("Scan.StatusGet")
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        """Break the scan off."""
+        stop, no_direction = 1, 0
+        self._ask("Scan.Action", stop, no_direction)
+        self._activity.stopping = True
+        self._harvest.forget()
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a spectrum of the kind `x-spec-kind` where the tip is."""
+        self._activity.refuse_safe_tip()
+        kind = str(self._kept[names.SPEC_KIND])
+        if self._session is not None and MODULES[kind] not in self._session.opened:
+            raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis has no module {MODULES[kind]}, or can't open it")
+        self._activity.start_curve(kind)
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        """Break the spectrum off."""
+        for module in MODULES.values():
+            if self._session is not None and module in self._session.opened and self._ask(f"{module}.StatusGet")[0]:
+                self._ask(f"{module}.Stop")
+        self._activity.stopping = True
+        self._harvest.forget()
+
+    @action(names.PULSE, state=ScopeState.BUSY_PARAM)
+    def pulse(self) -> None:
+        """A bias pulse of `x-pulse-voltage` for `x-pulse-duration`, the z controller on hold meanwhile."""
+        duration_s = float(self._kept[names.PULSE_DURATION])
+        hold, absolute = 1, 2
+        self._ask("Bias.Pulse", _AT_ONCE, duration_s, float(self._kept[names.PULSE_VOLTAGE]), hold, absolute)
+        self._activity.occupied(ScopeState.BUSY_PARAM, duration_s)
+
+    @action(names.CRASH, state=ScopeState.MOVING)
+    def crash(self) -> None:
+        """The tip shaper: `x-crash-depth` down at `x-crash-speed`, up again, and the z controller as it was."""
+        self._activity.refuse_safe_tip()
+        depth_m, ramp_s = float(self._kept[names.CRASH_DEPTH]), 0.0
+        ramp_s = depth_m / float(self._kept[names.CRASH_SPEED])
+        bias_v = groups.numbers(self._ask, "Bias.Get")[0]
+        same_bias, settle_s, restore, no_timeout = 2, 0.1, 1, -1
+        before = (settle_s, same_bias, bias_v)
+        self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
+        self._ask("TipShaper.Start", _AT_ONCE, no_timeout)
+        self._activity.occupied(ScopeState.MOVING, 2 * ramp_s + 4 * settle_s)
+
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        """Withdraw the tip by its piezo, whatever is going on."""
+        if self._ask("Scan.StatusGet")[0]:
+            self.stop_scan()
+        elif self._harvest.what:
+            self.stop_spec()
+        no_timeout = -1
+        self._ask("ZCtrl.Withdraw", _AT_ONCE, no_timeout)
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """The z controller on: it brings the tip back that `x-retract` or the safe tip has withdrawn."""
+        on = 1
+        self._ask("ZCtrl.OnOffSet", on)
+
+    def command(self, text: str) -> None:
+        """A function with its arguments, e.g. "AutoApproach.OnOffSet 1"."""
+        name, *words = shlex.split(text)
+        codes = [code for code, _ in protocol.function(name).arguments]
+        try:
+            arguments = [_argument(code, word) for code, word in zip(codes, words, strict=True)]
+        except ValueError as error:
+            reason = f"{text!r}: the arguments of {name} are {' '.join(codes) or 'none'}"
+            raise Refused(ControlResponse.ACTION_ERROR, reason) from error
+        self._ask(name, *arguments)
+
+    def _prepare_panel(self) -> None:
+        """One scan, in the direction that was asked for, and saved: told to Nanonis only if its panel says otherwise.
+
+        What is got is not set as it is: continuous, bouncy and autosave count differently there.
+        """
+        continuous, bouncy, autosave, series, comment, *rest = self._ask("Scan.PropsGet")
+        save = self._autosave and autosave != 0
+        if continuous or bouncy or save:
+            no_change, off, save_all = 0, 2, 1
+            modules = rest[0] if rest else []
+            autosave = save_all if save else no_change
+            self._ask("Scan.PropsSet", off, off, autosave, series, comment, modules, no_change)
+
+
+def _argument(code: str, word: str) -> Any:
+    if code in "HIi":
+        return int(word)
+    if code in "fd":
+        return float(word)
+    if code == "S":
+        return word
+    raise ValueError(code)
+
+
+def _addresses(text: str) -> list[tuple[str, int]]:
+    host, _, ports = text.rpartition(":")
+    try:
+        found = [(host, int(port)) for port in ports.split(",") if host]
+    except ValueError:
+        found = []
+    if not found:
+        raise ConfigError(f"{text!r} is no address", where="address", hint='"host:port,port"')
+    return found

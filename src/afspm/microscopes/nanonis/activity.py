@@ -1,0 +1,207 @@
+"""What Nanonis is doing, from what both connections say of it."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Final
+
+from afspm.clock import Clock
+from afspm.errors import Refused
+from afspm.microscopes.in_force import frame
+from afspm.microscopes.microscope import ControllerLost
+from afspm.microscopes.nanonis.groups import Probe, ScanFrame
+from afspm.microscopes.nanonis.harvest import SCAN, Harvest
+from afspm.microscopes.nanonis.listener import CurveEnded, Failed, Heard, ScanEnded
+from afspm.microscopes.nanonis.session import APPROACH, MODULES, Session
+from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+
+_SETTLES_S: Final = 1.0
+"""So long, in real time, what was begun may take to be seen running."""
+_LATEST_S: Final = 10.0
+"""So much later than it should the tip may arrive, in experiment time."""
+_SAFE_TIP, _WITHDRAWING = 5, 6
+
+
+class Activity:
+    """See the module.
+
+    Attributes:
+        curve: the data of the last spectrum, once it has ended.
+        stopping: what is running was told to stop: nothing comes of it.
+    """
+
+    def __init__(self, session: Session, harvest: Harvest, probe: Probe, clock: Clock, log: logging.Logger) -> None:
+        self._ask = session.ask
+        self._listener = session.listener
+        self._opened = session.opened
+        self._harvest = harvest
+        self._probe = probe
+        self._clock = clock
+        self._log = log
+        self.curve: CurveEnded | None = None
+        self.stopping = False
+        self._kind_asked = ""
+        self._told: str | None = None
+        self._occupied = (ScopeState.FREE, 0.0)
+        self._arrives_s = 0.0
+        self._was_safe = False
+
+    # --- what is begun ---
+
+    def begin_scan(self, region: Region) -> None:
+        """A scan of a frame begins, or was found running."""
+        self.stopping = False
+        self._listener.scan()
+        taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad]}
+        self._harvest.begin(SCAN, self._session_folder(), taken)
+
+    def begin_curve(self, kind: str) -> None:
+        """A spectrum begins, or was found running."""
+        self.stopping = False
+        position = self._probe.read(self._ask)
+        taken = {"position": [float(position[name]) for name in self._probe.names]}
+        self._harvest.begin(kind, self._session_folder(), taken)
+
+    def start_curve(self, kind: str) -> None:
+        """Take a spectrum; its data come over the second connection.
+
+        Raises:
+            Refused: ACTION_ERROR: Nanonis would not.
+        """
+        self.begin_curve(kind)
+        self.curve, self._kind_asked = None, kind
+        same_name = ""
+        self._listener.curve(MODULES[kind], same_name)
+        self.settle(f"{MODULES[kind]}.StatusGet")
+
+    def settle(self, status: str) -> None:
+        """Until what was begun is seen running, or has ended already.
+
+        Raises:
+            Refused: ACTION_ERROR: Nanonis would not.
+        """
+        until_s = self._clock.monotonic_s() + _SETTLES_S
+        while not self._ask(status)[0] and self._clock.monotonic_s() < until_s:
+            for heard in self._listener.heard():
+                if isinstance(heard, Failed) and not isinstance(heard.error, ControllerLost):
+                    self.forget()
+                    raise Refused(ControlResponse.ACTION_ERROR, str(heard.error))
+                self._take(heard)
+                return
+
+    def forget(self) -> None:
+        """Nothing comes of what was begun."""
+        self._kind_asked = ""
+        self._harvest.forget()
+
+    def occupied(self, state: ScopeState, lasts_s: float) -> None:
+        """It is in a state for so long, experiment time, which Nanonis itself does not tell."""
+        self._occupied = (state, self._clock.now_s() + lasts_s)
+
+    def sets_out(self, lasts_s: float) -> None:
+        """The tip was sent away, and should arrive after so long, experiment time."""
+        self._arrives_s = self._clock.now_s() + lasts_s
+
+    def next_change_s(self) -> float | None:
+        """When a move, a pulse or the wait for a file is over."""
+        now_s = self._clock.now_s()
+        times = (self._occupied[1], self._arrives_s, self._harvest.next_s() or 0.0)
+        return min((at_s for at_s in times if at_s > now_s), default=None)
+
+    # --- what goes on ---
+
+    def status(self) -> ScopeStatus:
+        """What Nanonis is doing now; what has ended is awaited from here on.
+
+        Raises:
+            ControllerLost: one of both connections.
+        """
+        for heard in self._listener.heard():
+            self._take(heard)
+        scanning = bool(self._ask("Scan.StatusGet")[0])
+        self._probe.led = scanning
+        told, self._told = self._told, None
+        if scanning:
+            return self._scanning(told)
+        if self._harvest.what == SCAN or told is not None:
+            self._end(told)
+        state = self._besides_scans()
+        return ScopeStatus(ScopeState.INTERRUPTED if self._harvest.broken_off else state)
+
+    def refuse_safe_tip(self) -> None:
+        """Raises Refused: nothing is to be measured with a tip that has been withdrawn in an emergency."""
+        if self._ask("ZCtrl.StatusGet")[0] == _SAFE_TIP:
+            reason = "Nanonis' safe tip has withdrawn the tip: find out why; x-engage brings it back"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
+
+    def _scanning(self, told: str | None) -> ScopeStatus:
+        if told:  # it scans again and again
+            self._end(told)
+        if not self.stopping:
+            if self._harvest.what != SCAN:
+                self.begin_scan(frame(ScanFrame().read(self._ask))[0])
+            self._listener.scan()
+        return ScopeStatus(ScopeState.SCANNING)
+
+    def _besides_scans(self) -> ScopeState:
+        kind = self._kind_running()
+        if kind:
+            if not self.stopping and self._harvest.what != kind:
+                self.begin_curve(kind)
+            return ScopeState.SPEC
+        self.stopping = False
+        if self._harvest.what:
+            self._end(None)
+        state, until_s = self._occupied
+        if self._clock.now_s() < until_s:
+            return state
+        z_controller = self._ask("ZCtrl.StatusGet")[0]
+        self._watch_safe_tip(z_controller)
+        if z_controller == _WITHDRAWING or (APPROACH in self._opened and self._ask("AutoApproach.OnOffGet")[0]):
+            return ScopeState.COARSE_MOTOR
+        return ScopeState.FREE if self._is_there() else ScopeState.MOVING
+
+    def _kind_running(self) -> str:
+        if self._kind_asked:
+            return self._kind_asked
+        for kind, module in MODULES.items():
+            if module in self._opened and self._ask(f"{module}.StatusGet")[0]:
+                return kind
+        return ""
+
+    def _is_there(self) -> bool:
+        if self._probe.arrived(self._ask):
+            return True
+        if self._clock.now_s() < self._arrives_s + _LATEST_S:
+            return False
+        self._log.error("the tip does not arrive where it was sent")
+        self._probe.give_up()
+        return True
+
+    def _watch_safe_tip(self, z_controller: int) -> None:
+        safe = z_controller == _SAFE_TIP
+        if safe and not self._was_safe:
+            self._log.error("Nanonis' safe tip has withdrawn the tip: nothing is measured until that is put right")
+        self._was_safe = safe
+
+    def _take(self, heard: Heard) -> None:
+        """What the second connection has to say."""
+        if isinstance(heard, ScanEnded):
+            self._told = heard.path
+        elif isinstance(heard, CurveEnded):
+            self._kind_asked, self.curve = "", heard
+        elif isinstance(heard.error, ControllerLost):
+            raise heard.error
+        else:
+            self._log.error("%s", heard.error)
+            if self._kind_asked:
+                self._kind_asked = ""
+                not_saved = ""
+                self._end(not_saved)
+
+    def _end(self, told: str | None) -> None:
+        self._harvest.end(self._clock.now_ns(), self._clock.now_s(), told)
+
+    def _session_folder(self) -> str:
+        folder: Any = self._ask("Util.SessionPathGet")[0]
+        return str(folder)
