@@ -80,9 +80,10 @@ class Cache:
             return self._again(Packet(envelope, packet.payload, first_ns), source_ns, history)
         said = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
         out = Packet(envelope, packet.payload, self._next_ns(source_ns if said and source_ns is not None else now_ns))
-        if source_ns is not None and out.time_ns is not None:
+        kept = self._keep(out, source_ns, history)
+        if source_ns is not None and out.time_ns is not None and history:
             self._recent.append((source_ns, out.time_ns))
-        return out, self._keep(out, source_ns, history)
+        return out, kept
 
     def recent(self) -> list[tuple[int, int]]:
         """(translator's time, ours) of the packets published last, for a restarted scheduler's `remember`."""
@@ -154,7 +155,7 @@ class Cache:
     def _keep(self, packet: Packet, source_ns: int | None, history: int) -> bool:
         payload = packet.payload
         size = (payload.nbytes if isinstance(payload, memoryview) else len(payload)) + _OVERHEAD_BYTES
-        if size > self._max_bytes:
+        if size > self._max_bytes or not history:
             return False
         assert packet.time_ns is not None
         self._kept[packet.time_ns] = Kept(packet, source_ns, size)

@@ -66,7 +66,8 @@ class Desk:
         self._frame = frame
         self._asked_by_us: dict[int, OwnEnd] = {}
         self._ids_known: bool | None = None
-        # actions that only we know of: a translator of version 1 would do them again
+        # actions that only we know of: a translator of version 1 would do them again, one of ours not, but for one that
+        # was done already it must not be moved
         self._sent: deque[tuple[str, str, int]] = deque(maxlen=_SENT_REMEMBERED)
         self._refused: set[int] = set()
         self._unclear: dict[str, tuple[RequestIn, float]] = {}  # by name, and until when it is not answered
@@ -218,7 +219,7 @@ class Desk:
         """Whether the microscope has to be moved before an action; then it is, or the action is answered."""
         assert self._frame is not None
         move = self._frame.move_before(str(event.request.subject), now_ns)
-        if move is None:
+        if move is None or (event.name, event.request.id) in (sent[:2] for sent in self._sent):
             return False
         if self.mover.busy:
             self.answer(event, ControlResponse.NOT_FREE, "the microscope is being moved for another action")
@@ -254,7 +255,7 @@ class Desk:
             return
         if request.id:
             self._once.note(name, request, Fate.PENDING)
-            if request.kind == _ACTION and not self._ids_known:
+            if request.kind == _ACTION and (self._frame is not None or not self._ids_known):
                 self._sent.append((name, request.id, fingerprint(request)))
                 self.effects.append(self._save())
             elif mapped is not None:

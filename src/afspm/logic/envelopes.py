@@ -11,8 +11,8 @@ from afspm.model import PacketHeader
 
 EnvelopeMapping = Callable[[PacketHeader], str]
 
-DEFAULT_HISTORY = {"Scan2d": 5, "Spec1d": 10, "ScopeStateMsg": 10}
-"""How many packets are kept of each envelope, by message; of all others one."""
+DEFAULT_HISTORY = {"Scan2d": 5, "Spec1d": 10, "ScopeStateMsg": 10, "ScanLines": 0}
+"""How many packets are kept of each envelope, by message; of all others one. Lines are of the moment."""
 
 
 def default_envelope(header: PacketHeader) -> str:

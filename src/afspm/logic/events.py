@@ -122,10 +122,15 @@ class ProblemSeen:
 
 @dataclass(frozen=True, slots=True)
 class Announced:
-    """The scheduler itself has something to publish."""
+    """The scheduler itself has something to publish.
+
+    Attributes:
+        before_ns: the translator's time of a packet that it goes before; None: it is of now.
+    """
 
     envelope: str
     payload: bytes
+    before_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

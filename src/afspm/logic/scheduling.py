@@ -11,7 +11,7 @@ from typing import Any
 from afspm.errors import AfspmError
 from afspm.logic import arbitration
 from afspm.logic.arbitration import Ask, Cause, Control, Do, Event
-from afspm.logic.cache import Cache
+from afspm.logic.cache import TIME_STEP_NS, Cache
 from afspm.logic.desk import Desk, OwnEnd, reads
 from afspm.logic.events import (
     Announced,
@@ -219,6 +219,11 @@ class SchedulerCore:
         self._desk.ask_own(request, now_s, ended)
         return self._with_forwards()
 
+    def put_off(self, until_s: float) -> None:
+        """More of what was published before a restart is to come: who is in control is told after that."""
+        if self._announce_at_s is not None:
+            self._announce_at_s = max(self._announce_at_s, until_s)
+
     @property
     def newest_source_ns(self) -> int:
         """The translator's newest packet that was taken in: where to subscribe from; -1 if there is none."""
@@ -261,8 +266,10 @@ class SchedulerCore:
         self._arbitrate(Ask(what, event.name, event.problem), None, now_s, now_ns)
 
     def _on_announced(self, event: Announced, now_s: float, now_ns: int) -> None:
-        packet, cached = self._cache.stamp(event.envelope, event.payload, now_ns)
-        self._effects.append(Publish(packet, None, cached))
+        # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
+        time_ns = now_ns if event.before_ns is None else event.before_ns - TIME_STEP_NS
+        packet, cached = self._cache.stamp(event.envelope, event.payload, time_ns)
+        self._effects += [self._save(), Publish(packet, None, cached)]
 
     def _on_subscriber(self, event: SubscriberJoined, now_s: float, now_ns: int) -> None:
         self._effects.append(Replay(event.subscriber, self._cache.replay(event.prefixes, event.since_ns)))

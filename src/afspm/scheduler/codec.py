@@ -32,7 +32,7 @@ class WireCodec:
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
         """See `scheduler.drift.places.PlaceCodec`."""
-        of = "ScanParameters2d" if message in ("Scan2d", "ScanParameters2d") else "ProbePosition"
+        of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
         return wire.relocated(message, payload, wire.place_in(of, told))
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:

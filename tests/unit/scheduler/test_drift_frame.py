@@ -451,3 +451,16 @@ def test_correction_that_begins_later_goes_back_to_where_the_sample_was() -> Non
     lab.ask(ControlRequest.ACTION, names.START_SCAN)
     told = wire.decode("ScanParameters2d", lab.sent().request.payload)
     same(told.region, moved(HERE, DRIFT))
+
+
+def test_an_action_that_was_sent_before_a_kill_is_asked_for_again_without_a_move(lab: Lab) -> None:
+    """It may have been done: the microscope is busy with it then, and would refuse to be moved."""
+    set_region(lab, HERE)
+    lab.ask(ControlRequest.ACTION, names.START_SCAN, id_="series/life/go")
+    assert lab.sent().request.id == "series/life/go"
+    again = Lab(state=lab.saved())
+    again.take_control()
+    again.knows(forecast((500e-9, 0.0)))
+    again.forwards()
+    again.ask(ControlRequest.ACTION, names.START_SCAN, id_="series/life/go")
+    assert again.sent().request.id == "series/life/go"

@@ -201,7 +201,9 @@ class DriftCore:
         key = scan_key(scan, event.packet)
         if self._gate.is_settled(key):
             return self.core.step(self._relocated(event, scan, self._gate.mapping_of(key)), now_s, now_ns)
-        self._gate.hold(Held(key, self._middle_s(scan, event, now_ns), now_s + self._settings.longest_registration))
+        until_s = now_s + self._settings.longest_registration
+        self._gate.hold(Held(key, self._middle_s(scan, event, now_ns), until_s))
+        self.core.put_off(until_s)
         self._gate.keep(event)
         return self._look_at(event, now_s, now_ns)
 
@@ -299,7 +301,8 @@ class DriftCore:
             return effects  # long told: a worker that was restarted says it again
         correcting = self.knowledge.corrects(now_ns * 1e-9)
         payload = self._codec.encode_mapping(said, job, correcting=correcting)
-        effects += [SaveState(self.snapshot()), *self.core.step(Announced(MAPPING, payload), now_s, now_ns)]
+        before_ns = self._gate.next_ns() if is_awaited else None
+        effects += self.core.step(Announced(MAPPING, payload, before_ns), now_s, now_ns)
         if is_awaited:
             effects += self._release(now_s, now_ns)
 

@@ -246,6 +246,7 @@ class DriftFrame:
             "ScanParameters2d": self._region_told,
             "ProbePosition": self._probe_told,
             "Spec1d": self._spectrum_told,
+            "ScanLines": self._lines_told,
         }.get(header.message)
         if handler is None:
             return packet
@@ -264,6 +265,15 @@ class DriftFrame:
             place = Place(sample, self._codec.encode(ScanParameters(sample)), told.region, bytes(payload))
             self.region.current = place
         return None if mapping is None else self._codec.relocated("ScanParameters2d", payload, place.said)
+
+    def _lines_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        """They lie where the frame is that they are taken in; the finished scan will be told to lie where it was."""
+        region, mapping = getattr(told, "region", None), self._mapping_at(time_s)
+        if region is None or mapping is None:
+            return None
+        place = self.region.told(region)
+        said = self._codec.encode(ScanParameters(mapping.to_sample(region))) if place is None else place.said
+        return self._codec.relocated("ScanLines", payload, said)
 
     def _probe_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
         if not isinstance(told, ProbePosition):

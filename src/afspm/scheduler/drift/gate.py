@@ -50,6 +50,10 @@ class Gate:
         """Let a packet, or the word that there are no more old ones, wait."""
         self._waiting.append(event)
 
+    def next_ns(self) -> int | None:
+        """The translator's time of the first packet that waits."""
+        return next((event.packet.time_ns for event in self._waiting if isinstance(event, PacketIn)), None)
+
     def is_settled(self, key: str) -> bool:
         return key in self._settled
 

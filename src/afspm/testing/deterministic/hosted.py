@@ -336,9 +336,9 @@ class HostedTranslator(HostedProcess):
             line.answer(wire.decode_response(frames), number)
         self.may_die()
 
-    def publish(self, envelope: str, payload: bytes, time_ns: int | None) -> None:
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None, *, keep: bool) -> None:
         self.may_die()
-        packet = self._published.stamp(envelope, payload, time_ns)
+        packet = self._published.stamp(envelope, payload, time_ns, keep=keep)
         for feed in list(self._feeds):
             feed.publish(packet)
 
@@ -363,8 +363,8 @@ class MemoryServerPort:
     def reply(self, frames: Sequence[bytes] | None) -> None:
         self._host.reply(frames)
 
-    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
-        self._host.publish(envelope, payload, time_ns)
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
+        self._host.publish(envelope, payload, time_ns, keep=keep)
 
     def wake_up(self, incoming: Served | None = None) -> None:
         self._host.wake(incoming)

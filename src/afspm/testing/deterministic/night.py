@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from afspm.logic.arbitration import Cause
 from afspm.logic.envelopes import Envelopes
@@ -141,9 +143,9 @@ class Night:
         self.plan = plan
         self.timeline = timeline = Timeline(plan.seed, plan.speed)
         self.weather = Weather(doubles=plan.doubles)
-        self.codec = TableCodec()
+        self.codec = self.make_codec()
         habits = Habits(plan.ids_known, hangs=plan.hangs, loses_answer=plan.loses_answer)
-        self.microscope = FakeMicroscope(timeline, self.codec, habits)
+        self.microscope = self.make_microscope(habits)
         self.settings = _settings(plan)
         bounds = Bounds(
             self.settings.grace_s,
@@ -160,12 +162,23 @@ class Night:
             self._header,
             self.invariants,
             dies_in_step=plan.dies_in_step,
+            make_core=self.make_core(),
         )
         self.scheduler.translator = (self.microscope, self.microscope)
         self.components = self._components()
         self.dawn = behaviours.Dawn(timeline, self.weather, self.codec, self.scheduler, "dawn")
         self.keeper = Keeper(timeline, [self.microscope, self.scheduler, *self.components.values()], _policy())
         self.keeper.on_over = self._over
+
+    def make_codec(self) -> TableCodec:
+        return TableCodec()
+
+    def make_microscope(self, habits: Habits) -> FakeMicroscope:
+        return FakeMicroscope(self.timeline, self.codec, habits)
+
+    def make_core(self) -> Callable[[], Any] | None:
+        """Makes the core of the scheduler's next life; None: a plain one."""
+        return None
 
     def _components(self) -> dict[str, Client]:
         made: dict[str, Client] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from afspm.logic.events import (
     Codec,
@@ -60,6 +60,7 @@ class SchedulerHost(Process):
     Args:
         journal_s: how long after a packet the journal is written.
         dies_in_step: the chance that it is killed between two effects of one step.
+        make_core: makes the core of each life, if it is not to be a plain one.
     """
 
     def __init__(
@@ -73,15 +74,15 @@ class SchedulerHost(Process):
         *,
         journal_s: float = 0.1,
         dies_in_step: float = 0.0,
+        make_core: Callable[[], Any] | None = None,
     ) -> None:
         super().__init__(timeline, "scheduler")
-        self.core = SchedulerCore(settings, codec)
+        self._make_core: Callable[[], Any] = make_core or (lambda: SchedulerCore(settings, codec))
+        self.core = self._make_core()
         self.disk = Disk()
         self.dies_in_step = dies_in_step
         self.translator: tuple[ControlServer, Publisher] | None = None
         self._weather = weather
-        self._settings = settings
-        self._codec = codec
         self._header = header
         self._observer = observer
         self._journal_s = journal_s
@@ -101,7 +102,7 @@ class SchedulerHost(Process):
 
     def begin(self) -> None:
         self._forget()
-        self.core = SchedulerCore(self._settings, self._codec)
+        self.core = self._make_core()
         if self.disk.state is not None:
             self.core.restore(json.loads(self.disk.state))
         self.core.restore_cache(self.disk.journal)
@@ -186,6 +187,10 @@ class SchedulerHost(Process):
             self._feeds.remove(feed)
 
     # --- steps ---
+
+    def carry_out(self, effects: Sequence[Effect]) -> None:
+        """What the core wants done that nobody asked for."""
+        self._carry_out(None, effects)
 
     def _step(self, event: Input) -> None:
         self._carry_out(event, self.core.step(event, self.timeline.monotonic_s(), self.timeline.now_ns()))
