@@ -27,6 +27,8 @@ PUBLISHED: Final = (
     "ProbePosition",
 )
 CONTINUED: Final = ("Scan2d", "Spec1d")
+LIVE: Final = "ScanLines"
+"""Published only where it is asked for."""
 LONGEST_NAME = 100
 _NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
@@ -211,13 +213,16 @@ def check_envelopes(resolved: Resolved) -> None:
     """Every envelope subscribed to is published by somebody."""
     published = {*PUBLISHED, *(e for said in resolved.declared.values() for e in said.publishes)}
     published |= set(resolved.caching.envelopes)
+    if any(part.command or part.settings.get("live_lines_s") for part in resolved.with_role(Role.TRANSLATOR)):
+        published.add(LIVE)
     for part in resolved.parts.components:
         for i, prefix in enumerate(resolved.envelopes(part) or ()):
             key = next((k for k in ("envelopes", "subscriber") if k in part.own), "class")
             place = resolved.document.place(part.name, key, *([i] if key == "envelopes" else []))
             if _is_published(prefix, published, resolved.caching.envelopes):
                 continue
-            hint = nearest(prefix, published)
+            live = LIVE.startswith(prefix)
+            hint = 'give the microscope live_lines_s = "1 s"' if live else nearest(prefix, published)
             what = f"[{part.name}] subscribes to {prefix!r}, which nobody publishes"
             if resolved.caching.mapping is not None:
                 resolved.findings.warning(what + ", unless the mapping of [cache] makes it", place, hint)

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from afspm.clock import Clock
-from afspm.errors import AfspmError, Refused
+from afspm.errors import AfspmError, ConfigError, Refused
 from afspm.microscopes.pace import EAGER_S
 from afspm.microscopes.parameters import ParameterTable, Value
-from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.units import Duration
 
 if TYPE_CHECKING:
     from afspm.runtime.process import Context
@@ -120,6 +121,7 @@ class Microscope(ABC):
         poll_period_s: the controller is looked at this often, in real seconds, when nothing is about to happen; its
             state more often when a measurement is about to end, as learned from those before.
         result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds.
+        live_lines_s: how often the lines of a running scan are published, in experiment seconds; None: not at all.
 
     Attributes:
         clock, log: of the experiment; given before `connect`.
@@ -148,14 +150,18 @@ class Microscope(ABC):
         *,
         parameters: Mapping[str, Mapping[str, Any]] | None = None,
         actions: Mapping[str, Mapping[str, Any]] | None = None,
-        poll_period_s: float = 0.1,
-        result_timeout_s: float = 10.0,
+        poll_period_s: Duration = 0.1,
+        result_timeout_s: Duration = 10.0,
+        live_lines_s: Duration | None = None,
     ) -> None:
+        if live_lines_s is not None and type(self).lines is Microscope.lines:
+            raise ConfigError(f"{type(self).__name__} can't give lines while it scans", where="live_lines_s")
         table = ParameterTable.from_toml(self.parameters_file)
         self.table = table.extended(parameters or {}, where="the experiment file")
         self.added_actions = dict(actions or {})
         self.poll_period_s = poll_period_s
         self.result_timeout_s = result_timeout_s
+        self.live_lines_s = live_lines_s
 
     @abstractmethod
     def connect(self) -> None:
@@ -190,6 +196,16 @@ class Microscope(ABC):
         Raises:
             FileError: it is not (yet) whole; asked for again until `result_timeout_s` is over.
         """
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        """What a running scan has of complete lines beyond the first `start`, in the order in which they are scanned.
+
+        To be written where the controller can tell (`live_lines_s`).
+
+        Returns:
+            for each channel the same lines, rows and columns ascending; nothing while there are no new ones.
+        """
+        return ()
 
     def command(self, text: str) -> None:
         """Send a command that the experiment file added to the controller as it is."""

@@ -19,6 +19,7 @@ from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, FileError, WireError
 from afspm.microscopes import in_force
 from afspm.microscopes.ledger import Ledger
+from afspm.microscopes.live import LiveLines
 from afspm.microscopes.microscope import LOST, MEASURING, ControllerLost, Microscope
 from afspm.microscopes.outbox import Outbox
 from afspm.microscopes.pace import Pace
@@ -75,6 +76,7 @@ class Translator:
         self._values: dict[str, Value] = {}
         self._connected = self._started = self._told_lost = False
         self._pace = Pace(microscope.poll_period_s, microscope.eager_poll_s)
+        self._live = LiveLines(microscope)
         self._paced = ScopeState.UNDEFINED
         self._retry_at_s = self._all_at_s = 0.0
         self._complaint = ""
@@ -111,7 +113,7 @@ class Translator:
             return max(0.0, self._retry_at_s - self._clock.monotonic_s())
         real_now_s, now_s = self._clock.monotonic_s(), self._clock.now_s()
         wait_s = min(self._pace.wait_s(real_now_s), self._all_at_s - real_now_s)
-        for at_s in (self.microscope.next_change_s(), self._sequence.deadline_s()):
+        for at_s in (self.microscope.next_change_s(), self._sequence.deadline_s(), self._live.due_s):
             if at_s is not None:
                 # a change that should have been and was not seen yet is looked for eagerly, and not without a break
                 until_s = self._clock.real_s(at_s - now_s)
@@ -132,6 +134,8 @@ class Translator:
         elif self.microscope.status() != self._sequence.said:
             # what ends a measurement changes nothing of what is in force; what else happens, may
             self._observe(values=self._sequence.said.state not in MEASURING)
+        for name, payload in self._live.look(self._clock.now_s()):
+            self._port.publish(name, payload, self._stamp(1)[0], keep=False)
 
     def _trusting(self, do: Callable[[], None]) -> bool:
         """Whether that could be done; if not, the controller is gone, or says what can't be.
@@ -235,6 +239,10 @@ class Translator:
     def _pace_for(self, state: ScopeState) -> None:
         """Look as often as what it now does asks for."""
         before, self._paced, now_s = self._paced, state, self._clock.monotonic_s()
+        if state is ScopeState.SCANNING:
+            self._live.begin(self._clock.now_ns())
+        else:
+            self._live.end()
         if state in MEASURING:
             lasts_s, what = self._scan_s() if state is ScopeState.SCANNING else (None, ())
             self._pace.began((state, *what), now_s, lasts_s)

@@ -12,6 +12,7 @@ from afspm.model.enums import (
     ScopeState,
 )
 from afspm.model.geometry import Frame, Region, RegionChange
+from afspm.model.lines import ScanLines
 from afspm.model.packet import Packet, PacketHeader
 from afspm.model.problems import ProblemNames
 from afspm.model.scan import Scan, ScanParameters, ScanSet, ShapeChange
@@ -38,6 +39,7 @@ __all__ = [
     "Request",
     "Response",
     "Scan",
+    "ScanLines",
     "ScanParameters",
     "ScanSet",
     "ScopeState",

@@ -27,10 +27,16 @@ class Published:
         self._last: dict[str, Packet] = {}
         self._newest_ns = 0
 
-    def stamp(self, envelope: str, payload: bytes, time_ns: int | None = None) -> Packet:
-        """A packet that is newer than all before it, now remembered; `time_ns`: a time that was given out already."""
+    def stamp(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> Packet:
+        """A packet that is newer than all before it, now remembered, unless it is not to be.
+
+        Args:
+            time_ns: a time that was given out already.
+        """
         self._newest_ns = max(self._clock.now_ns() if time_ns is None else time_ns, self._newest_ns + 1)
         packet = Packet(envelope, payload, self._newest_ns)
+        if not keep:
+            return packet
         self._packets.append(packet)
         self._bytes += len(payload)
         self._last.pop(envelope, None)

@@ -143,12 +143,13 @@ class ServerPort(Protocol):
         None: not at all, as if the answer was lost (a fault that a simulated microscope may be told to have).
         """
 
-    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
         """Publish; the time is the experiment's, made strictly increasing.
 
         Args:
             time_ns: the time to publish it with. A restarted translator publishes again what may have been lost in
                 the kill, at the times of the first attempt, so that whoever has had it ignores it.
+            keep: whether it is sent to who subscribes later; False for what is of this moment only.
         """
 
     def wake_up(self, incoming: Served | None = None) -> None:

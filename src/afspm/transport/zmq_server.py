@@ -99,10 +99,10 @@ class ZmqServerPort:
             self.touched = True
             send(self._socket, [*asker, *frames])
 
-    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
         if self._publisher is None:
             raise ConfigError("there is no address to publish on", hint="publish = address")
-        self._publisher.publish(self._published.stamp(envelope, payload, time_ns))
+        self._publisher.publish(self._published.stamp(envelope, payload, time_ns, keep=keep))
 
     def kill(self) -> None:
         """Tell those who subscribed that the experiment has ended."""

@@ -12,13 +12,13 @@ from afspm import model
 from afspm.errors import AfspmError, InvalidValue, UnitError, WireError
 from afspm.units import convert as convert_unit
 from afspm.wire import convert
-from afspm.wire.generated import analysis_pb2, control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire.generated import analysis_pb2, control_pb2, feedback_pb2, lines_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.messages import message_type, parse
 from afspm.wire.split import doubles, nested, packed, split
 
 Buffer = bytes | memoryview
 
-_VALUES_OF_SCAN = 4
+_VALUES_OF_SCAN = _VALUES_OF_LINES = 4
 _DATA_OF_SPECTRUM = 4
 _VALUES_OF_DATA = 5
 
@@ -116,6 +116,40 @@ def _scan_header(payload: Buffer) -> model.PacketHeader:
     return model.PacketHeader("Scan2d", message.channel, size_m, None, stamp)
 
 
+def _encode_lines(lines: model.ScanLines) -> tuple[str, bytes]:
+    message = lines_pb2.ScanLines(
+        params=convert.scan_parameters_to_wire(model.ScanParameters(lines.region, lines.shape, lines.unit)),
+        channel=lines.channel,
+        first_row=lines.first_row,
+    )
+    if lines.began_ns is not None:
+        message.timestamp.CopyFrom(convert.timestamp(lines.began_ns))
+    return "ScanLines", b"".join((message.SerializeToString(), *packed(lines.values, _VALUES_OF_LINES)))
+
+
+def _decode_lines(payload: Buffer) -> model.ScanLines:
+    rest, chunks = split(payload, _VALUES_OF_LINES)
+    message = parse(lines_pb2.ScanLines, rest)
+    values, shape = doubles(chunks), message.params.data.shape
+    region = convert.whole_region(convert.spatial_from_wire(message.params.spatial))
+    if region is None or not shape.x or values.size % shape.x:
+        raise WireError(f"{values.size} values are no lines of {shape.x} pixels of a scan of which the place is known")
+    return model.ScanLines(
+        region,
+        (shape.y, shape.x),
+        message.channel,
+        message.params.data.units,
+        message.first_row,
+        values.reshape(-1, shape.x),
+        convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
+    )
+
+
+def _lines_header(payload: Buffer) -> model.PacketHeader:
+    message = parse(lines_pb2.ScanLines, split(payload, _VALUES_OF_LINES)[0])
+    return model.PacketHeader("ScanLines", message.channel)
+
+
 def _encode_spectrum(spectrum: model.Spectrum) -> tuple[str, bytes]:
     message = spectroscopy_pb2.Spec1d(type=spectrum.kind)
     if spectrum.position_m is not None:
@@ -188,6 +222,7 @@ def _published_parameters(payload: Buffer) -> model.ScanParameters:
 
 _ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
     model.Scan: _encode_scan,
+    model.ScanLines: _encode_lines,
     model.Spectrum: _encode_spectrum,
     model.ScanParameters: _plain_encoder("ScanParameters2d", convert.scan_parameters_to_wire),
     model.Feedback: _plain_encoder("ZCtrlParameters", convert.feedback_to_wire),
@@ -199,6 +234,7 @@ _ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
 
 _DECODERS: dict[str, Callable[[Buffer], Any]] = {
     "Scan2d": _decode_scan,
+    "ScanLines": _decode_lines,
     "Spec1d": _decode_spectrum,
     "ScanParameters2d": _published_parameters,
     "ZCtrlParameters": lambda payload: convert.feedback_from_wire(parse(feedback_pb2.ZCtrlParameters, payload)),
@@ -210,6 +246,7 @@ _DECODERS: dict[str, Callable[[Buffer], Any]] = {
 
 _HEADERS: dict[str, Callable[[Buffer], model.PacketHeader]] = {
     "Scan2d": _scan_header,
+    "ScanLines": _lines_header,
     "Spec1d": _spectrum_header,
     "SpatialROIWithScoreList": _regions_header,
     "SpatialPointWithScoreList": _points_header,

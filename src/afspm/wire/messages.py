@@ -28,6 +28,7 @@ from afspm.wire.generated.geometry_pb2 import (
     Size2u,
     Size3u,
 )
+from afspm.wire.generated.lines_pb2 import ScanLines
 from afspm.wire.generated.scan_pb2 import DataAspects, Scan2d, ScanParameters2d, SpatialAspects
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition, Spec1d, SpecData
 
@@ -37,9 +38,9 @@ _messages: dict[str, type[Message]] = {
     message.DESCRIPTOR.name: message
     for message in (
         ActionMsg, ControlState, DataAspects, DriftMapping, DriftRescan, FeedbackAnalysis, ParameterMsg, Point2d,
-        Point2u, ProbePosition, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d, ScanParameters2d, ScopeStateMsg, Size2d,
-        Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore, SpatialPointWithScoreList,
-        SpatialROIWithScore, SpatialROIWithScoreList, Spec1d, SpecData, ZCtrlParameters,
+        Point2u, ProbePosition, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d, ScanLines, ScanParameters2d,
+        ScopeStateMsg, Size2d, Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore,
+        SpatialPointWithScoreList, SpatialROIWithScore, SpatialROIWithScoreList, Spec1d, SpecData, ZCtrlParameters,
     )
 }  # fmt: skip
 

@@ -7,6 +7,7 @@ from google.protobuf.message import Message
 from afspm.errors import WireError
 from afspm.model import ProbePosition, Region
 from afspm.wire import convert
+from afspm.wire.generated.lines_pb2 import ScanLines
 from afspm.wire.generated.scan_pb2 import Scan2d, ScanParameters2d
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as ProbePositionMessage
 from afspm.wire.generated.spectroscopy_pb2 import Spec1d
@@ -38,7 +39,7 @@ def place_in(name: str, payload: Buffer) -> bytes:
 
 
 def relocated(name: str, payload: Buffer, place: bytes) -> bytes:
-    """A Scan2d, ScanParameters2d, Spec1d or ProbePosition with another place; all else is as it was.
+    """A Scan2d, ScanLines, ScanParameters2d, Spec1d or ProbePosition with another place; all else is as it was.
 
     Raises:
         WireError: the bytes are no such message, or messages of this name have no place.
@@ -48,6 +49,11 @@ def relocated(name: str, payload: Buffer, place: bytes) -> bytes:
         scan = parse(Scan2d, rest)
         _put(scan.params.spatial, place)
         return b"".join((scan.SerializeToString(), *_values(values)))
+    if name == "ScanLines":
+        rest, values = split(payload, _VALUES_OF_SCAN)
+        lines = parse(ScanLines, rest)
+        _put(lines.params.spatial, place)
+        return b"".join((lines.SerializeToString(), *_values(values)))
     if name == "ScanParameters2d":
         parameters = parse(ScanParameters2d, payload)
         _put(parameters.spatial, place)

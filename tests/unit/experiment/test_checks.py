@@ -127,6 +127,21 @@ BROKEN = {
 }  # fmt: skip
 
 
+def test_time_may_be_made_faster_where_the_controller_is_an_emulated_one(write: Write) -> None:
+    emulated = '[controller]\ncomponent = true\nclass = "parts.Emulated"\nport = 6501\n'
+    assert errors(write("[clock]\nspeed = 60\n" + emulated, frame=REAL)) == []
+    assert write("[clock]\nspeed = 60\n" + emulated, frame=REAL).resolved.simulated
+
+
+def test_lines_of_running_scans_are_there_for_those_who_asked_the_microscope_for_them(write: Write) -> None:
+    simulated = FRAME[: FRAME.index("[microscope]")] + '[microscope]\ncomponent = true\nclass = "Simulator"\n'
+    watcher = ANYTHING + 'envelopes = ["ScanLines"]\n'
+    error = only_error(write(watcher, frame=simulated))
+    assert "'ScanLines', which nobody publishes" in error.what
+    assert "live_lines_s" in error.hint
+    assert errors(write(watcher, frame=simulated + 'live_lines_s = "1 s"\n')) == []
+
+
 @pytest.mark.parametrize("case", BROKEN, ids=str)
 def test_what_does_not_fit_is_an_error(write: Write, case: str) -> None:
     text, frame, said = BROKEN[case]

@@ -50,6 +50,18 @@ def test_sizes_below_a_nanometre_stay_apart() -> None:
     assert [size_text(width) for width in (2.5e-10, 3e-10, 9e-10)] == ["0.25", "0.3", "0.9"]
 
 
+def test_lines_of_a_running_scan_are_passed_on_and_not_kept() -> None:
+    cache = Cache()
+    put(cache, scan(), NOW)
+    for number in range(1, 200):
+        taken = cache.take(Packet("ScanLines", b"x", NOW + number), PacketHeader("ScanLines", "Height"), NOW + number)
+        assert taken is not None
+        assert (taken[0].envelope, taken[1]) == ("ScanLines", False)
+    assert len(cache) == 1
+    assert times(cache, "ScanLines") == []
+    assert [source_ns for source_ns, _ in cache.recent()] == [NOW]  # what is to keep its time after a kill is known
+
+
 def test_the_default_envelopes_are_those_of_the_wire_format() -> None:
     assert default_envelope(scan(2e-6, "Height Retrace")) == "Scan2d_2000.0_Height Retrace"
     assert default_envelope(scan(2e-6, "a_b_c")) == "Scan2d_2000.0_a_b_c"

@@ -74,6 +74,7 @@ class FakePort:
         self.clock = clock
         self.replies: list[list[bytes]] = []
         self.packets: list[tuple[str, Any, int]] = []
+        self.kept: list[str] = []
 
     def poll(self, timeout_s: float | None) -> list[Served]:
         return []
@@ -81,8 +82,9 @@ class FakePort:
     def reply(self, frames: Sequence[bytes] | None) -> None:
         self.replies.append(list(frames or []))
 
-    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
         assert time_ns is not None
+        self.kept += [envelope] if keep else []
         self.packets.append((envelope, wire.decode(envelope, payload), time_ns))
 
     def wake_up(self, incoming: Served | None = None) -> None: ...
@@ -200,8 +202,13 @@ class Bench:
 
     def heard(self) -> list[Any]:
         """What was published since the last call: states as their names, else the name of the message."""
-        packets, self.port.packets = self.port.packets, []
+        packets, self.port.packets, self.port.kept = self.port.packets, [], []
         return [thing.state.name if isinstance(thing, ScopeStatus) else name for name, thing, _ in packets]
+
+
+@pytest.fixture
+def fake_clock() -> FakeClock:
+    return FakeClock()
 
 
 @pytest.fixture

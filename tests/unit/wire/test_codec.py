@@ -26,6 +26,7 @@ from afspm.model import (
     Request,
     Response,
     Scan,
+    ScanLines,
     ScanParameters,
     ShapeChange,
     Spectrum,
@@ -35,6 +36,39 @@ from afspm.wire.frames import decode_time, encode_subject, encode_time
 SCAN = Scan(
     Region((1e-6, -2e-6), (2e-6, 1e-6), 0.25), "Height", "m", np.arange(12.0).reshape(3, 4), 1_700_000_000_000_000_001
 )
+
+
+LINES = ScanLines(
+    SCAN.region, (5, 4), "Height", "m", 2, np.arange(8.0).reshape(2, 4), began_ns=1_700_000_000_000_000_001
+)
+
+
+def test_lines_of_a_scan_survive() -> None:
+    name, payload = wire.encode(LINES)
+    assert name == wire.message_of("ScanLines") == "ScanLines"
+    lines = wire.decode(name, payload)
+    np.testing.assert_array_equal(lines.values, LINES.values)
+    assert (lines.shape, lines.first_row, lines.channel, lines.unit) == ((5, 4), 2, "Height", "m")
+    assert (lines.region, lines.began_ns) == (LINES.region, LINES.began_ns)
+    assert wire.header(name, payload).channel == "Height"
+
+
+@pytest.mark.parametrize(("first_row", "columns"), [(4, 4), (2, 3), (0, 0)])
+def test_lines_that_are_none_of_their_scan_are_refused(first_row: int, columns: int) -> None:
+    from afspm.wire.generated.lines_pb2 import ScanLines as Message
+
+    message = Message.FromString(wire.encode(LINES)[1])
+    message.first_row, message.params.data.shape.x = first_row, columns
+    with pytest.raises(WireError):
+        wire.decode("ScanLines", message.SerializeToString())
+
+
+def test_a_picture_is_made_up_of_lines() -> None:
+    picture = LINES.into()
+    assert np.isnan(picture).all(axis=1).tolist() == [True, True, False, False, True]
+    rest = ScanLines(LINES.region, (5, 4), "Height", "m", 0, np.ones((2, 4)))
+    assert rest.into(picture) is picture
+    assert picture[:4, 0].tolist() == [1, 1, 0, 4]
 
 
 def test_a_scans_values_are_a_view_of_the_buffer() -> None:

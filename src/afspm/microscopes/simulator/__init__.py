@@ -17,7 +17,7 @@ from afspm.microscopes.simulator import files
 from afspm.microscopes.simulator.faults import Fault, Faults
 from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
 from afspm.microscopes.simulator.truth import Truth
-from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.simulation import World
 from afspm.units import Duration
 
@@ -66,7 +66,7 @@ class Simulator(Microscope):
         faults: what goes wrong when, each a table of `kind`, `at_s`, `count`, `duration_s` (see `Fault`).
         fault_action: whether the action "x-fault" makes faults on demand.
         panel: what a person does at the controller itself, each a table of `at_s` with `set` or `action`.
-        parameters, actions, poll_period_s, result_timeout_s: as for every microscope.
+        parameters, actions, poll_period_s, result_timeout_s, live_lines_s: as for every microscope.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -97,6 +97,7 @@ class Simulator(Microscope):
         actions: dict[str, dict[str, Any]] | None = None,
         poll_period_s: Duration = 0.25,
         result_timeout_s: Duration = 10.0,
+        live_lines_s: Duration | None = None,
     ) -> None:
         world: dict[str, Any] = {
             "surface": surface,
@@ -118,6 +119,7 @@ class Simulator(Microscope):
             actions=actions,
             poll_period_s=poll_period_s,
             result_timeout_s=result_timeout_s,
+            live_lines_s=live_lines_s,
         )
         if not fault_action:
             self.table = self.table.without(_FAULT_PARAMETERS)
@@ -195,6 +197,10 @@ class Simulator(Microscope):
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         """Read a saved file."""
         return files.load(Path(result))
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        """The lines that are complete by now."""
+        return self._instrument.lines(start, self.clock.now_s())
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:

@@ -16,13 +16,15 @@ from pathlib import Path
 from threading import Thread
 from typing import Any, Final
 
+import numpy as np
+
 from afspm.errors import AfspmError, FileError, Refused
 from afspm.microscopes.in_force import feedback, frame
 from afspm.microscopes.parameters import ParameterTable, Value
 from afspm.microscopes.simulator.faults import Faults
 from afspm.microscopes.simulator.files import Measured, encode_scan, encode_spectrum
 from afspm.microscopes.simulator.truth import Truth
-from afspm.model import ControlResponse, ScopeState, Spectrum, names
+from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.runtime.memory import write_whole
 from afspm.simulation import SimulatedScan, World
 
@@ -123,6 +125,21 @@ class Instrument:
     def results(self) -> list[str]:
         """The files of the last scans and spectra, oldest first."""
         return list(self._kept["results"])
+
+    def lines(self, start: int, now_s: float) -> list[ScanLines]:
+        """The lines of the running scan beyond the first `start`, as far as they are complete."""
+        doing = self._kept["doing"]
+        if doing is None or self._scan is None or not self._scan.done():
+            return []
+        scan = self._scan.result()
+        course = scan.course
+        rows = np.sort(course.order[start : int(course.rows_taken(now_s).sum())])
+        if not rows.size:
+            return []
+        return [
+            ScanLines(course.region, course.shape, channel, unit, int(rows[0]), values[rows])
+            for channel, (unit, values) in scan.channels().items()
+        ]
 
     def _advance(self, now_s: float) -> None:
         while (at_s := self.next_change_s()) is not None and at_s <= now_s:

@@ -1,0 +1,130 @@
+"""Lines of a running scan, published while it goes on."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from afspm.errors import ConfigError
+from afspm.microscopes.simulator import Simulator
+from afspm.model import ControlRequest, Region, ScanLines, ScopeState, names
+
+REGION = Region((0.0, 0.0), (1e-6, 1e-6))
+
+
+@pytest.fixture
+def live(make_bench: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A translator whose controller has `bench.there` lines of two channels."""
+
+    def lines(self: Any, start: int) -> list[ScanLines]:
+        values = np.arange(start, bench.there)[:, None] * np.ones((1, 3))
+        return [ScanLines(REGION, (8, 3), name, "m", start, values) for name in ("Height", "Phase")]
+
+    bench: Any = None
+    bench = make_bench()
+    monkeypatch.setattr(type(bench.microscope), "lines", lines, raising=False)
+    bench = make_bench({"live_lines_s": 1.0})
+    bench.there = 0
+    bench.heard()
+    return bench
+
+
+def published(bench: Any) -> list[ScanLines]:
+    packets, bench.port.packets = bench.port.packets, []
+    return [thing for name, thing, _ in packets if name == "ScanLines"]
+
+
+def test_new_lines_are_published_as_often_as_was_asked(live: Any) -> None:
+    live.ask(ControlRequest.ACTION, names.START_SCAN)
+    live.there = 3
+    live.look(0.5)
+    assert published(live) == []
+    live.look(0.5)
+    first = published(live)
+    assert [(lines.channel, lines.first_row, lines.values[:, 0].tolist()) for lines in first] == [
+        ("Height", 0, [0, 1, 2]),
+        ("Phase", 0, [0, 1, 2]),
+    ]
+    live.there = 5
+    live.look(1.0)
+    second = published(live)
+    assert [(lines.first_row, len(lines.values)) for lines in second] == [(3, 2), (3, 2)]
+    assert first[0].began_ns == second[0].began_ns == 1_000_000_000_000
+    live.look(1.0)
+    assert published(live) == []  # nothing new
+
+
+def test_the_next_scan_begins_with_its_first_line(live: Any, scan: Any) -> None:
+    live.ask(ControlRequest.ACTION, names.START_SCAN)
+    live.there = 8
+    live.look(1.0)
+    began_ns = published(live)[0].began_ns
+    live.microscope.files["a"], live.microscope.state = [scan()], ScopeState.FREE
+    live.look(1.0)
+    live.look(1.0)
+    assert published(live) == []
+    live.ask(ControlRequest.ACTION, names.START_SCAN)
+    live.there = 1
+    live.look(1.0)
+    again = published(live)[0]
+    assert (again.first_row, len(again.values)) == (0, 1)
+    assert again.began_ns == began_ns + 3_000_000_000
+
+
+def test_they_are_not_kept_for_who_comes_later(live: Any) -> None:
+    live.ask(ControlRequest.ACTION, names.START_SCAN)
+    live.heard()
+    live.there = 8
+    live.look(1.0)
+    assert live.port.kept == []
+    assert published(live)
+
+
+def test_a_line_is_looked_for_at_its_time(live: Any) -> None:
+    live.ask(ControlRequest.ACTION, names.START_SCAN)
+    live.look(0.99)
+    assert live.translator.wait_s() <= 0.0101
+
+
+def test_without_being_asked_for_a_controller_is_not_asked(make_bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = make_bench()
+    monkeypatch.setattr(type(bench.microscope), "lines", lambda self, start: pytest.fail("it is asked"), raising=False)
+    bench.ask(ControlRequest.ACTION, names.START_SCAN)
+    for _ in range(50):
+        bench.look(1.0)
+
+
+def test_a_microscope_that_has_none_says_so(make_bench: Any) -> None:
+    with pytest.raises(ConfigError, match="can't give lines"):
+        make_bench({"live_lines_s": 1.0})
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_the_simulators_lines_make_up_its_scan(direction: str, tmp_path: Path, fake_clock: Any) -> None:
+    simulator = Simulator(initial={"scan-resolution-x": 8, "scan-resolution-y": 16, "x-scan-direction": direction})
+    simulator.clock, simulator.log, simulator.run_dir = fake_clock, logging.getLogger("test"), tmp_path
+    simulator.memory, simulator.wake = {}, lambda: None
+    simulator.connect()
+    simulator.start_scan()  # 16 lines of a second
+    assert simulator._instrument._scan is not None
+    simulator._instrument._scan.result()
+    pictures: dict[str, np.ndarray] = {}
+    start = 0
+    for seconds, rows in ((0.5, 0), (3.0, 3), (3.0, 3), (9.0, 9)):
+        fake_clock.t_s += seconds
+        new = simulator.lines(start)
+        assert {len(lines.values) for lines in new} == ({rows} if rows else set())
+        start += rows
+        for lines in new:
+            pictures[lines.channel] = lines.into(pictures.get(lines.channel))
+    missing = 0 if direction == "down" else 15
+    assert np.isnan(pictures["Height"]).all(axis=1).nonzero()[0].tolist() == [missing]
+    fake_clock.t_s += 10.0
+    assert simulator.status().state is ScopeState.FREE
+    for scan in simulator.load(simulator.results()[-1]):
+        taken = ~np.isnan(pictures[scan.channel])  # type: ignore[union-attr]
+        assert np.array_equal(pictures[scan.channel][taken], scan.values[taken])  # type: ignore[union-attr]
