@@ -51,6 +51,8 @@ class Control(Section):
     stop_scan_on_manual: bool = True
     request_timeout: PositiveDuration = 5.0
     request_retries: Annotated[int, Field(ge=0)] = 3
+    malfunction_after: Annotated[Duration, Field(ge=0)] = 5.0
+    """Real seconds that the microscope may be lost, before that is a malfunction and nobody stays in control."""
     solved_by_hand: tuple[str, ...] = ("device-malfunction",)
     """Problems that a person puts right: they may be flagged though no component solves them."""
     retract: bool = True

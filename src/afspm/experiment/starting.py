@@ -183,7 +183,7 @@ def _first(a: int | None, b: int) -> int:
 def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
     """The sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m.
 
-    control: lease_s, grace_s, stop_scan_on_problem, stop_scan_on_manual, retract, dangerous,
+    control: lease_s, grace_s, malfunction_after_s, stop_scan_on_problem, stop_scan_on_manual, retract, dangerous,
         roles (name of the role -> names; None: everyone).
     limits: see `limits.to_settings`; cache: see `caching.Caching.to_settings`.
     """
@@ -192,6 +192,7 @@ def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
         "control": {
             "lease_s": control.lease,
             "grace_s": control.grace,
+            "malfunction_after_s": control.malfunction_after,
             "stop_scan_on_problem": control.stop_scan_on_problem,
             "stop_scan_on_manual": control.stop_scan_on_manual,
             "retract": control.retract,

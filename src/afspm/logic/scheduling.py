@@ -42,6 +42,7 @@ from afspm.logic.frame import CoordinateFrame
 from afspm.logic.lease import Lease
 from afspm.logic.sessions import token_of
 from afspm.logic.settings import SchedulerSettings
+from afspm.logic.trust import TRANSLATOR, Trust
 from afspm.logic.watchdog import Watchdog
 from afspm.logic.words import is_routine, said
 from afspm.model import (
@@ -53,9 +54,11 @@ from afspm.model import (
     Packet,
     PacketHeader,
     ProbePosition,
+    Problem,
     Request,
     Response,
     ScanParameters,
+    ScopeState,
     ScopeStatus,
 )
 
@@ -101,6 +104,7 @@ class SchedulerCore:
         self._cache = Cache(settings.envelopes, settings.cache_bytes)
         self._lease = Lease(None if settings.lease_s is None else round(settings.lease_s * 1e9))
         self._watchdog = Watchdog(settings.watchdog)
+        self._trust = Trust(settings.malfunction_after_s)
         self._frame = frame
         self._desk = desk = Desk(settings, codec, self._watchdog, self._lease, self._holder, self._save, frame)
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
@@ -167,6 +171,7 @@ class SchedulerCore:
             self._desk.unclear_until_s(),
             self._desk.mover.due_s(),
             self._held_due_s,
+            self._malfunction_at_s(),
         )
         for deadline_s in others_s:
             if deadline_s is not None and (soonest_s is None or deadline_s < soonest_s):
@@ -431,6 +436,7 @@ class SchedulerCore:
         if isinstance(told, ScopeStatus):
             self._watchdog.scope_is(told.state)
             self._lease.scope_is(told.state, now_ns)
+            self._trust_is(told.state, now_s, now_ns)
             self._desk.errands.send(now_s)
             if self._desk.mover.busy:
                 self._desk.act_when_moved(now_s)
@@ -438,6 +444,15 @@ class SchedulerCore:
             self._watchdog.feedback_is(told)
         if isinstance(told, Feedback | ScanParameters | ProbePosition):
             self._guard.published(told, now_ns)
+
+    def _trust_is(self, state: ScopeState, now_s: float, now_ns: int) -> None:
+        self._trust.scope_is(state, now_s)
+        if not self._trust.lost and self._control.problems.get(Problem.DEVICE_MALFUNCTION) == TRANSLATOR:
+            self._arbitrate(Ask(Event.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
+
+    def _malfunction_at_s(self) -> float | None:
+        """When a problem is made of the microscope's being lost; None if it is not, or is flagged already."""
+        return None if Problem.DEVICE_MALFUNCTION in self._control.problems else self._trust.due_s()
 
     # --- time ---
 
@@ -448,6 +463,10 @@ class SchedulerCore:
             return
         if self._held and self._announce_at_s is None:
             self._on_request(self._held.popleft(), now_s, now_ns)
+            return
+        malfunction_at_s = self._malfunction_at_s()
+        if malfunction_at_s is not None and now_s >= malfunction_at_s:
+            self._arbitrate(Ask(Event.FLAG, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
             return
         dead_at_s, holder = self._holder_dead_at_s(), self._control.holder
         if holder is not None and dead_at_s is not None and now_s >= dead_at_s:

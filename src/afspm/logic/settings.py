@@ -26,6 +26,7 @@ class SchedulerSettings:
         takeover_s: see `Sessions`.
         cache_bytes: how much is cached at most.
         catch_up_s: how long (real) a scheduler waits at its start for what the translator has published before.
+        malfunction_after_s: how long (real) the microscope may be lost before that is flagged as a malfunction.
         clock: `ExperimentClock.as_dict()`, to be told to those who ask; empty: real time.
     """
 
@@ -42,4 +43,5 @@ class SchedulerSettings:
     envelopes: Envelopes = field(default_factory=Envelopes)
     cache_bytes: int = 512 * 2**20
     catch_up_s: float = 1.0
+    malfunction_after_s: float = 5.0
     clock: Mapping[str, float] = field(default_factory=dict)

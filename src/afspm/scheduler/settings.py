@@ -21,7 +21,8 @@ def scheduler_settings(
     control: Table, limits: Table, cache: Table, problems: ProblemNames, request_timeout_s: float
 ) -> SchedulerSettings:
     """All of them. Raises ConfigError, naming the section."""
-    known = {"lease_s", "grace_s", "stop_scan_on_problem", "stop_scan_on_manual", "retract", "dangerous", "roles"}
+    known = {"lease_s", "grace_s", "malfunction_after_s", "stop_scan_on_problem", "stop_scan_on_manual"}
+    known |= {"retract", "dangerous", "roles"}
     if unknown := control.keys() - known:
         raise ConfigError(f"unknown settings {sorted(unknown)}", where="[control]", hint=f"known: {sorted(known)}")
     try:
@@ -33,6 +34,7 @@ def scheduler_settings(
             limits=_limits(limits),
             envelopes=_envelopes(cache),
             grace_s=control.get("grace_s", SchedulerSettings.grace_s),
+            malfunction_after_s=control.get("malfunction_after_s", SchedulerSettings.malfunction_after_s),
         )
     except (TypeError, ValueError, KeyError) as error:
         raise ConfigError(f"the scheduler's settings make no sense: {error}") from error
