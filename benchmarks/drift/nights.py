@@ -1,0 +1,133 @@
+"""Nights in which a sample drifts and a microscope follows it as a tracker says; the truth is known.
+
+The drift: 1.5 µm gone to 1/e in three hours, 300 nm in half an hour, a wave of 150 nm a day, a random walk of 1 nm in
+a quarter of an hour, each in a direction of its own. The scans: 2 µm, 128 px, every 15 minutes, noise "real", every
+row where the drift is while it is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from afspm.drift.registration import DriftScan, Prior, Registration
+from afspm.drift.shear import row_delay_s
+from afspm.drift.tracking import Tracker, Update
+from afspm.model import Region
+from benchmarks.drift.conditions import CONDITIONS, Array, measured
+from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, ROW_S, View
+from benchmarks.drift.surfaces import SURFACES, Grid, imaged
+
+PIXELS = 128
+INTERVAL_S = 900.0
+FRAME_S = (PIXELS - 1) * ROW_S
+SIZE_M = (PIXELS - 1) * PIXEL_M
+STRAY_PX = 24.0  # that a scan may be off; what lies further out is repeated from there
+WALK_M = 1e-9
+_WALK_STEP_S = 60.0
+
+
+@dataclass
+class Drift:
+    """Displacement of the sample at any time of a night."""
+
+    seed: int
+    scans: int
+    _directions: Array = field(init=False)
+    _walk_m: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        random = np.random.default_rng([self.seed, 3])
+        directions = random.standard_normal((3, 2))
+        self._directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        steps = math.ceil((self.scans + 2) * INTERVAL_S / _WALK_STEP_S)
+        step_m = WALK_M * math.sqrt(_WALK_STEP_S / INTERVAL_S)
+        self._walk_m = np.cumsum(step_m * random.standard_normal((steps, 2)), axis=0)
+
+    def at(self, time_s: Array) -> Array:
+        """(…, 2) in m."""
+        t = np.asarray(time_s, dtype=np.float64)[..., None]
+        slow, fast, daily = self._directions
+        smooth = -1.5e-6 * np.expm1(-t / 10800.0) * slow - 0.3e-6 * np.expm1(-t / 1800.0) * fast
+        smooth = smooth + 0.15e-6 * np.sin(2 * np.pi * t / 86400.0) * daily
+        at = np.arange(len(self._walk_m)) * _WALK_STEP_S
+        walked = np.stack([np.interp(t[..., 0], at, self._walk_m[:, axis]) for axis in range(2)], axis=-1)
+        return np.asarray(smooth + walked)
+
+
+@dataclass
+class Night:
+    """A sample of one kind, and its drift."""
+
+    surface: str
+    seed: int
+    scans: int
+    drift: Drift = field(init=False)
+    _view: View = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.drift = Drift(self.seed, self.scans)
+        grid = Grid(PIXELS / 2 + STRAY_PX)
+        random = [np.random.default_rng([self.seed, list(SURFACES).index(self.surface), k]) for k in (1, 2)]
+        image = imaged(_unit(SURFACES[self.surface](grid, *random)))
+        self._view = View.of(grid, image / image[_middle(grid)].std())
+
+    def scan(self, number: int, start_s: float, center_m: Array, *, upwards: bool = True) -> DriftScan:
+        """The scan of this number (which its noise depends on) of a region of tip coordinates."""
+        q = np.stack(np.meshgrid(*[np.arange(PIXELS) - (PIXELS - 1) / 2] * 2))
+        order = np.arange(PIXELS) if upwards else np.arange(PIXELS)[::-1]
+        sample_m = np.asarray(center_m - self.drift.at(np.asarray(start_s + order * ROW_S, dtype=np.float64)))
+        heights = self._view.at(q + (sample_m / PIXEL_M).T[:, :, None])
+        noise = np.random.default_rng([self.seed, 4, number])
+        values = HEIGHT_M * measured(heights, CONDITIONS["real"], noise)
+        region = Region((float(center_m[0]), float(center_m[1])), (SIZE_M, SIZE_M))
+        return DriftScan(values, region, start_s, start_s + FRAME_S, upwards, f"{number}")
+
+    def followed(self, tracker: Tracker, *, up_and_down: bool = False) -> Iterator[tuple[Array, Update]]:
+        """(2,) where the sample is in the middle of each scan, less where it was in that of the first; and what the
+        tracker says of it. A second frame, downwards and right after the first one, is not given out."""
+        start_m = self.drift.at(np.array(FRAME_S / 2))
+        for number in range(self.scans):
+            update = self._taken(tracker, number, number * INTERVAL_S)
+            yield self.drift.at(np.array(update.after.time_s)) - start_m, update
+            if up_and_down and number == 0:
+                self._taken(tracker, self.scans, FRAME_S + ROW_S, upwards=False)
+
+    def _taken(self, tracker: Tracker, number: int, start_s: float, *, upwards: bool = True) -> Update:
+        center_m = tracker.forecast.at(start_s + FRAME_S / 2).mapping.inverse.apply((0.0, 0.0))
+        return tracker.add(self.scan(number, start_s, center_m, upwards=upwards))
+
+
+@dataclass
+class Oracle:
+    """An estimator that knows the truth."""
+
+    drift: Drift
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        there = np.array(scan.region.center_m)
+        now_m, then_s = self.drift.at(np.array(scan.mid_s)), reference.mid_s
+        for _ in range(3):  # when the reference passed what is in the middle of the scan
+            displacement = now_m - self.drift.at(np.array(then_s))
+            then_s = reference.mid_s + (row_delay_s(reference, there - displacement) or 0.0)
+        return Registration(
+            accepted=True,
+            reason="",
+            displacement_m=displacement,
+            covariance_m2=np.eye(2) * (1e-4 * PIXEL_M) ** 2,
+            linear=np.zeros((2, 2)),
+            center_m=there - displacement,
+        )
+
+
+def _unit(height: Array) -> Array:
+    return np.asarray((height - height.mean()) / height.std())
+
+
+def _middle(grid: Grid) -> tuple[slice, slice]:
+    inside = np.flatnonzero(np.abs(grid.axis_px) <= PIXELS / 2)
+    part = slice(inside[0], inside[-1] + 1)
+    return part, part
