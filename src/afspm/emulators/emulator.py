@@ -145,13 +145,13 @@ class Emulator(ABC):
             Crashed: it was told to.
         """
         self.clock, self.folder, self.log = clock, folder, log
+        self.rig = Rig(self._world_settings, self.seed, clock)
+        self.faults = Faults(self._faults, self.fault_kinds, clock.now_s())
+        folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()
         if self._stop.is_set():
             self.woken.post()
-        self.rig = Rig(self._world_settings, self.seed, clock)
         self.rig.wake = self.woken.post
-        self.faults = Faults(self._faults, self.fault_kinds, clock.now_s())
-        folder.mkdir(parents=True, exist_ok=True)
         try:
             listening(self.open())
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Event
 from typing import Any
 
 import zmq
@@ -84,6 +86,19 @@ def states(heard: Sequence[Any]) -> list[str]:
     return [one.state.name for one in heard if isinstance(one, ScopeStatus)]
 
 
+class Emulated(NanonisEmulator):
+    """With somebody at its panel."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.to_do: SimpleQueue[Callable[[], None]] = SimpleQueue()
+
+    def tick(self, now_s: float) -> float | None:
+        while not self.to_do.empty():
+            self.to_do.get()()
+        return super().tick(now_s)
+
+
 class Bench:
     """An emulator and a translator of it."""
 
@@ -91,10 +106,22 @@ class Bench:
         self.folder, self._stack = folder, stack
         self.clock = ExperimentClock.starting_now(speed=speed)
         world = {"port": 0, "surface": "steps", **emulator}
-        self.emulator = NanonisEmulator(**world)
+        self.emulator = Emulated(**world)
         self.session = folder / "session"
         self.address = stack.enter_context(self.emulator.running(self.session, self.clock))
         self.log = folder / "log.txt"
+
+    def at_panel(self, do: Callable[[Emulated], None]) -> None:
+        """Do something in the emulator's own thread; returns when it is done."""
+        done = Event()
+
+        def job() -> None:
+            do(self.emulator)
+            done.set()
+
+        self.emulator.to_do.put(job)
+        self.emulator.woken.post()
+        assert done.wait(DEADLINE_S)
 
     def start(self, **settings: Any) -> Peer:
         """The translator, as a process of its own, once it has found the controller."""

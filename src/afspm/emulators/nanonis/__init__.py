@@ -44,7 +44,8 @@ class NanonisEmulator(Emulator):
 
     Args:
         release: of its software: a year of `RELEASES`, or the number itself.
-        port: the first of four that it listens on; 0: one, any free.
+        port: the first that it listens on; 0: any free.
+        ports: how many; left out: four, as the real one, beginning with its usual one; one anywhere else.
         one_each: whether a port serves one client at a time, as the real one's do.
         session_path: what it calls its session folder, e.g. "D:\\\\Data"; left out: what the folder is called here.
         range_m: of its scanner in x and y.
@@ -77,6 +78,7 @@ class NanonisEmulator(Emulator):
         self,
         *,
         release: str | int = "2025",
+        ports: int | None = None,
         one_each: bool = False,
         session_path: str = "",
         range_m: Length = 100e-6,
@@ -86,6 +88,7 @@ class NanonisEmulator(Emulator):
     ) -> None:
         super().__init__(**settings)
         self.release = _release(release)
+        self._ports = ports or (_PORTS if self.port == self.usual_port else 1)
         self._one_each = one_each
         self._session_path = session_path
         self._range_m = range_m
@@ -96,7 +99,7 @@ class NanonisEmulator(Emulator):
 
     def open(self) -> str:
         """Listen on all ports."""
-        ports = [self.port + i if self.port else 0 for i in range(_PORTS if self.port == self.usual_port else 1)]
+        ports = [self.port + i if self.port else 0 for i in range(self._ports)]
         self._server = Server(LOOPBACK, ports, one_each=self._one_each, wakes=self.woken, on_bytes=self._answer_all)
         self.panel = Panel(
             self.rig,

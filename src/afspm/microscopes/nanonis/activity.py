@@ -119,7 +119,6 @@ class Activity:
         for heard in self._listener.heard():
             self._take(heard)
         scanning = bool(self._ask("Scan.StatusGet")[0])
-        self._probe.led = scanning
         told, self._told = self._told, None
         if scanning:
             return self._scanning(told)

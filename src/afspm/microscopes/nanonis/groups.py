@@ -216,7 +216,6 @@ class Probe(Group):
 
     Attributes:
         goal_m: where it is going; None when it is not.
-        led: a scan is leading it.
     """
 
     names = POSITION
@@ -225,13 +224,12 @@ class Probe(Group):
 
     def __init__(self) -> None:
         self.goal_m: tuple[float, float] | None = None
-        self.led = False
         self._seen_m: tuple[float, float] | None = None
         self._range_m = (math.inf, math.inf)
 
     def read(self, ask: Ask) -> dict[str, Value]:
         xy_m = self.goal_m
-        if xy_m is None and self.led:
+        if xy_m is None and self._seen_m is not None and ask("Scan.StatusGet")[0]:
             xy_m = self._seen_m
         if xy_m is None:
             xy_m = self._look(ask)
