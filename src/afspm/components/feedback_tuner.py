@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from afspm.components.feedback_metrics import error_shares, gain_search
 from afspm.errors import ConfigError, ControlLost, Refused
-from afspm.model import Problem
+from afspm.model import Problem, names
 from afspm.runtime.component import Component
 
 
@@ -26,6 +26,8 @@ class FeedbackTuner(Component):
 
     solves: ClassVar = ("feedback-non-optimal",)
     flags: ClassVar = ("device-malfunction",)
+    needs_actions = (names.START_SCAN,)
+    needs_parameters = (names.ZCTRL_IGAIN,)
 
     def __init__(
         self,

@@ -10,11 +10,12 @@ from typing import Any
 
 from afspm.components.plan import XY, Rhythm, ScanPlan, Step, grid_centers, rounds_within, squares
 from afspm.errors import ConfigError, InvalidValue
-from afspm.model import Region
+from afspm.model import Region, names
 from afspm.runtime.component import Component
 from afspm.units import Angle, Duration, Length
 
 Pixels = tuple[int, int]
+_FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
 class PlannedScans(Component):
@@ -31,6 +32,8 @@ class PlannedScans(Component):
         parameters: set before the first scan, e.g. {"scan-speed": "2 um/s"}.
     """
 
+    needs_actions = (names.START_SCAN,)
+
     def __init__(
         self,
         plan: ScanPlan,
@@ -45,6 +48,7 @@ class PlannedScans(Component):
         self.beat_s = period_s
         self.end_when_done = end_when_done
         self.parameters = dict(parameters or {})
+        self.needs_parameters = (*_FRAME, *self.parameters)
 
     def run(self) -> None:
         self.memory.setdefault("start_s", self.clock.now_s())

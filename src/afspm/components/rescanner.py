@@ -36,6 +36,7 @@ class Rescanner(Component):
     solves: ClassVar = ("thermal-drift",)
     flags: ClassVar = ("thermal-drift", "device-malfunction")
     listens: ClassVar = (WANTED, TOLD)
+    needs_actions = (names.START_SCAN,)
 
     def __init__(
         self, attempts: int = 3, widen: float = 2.0, most_pixels: int = 512, problem: str = "thermal-drift"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from afspm.components.plan import grid_centers
 from afspm.components.planned_scans import pair
 from afspm.errors import ConfigError
+from afspm.model import names
 from afspm.runtime.component import Component
 from afspm.units import Angle, Length
 
@@ -24,6 +25,8 @@ class SpectroscopyGrid(Component):
         repeats: how many spectra at each point.
         end_when_done: whether to end the whole experiment after the last.
     """
+
+    needs_actions = (names.START_SPEC,)
 
     def __init__(
         self,
@@ -47,6 +50,7 @@ class SpectroscopyGrid(Component):
         if repeats < 1:
             raise ConfigError(f"{repeats} repeats are none", where="repeats")
         self.kind = kind
+        self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *([names.SPEC_KIND] if kind else []))
         self.repeats = repeats
         self.end_when_done = end_when_done
 

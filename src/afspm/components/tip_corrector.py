@@ -56,6 +56,8 @@ class TipCorrector(Component):
     solves: ClassVar = ("tip-shape-changed",)
     flags: ClassVar = ("device-malfunction",)
     publishes: ClassVar = (DONE_ACTION,)
+    needs_actions = (names.START_SCAN,)
+    needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
     def __init__(
         self,

@@ -20,11 +20,13 @@ PURE = (
 
 @dataclass(frozen=True)
 class Planned:
-    """The measurements of a plan."""
+    """The measurements of a plan, and what the microscope must have for them."""
 
     regions: tuple[Region, ...] = ()
     positions: tuple[tuple[float, float], ...] = ()
     shape: tuple[int, int] | None = None
+    needs_actions: tuple[str, ...] = ()
+    needs_parameters: tuple[str, ...] = ()
 
 
 def plan_of(component: type, settings: Mapping[str, Any]) -> Planned | None:
@@ -41,7 +43,8 @@ def plan_of(component: type, settings: Mapping[str, Any]) -> Planned | None:
     plan = getattr(made, "plan", None)
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
-    return Planned(regions, positions, getattr(plan, "shape", None))
+    needs = (tuple(getattr(made, name, ())) for name in ("needs_actions", "needs_parameters"))
+    return Planned(regions, positions, getattr(plan, "shape", None), *needs)
 
 
 def refusals(name: str, planned: Planned, limits: Limits) -> list[str]:

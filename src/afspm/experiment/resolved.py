@@ -191,7 +191,12 @@ def _resolve_plan(name: str, resolved: Resolved) -> None:
     except Exception as error:
         resolved.findings.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", place)
         return
-    for reason in planned.refusals(name, plan, resolved.limits) if plan else ():
+    if plan is None:
+        return
+    resolved.declared[name] = replace(
+        resolved.declared[name], needs_actions=plan.needs_actions, needs_parameters=plan.needs_parameters
+    )
+    for reason in planned.refusals(name, plan, resolved.limits):
         resolved.findings.error(f"[{name}] plans what its limits refuse: {reason}", place)
 
 

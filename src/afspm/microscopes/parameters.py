@@ -20,7 +20,7 @@ from afspm.model import ControlResponse, names
 
 Value = bool | int | float | str
 
-FEEDBACK_ON: Final = "x-feedback-on"
+FEEDBACK_ON: Final = names.FEEDBACK_ON
 
 _TRUE, _FALSE = {"true", "1", "on", "yes"}, {"false", "0", "off", "no"}
 _TYPES = ("float", "int", "bool", "text")

@@ -17,6 +17,8 @@ CRASH: Final = "x-crash"
 RETRACT: Final = "x-retract"
 ENGAGE: Final = "x-engage"
 
+EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE)
+
 SCAN_TOP_LEFT_X: Final = "scan-top-left-x"
 SCAN_TOP_LEFT_Y: Final = "scan-top-left-y"
 SCAN_SIZE_X: Final = "scan-size-x"
@@ -63,7 +65,15 @@ CRASH_SPEED: Final = "x-crash-speed"
 CRASH_DEPTH: Final = "x-crash-depth"
 SPEC_KIND: Final = "x-spec-kind"
 
+FEEDBACK_ON: Final = "x-feedback-on"
+CONTROLLER: Final = "x-controller"
+"""The controller's name and version, as a text that can only be read."""
+
 # Of the slow axis: "up" (small y first) or "down".
 SCAN_DIRECTION: Final = "x-scan-direction"
 UP: Final = "up"
 DOWN: Final = "down"
+
+EXTENSION_PARAMETERS: Final = (
+    FEEDBACK_ON, SPEC_KIND, SCAN_DIRECTION, PULSE_VOLTAGE, PULSE_DURATION, CRASH_SPEED, CRASH_DEPTH, CONTROLLER,
+)  # fmt: skip

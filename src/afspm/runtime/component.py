@@ -73,10 +73,10 @@ class Component:
     """Envelopes that it publishes itself: it then gets an address to do so."""
     listens: ClassVar[tuple[str, ...] | None] = None
     """Envelopes, or how they begin, that it subscribes to where the experiment file doesn't say; None: all."""
-    needs_actions: ClassVar[tuple[str, ...]] = ()
+    needs_actions: tuple[str, ...] = ()
     """Actions that the microscope must have."""
-    needs_parameters: ClassVar[tuple[str, ...]] = ()
-    """Parameters that the microscope must have."""
+    needs_parameters: tuple[str, ...] = ()
+    """Parameters that the microscope must have. `afspm check` looks; a ready-made one may say so by its settings."""
 
     longest_step_s: ClassVar[float] = 30.0
     period_s: float | None = None

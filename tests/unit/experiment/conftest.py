@@ -102,6 +102,11 @@ class Emulated:
     def run_process(self, context): ...
 
 
+class Swapper(Component):
+    needs_actions = ("x-swap-mode", "x-pulse")
+    needs_parameters = ("x-drive",)
+
+
 class Untyped(Component):
     def __init__(self, size=1e-6, label="", typed: str = ""):
         self.size, self.label, self.typed = size, label, typed

@@ -7,6 +7,7 @@ instrument afterwards, with the same tip, and what it was measuring has gone on 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -177,6 +178,8 @@ class Simulator(Microscope):
 
     def get(self, vendor: str) -> Value:
         """The value in force; every parameter has its generic name here."""
+        if vendor == names.CONTROLLER:
+            return f"simulated microscope of afspm {version('afspm')}"
         if vendor not in self.memory["values"]:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"the simulated controller has no {vendor!r}")
         value: Value = self.memory["values"][vendor]

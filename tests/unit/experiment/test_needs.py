@@ -1,0 +1,56 @@
+"""What components need of the microscope is asked before anything runs."""
+
+from __future__ import annotations
+
+import pytest
+
+from .conftest import FRAME, Write, errors, only_error
+
+SIMULATED = FRAME[: FRAME.index("[microscope]")] + '[microscope]\ncomponent = true\nclass = "Simulator"\n'
+SWAPPER = '[swapper]\ncomponent = true\nclass = "parts.Swapper"\n'
+SERIES = '[series]\ncomponent = true\nclass = "ScanSeries"\nsize = ["1 um", "1 um"]\nscans = 2\n'
+ADDED = """
+[microscope.parameters.x-drive]
+vendor = "probe-pos-x"
+[microscope.actions.x-swap-mode]
+set = { x-spec-kind = "force" }
+"""
+
+
+def test_what_the_microscope_lacks_is_named_with_who_needs_it(write: Write) -> None:
+    found = [finding.what for finding in errors(write(SWAPPER, frame=SIMULATED))]
+    assert found == [
+        "[swapper] needs the action 'x-swap-mode', which [microscope] does not have",
+        "[swapper] needs the parameter 'x-drive', which [microscope] does not have",
+    ]
+
+
+def test_what_the_experiment_file_adds_to_the_microscope_is_there(write: Write) -> None:
+    assert errors(write(SWAPPER, frame=SIMULATED + ADDED)) == []
+
+
+def test_a_command_that_is_the_translator_may_have_everything(write: Write) -> None:
+    assert errors(write(SWAPPER)) == []
+
+
+def test_a_ready_made_component_needs_what_its_settings_say(write: Write) -> None:
+    assert errors(write(SERIES + 'parameters = { scan-speed = "2 um/s" }\n', frame=SIMULATED)) == []
+    error = only_error(write(SERIES + 'parameters = { scan-sped = "2 um/s" }\n', frame=SIMULATED))
+    assert "[series] needs the parameter 'scan-sped'" in error.what
+    assert "scan-speed" in error.hint
+
+
+@pytest.mark.parametrize(
+    "component",
+    [
+        SERIES,
+        '[grid]\ncomponent = true\nclass = "SpectroscopyGrid"\npositions = [[0.0, 0.0]]\nkind = "IV"\n',
+        '[tuner]\ncomponent = true\nclass = "FeedbackTuner"\nlowest_gain = 1.0\nhighest_gain = 9.0\n',
+        '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["3 um", "3 um"]\n',
+    ],
+)
+def test_all_that_ready_made_components_need_the_simulator_has(write: Write, component: str) -> None:
+    experiment = write(component, frame=SIMULATED)
+    assert errors(experiment) == []
+    declared = [said for said in experiment.resolved.declared.values() if said.needs_actions]
+    assert len(declared) == 1
