@@ -26,6 +26,7 @@ from afspm.units import convert
 
 CONTROLLER = "GXSM"
 _ANGSTROM = ("AA", "Å", "Ang")
+_TEXT_MAX = 1 << 16
 _FILE_NAME = re.compile(r"-X([pm])-(.+)\.nc$")
 
 
@@ -72,9 +73,9 @@ def _netcdf4(path: Path) -> _Raw:
         numbers: dict[str, float] = {}
         texts: dict[str, str] = {}
         for key, node in file.items():
-            if node.dtype.kind == "S":
+            if node.dtype.kind == "S" and node.size * node.dtype.itemsize <= _TEXT_MAX:
                 texts[key] = hdf5.text(node[()])
-            elif node.size == 1:
+            elif node.dtype.kind in "iuf" and node.size == 1:
                 numbers[key] = float(np.ravel(node[()])[0])
         attributes = {key: hdf5.text(v) for key, v in field.attrs.items() if isinstance(v, bytes | str)}
         return _Raw(hdf5.array(field), attributes, numbers, texts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 from afspm.errors import FileError
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
-_VALUES_MAX = 1 << 28  # a broken header may promise any size
+_HEAP = b"GCOL\x01\0\0\0"
+_OBJECT = 16  # bytes of its head
+_VALUES_PER_BYTE = 16  # if it is well compressed; a damaged header may promise any size
 
 
 def is_hdf5(path: Path) -> bool:
@@ -27,12 +30,37 @@ def opened(path: Path) -> Any:
         raise FileError("reading HDF5 needs h5py", where=str(path), hint='pip install "afspm[files]"') from None
     if not is_hdf5(path):
         raise FileError("is no HDF5 file", where=str(path))
+    _check_heaps(path.read_bytes(), path)
     return h5py.File(path, "r")
 
 
+def _check_heaps(data: bytes, path: Path) -> None:
+    """Heaps of texts whose sizes do not add up are refused here: the library would go round in them for ever.
+
+    A heap: "GCOL", version 1, its size; objects of number, count of references, size and data up to a multiple of 8;
+    number 0 is the free rest, its size that with its head (HDF5 file format specification, III.E).
+    """
+    at = data.find(_HEAP)
+    while at >= 0:
+        (size,) = struct.unpack_from("<Q", data.ljust(at + 16, b"\0"), at + 8)
+        if at + size > len(data) or not _adds_up(data, at + 16, at + size):
+            raise FileError("is damaged: the sizes in a heap of texts do not add up", where=str(path))
+        at = data.find(_HEAP, at + 16)
+
+
+def _adds_up(data: bytes, place: int, end: int) -> bool:
+    while place + _OBJECT <= end:
+        number, length = struct.unpack_from("<H6xQ", data, place)
+        if number == 0:
+            return bool(place + length == end)
+        place += _OBJECT + (length + 7) // 8 * 8
+    return place <= end
+
+
 def array(dataset: Any) -> NDArray[np.float64]:
-    """All values of a dataset of numbers. Raises FileError: it promises more than any scan has."""
-    if dataset.size is None or dataset.size > _VALUES_MAX:
+    """All values of a dataset of numbers. Raises FileError: it promises more than the file can hold."""
+    most = _VALUES_PER_BYTE * dataset.file.id.get_filesize()
+    if dataset.size is None or dataset.size > most:
         raise FileError(f"promises {dataset.size} values in {dataset.name}")
     return np.asarray(dataset[()], dtype=np.float64)
 

@@ -96,3 +96,12 @@ def test_damaged_bytes_are_refused_or_read_and_nothing_else(name: str, data: st.
         for one in reading(bytes(damaged), name):
             assert one.values.ndim == 2
             assert one.values.dtype == np.float64
+
+
+@pytest.mark.parametrize("size", [0, 2**63])
+def test_a_heap_of_texts_in_which_the_library_would_go_round_for_ever_is_refused(size: int) -> None:
+    damaged = bytearray(whole("nsid.h5"))
+    second = damaged.index(b"GCOL") + 16 + 16 + 8  # its first text is no longer than 8 bytes
+    damaged[second + 8 : second + 16] = size.to_bytes(8, "little")
+    with pytest.raises(FileError, match="do not add up"):
+        reading(bytes(damaged), "nsid.h5")

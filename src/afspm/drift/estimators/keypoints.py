@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,7 +47,7 @@ def brief(image: Image, count_max: int) -> Keypoints:
 def orb(image: Image, count_max: int) -> Keypoints:
     """FAST corners over scales with binary descriptors that turn with them (Rublee et al. 2011)."""
     detector = _skimage().ORB(n_keypoints=count_max, fast_threshold=0.05)
-    if not _detected(detector, _unit(image.values)):
+    if not _found(detector.detect_and_extract, _unit(image.values)):
         return _none(256)
     inside = _known(image, detector.keypoints, 5.0)
     return _keypoints(image, detector.keypoints[inside], _signs(detector.descriptors[inside]))
@@ -55,11 +56,18 @@ def orb(image: Image, count_max: int) -> Keypoints:
 def sift(image: Image, count_max: int) -> Keypoints:
     """Blobs over scales with histograms of gradients (Lowe 2004)."""
     detector = _skimage().SIFT()
-    if not _detected(detector, _unit(image.values)):
+    values = _unit(image.values)
+    if not _found(detector.detect, values):
         return _none(128)
-    strongest = _strongest_blobs(image.values, detector, count_max)
-    inside = strongest[_known(image, detector.positions[strongest], 2.0 * detector.sigmas[strongest])]
-    return _keypoints(image, detector.positions[inside], detector.descriptors[inside].astype(np.float32))
+    # Only of those that are kept the descriptors are worked out: that is what takes long.
+    kept = _strongest_blobs(image.values, detector, count_max)
+    kept = kept[_known(image, detector.positions[kept], 2.0 * detector.sigmas[kept])]
+    for name in ("keypoints", "positions", "sigmas", "scales", "orientations", "octaves"):
+        setattr(detector, name, getattr(detector, name)[kept])
+    if not len(kept):
+        return _none(128)
+    detector.extract(values)
+    return _keypoints(image, detector.positions, detector.descriptors.astype(np.float32))
 
 
 KINDS = {"brief": brief, "orb": orb, "sift": sift}
@@ -76,10 +84,10 @@ def _keypoints(image: Image, rows_columns: NDArray[Any], descriptors: Descriptor
     return Keypoints((np.asarray(rows_columns, dtype=np.float64) - middle)[:, ::-1], descriptors)
 
 
-def _detected(detector: Any, values: Array) -> bool:
+def _found(detect: Callable[[Array], None], values: Array) -> bool:
     """scikit-image raises where it finds nothing."""
     try:
-        detector.detect_and_extract(values)
+        detect(values)
     except RuntimeError:
         return False
     return True
