@@ -104,7 +104,8 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int, con
     with Progress(*columns, console=console, transient=True) as progress, ThreadPoolExecutor(1) as beside:
         track = progress.add_task("followed", total=len(scans))
         pair = progress.add_task("compared with the first", total=len(scans) - 1)
-        work = beside.submit(_pairs, scans, by, max(jobs - 1, 1), lambda: progress.advance(pair))
+        others = max(jobs - 1, 2) if jobs > 1 else 1  # one would be this process
+        work = beside.submit(_pairs, scans, by, others, lambda: progress.advance(pair))
         updates = []
         for update in followed(scans, tracking):
             updates.append(update)
