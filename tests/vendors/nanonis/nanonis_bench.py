@@ -51,8 +51,11 @@ class Peer:
         text = str(value).lower() if isinstance(value, bool) else str(value)
         return self.ask(ControlRequest.PARAM, Parameter(name, text, unit))
 
+    def get_response(self, name: str) -> Response:
+        return self.ask(ControlRequest.PARAM, Parameter(name))
+
     def get(self, name: str) -> str:
-        response = self.ask(ControlRequest.PARAM, Parameter(name))
+        response = self.get_response(name)
         assert response.ok, response.reason
         value = wire.frames.decode_parameter(response.payload).value
         assert value is not None
@@ -92,11 +95,15 @@ class Emulated(NanonisEmulator):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.to_do: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self.scan_ended = Event()
 
     def tick(self, now_s: float) -> float | None:
         while not self.to_do.empty():
             self.to_do.get()()
-        return super().tick(now_s)
+        next_s = super().tick(now_s)
+        if self.panel.ends:
+            self.scan_ended.set()
+        return next_s
 
 
 class Bench:

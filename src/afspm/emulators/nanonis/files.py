@@ -96,10 +96,9 @@ def engineering(value: float) -> str:
     """As "15.0000E-9": an exponent divisible by three, six digits."""
     if not math.isfinite(value):
         return str(value).replace("nan", "NaN").replace("inf", "Inf")
-    exponent = 3 * math.floor(math.log10(abs(value)) / 3) if value else 0
-    scaled = value / 10.0**exponent
-    digits = max(0, 6 - len(f"{abs(scaled):.0f}"))
-    return f"{scaled:.{digits}f}E{exponent:+d}"
+    decade = int(f"{value:.5E}".partition("E")[2])
+    exponent = 3 * (decade // 3)
+    return f"{value / 10.0**exponent:.{5 - decade + exponent}f}E{exponent:+d}"
 
 
 def _local(time_s: float) -> datetime:

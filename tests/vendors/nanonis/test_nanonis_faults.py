@@ -1,0 +1,238 @@
+"""What can go wrong at a Nanonis controller: each gives an error with a name, nothing hangs, and it is found again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from nanonis_bench import Bench, Peer, states
+
+from afspm.emulators.faults import Fault
+from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
+
+Make = Callable[..., Bench]
+FREE = ScopeState.FREE
+UNDEFINED = ScopeState.UNDEFINED
+
+
+def small(made: Bench, **settings: object) -> Peer:
+    """A translator that has found the controller, with a frame of few pixels in force."""
+    peer = made.start(**settings)
+    peer.until(FREE)
+    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
+    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
+    peer.until(lambda one: getattr(one, "shape", None) == (8, 16))
+    peer.until(FREE)
+    return peer
+
+
+def strike(made: Bench, kind: str, count: int = 1, duration_s: float = 1.0) -> None:
+    fault = Fault(kind, 0.0, count, duration_s)
+    made.at_panel(lambda emulator: emulator.faults.demand(fault, made.clock.now_s()))
+
+
+def scans(heard: list[object]) -> list[Scan]:
+    return [one for one in heard if isinstance(one, Scan)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("no-reply", "no answer to"),
+        ("cut", "was closed after 0 of 40 bytes"),
+        ("truncated", "the connection was closed after"),
+        ("error", "an emulated error"),
+        ("wrong-name", "Nanonis replied to 'Util.RTFreqGet' when it was asked for"),
+        ("garbage", "Nanonis replied to"),
+        ("huge", "Nanonis announced 2147483647 bytes"),
+        ("nan", "says nan"),
+    ],
+)
+def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, kind: str, told: str) -> None:
+    made = bench()
+    peer = small(made, reply_timeout_s=0.3)
+    strike(made, kind)
+    peer.until(UNDEFINED)
+    peer.until(FREE)
+    assert told in made.said()
+    assert peer.act(names.START_SCAN).ok
+    assert scans(peer.until(FREE))
+
+
+def test_a_dialog_on_its_screen_silences_it_until_it_is_answered(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = small(made, reply_timeout_s=0.3)
+    strike(made, "dialog", duration_s=1.5)
+    peer.until(UNDEFINED)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "the controller can't be reached" in response.reason
+    peer.until(FREE)
+    assert "Nanonis is silent while a dialog waits for an answer on its screen" in made.said()
+
+
+def test_a_slow_reply_is_waited_for(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = small(made)
+    strike(made, "slow", duration_s=0.5)
+    assert peer.get(names.TIP_BIAS_VOLTAGE) is not None
+    assert "can't be reached" not in made.said()
+
+
+def test_what_it_refuses_is_refused_with_its_own_words(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    strike(made, "refused")
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "it is not possible now" in response.reason
+    strike(made, "refused")
+    response = peer.set(names.TIP_BIAS_VOLTAGE, 0.3)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "it is not possible now" in response.reason
+    assert peer.act(names.START_SCAN).ok
+    assert scans(peer.until(FREE))
+
+
+def test_a_spectrum_that_is_refused_is_an_error_at_once(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.at_panel(lambda emulator: emulator.rig.occupy("something else", 1e6))
+    response = peer.act(names.START_SPEC)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "something else" in response.reason
+
+
+def test_fields_of_another_release_than_it_says_are_named(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    strike(made, "wrong-release", duration_s=1e9)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "the reply to Scan.PropsGet is not what it should be" in response.reason
+    assert "it was read as of release 14573" in response.reason
+
+
+def test_a_release_can_be_set_where_it_is_told_wrong(bench: Make) -> None:
+    made = bench(release="2025")
+    made.at_panel(lambda emulator: setattr(emulator.panel, "release", 99999))
+    peer = small(made, release=14573)
+    assert peer.act(names.START_SCAN).ok
+    assert scans(peer.until(FREE))
+
+
+def test_texts_that_are_not_utf8_are_read(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    strike(made, "not-utf8", count=3)
+    assert peer.act(names.START_SCAN).ok
+    assert scans(peer.until(FREE))
+
+
+# --- files ---
+
+
+@pytest.mark.parametrize("kind", ["file-late", "half-file"])
+def test_a_file_that_takes_its_time_is_waited_for(bench: Make, kind: str) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    strike(made, kind, duration_s=3.0)
+    assert peer.act(names.START_SCAN).ok
+    found = scans(peer.until(FREE))
+    assert found[0].filename.endswith("unnamed001.sxm")
+
+
+@pytest.mark.parametrize("kind", ["file-late", "half-file", "file-missing"])
+def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    strike(made, kind, duration_s=1e6)
+    assert peer.act(names.START_SCAN).ok
+    found = scans(peer.until(FREE))
+    assert found[0].filename.endswith("nanonis-0001.npz")
+    assert "unnamed001.sxm): it was fetched from Nanonis" in made.said()
+
+
+def test_a_spectrum_that_is_not_saved_is_fetched(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    strike(made, "autosave-off", duration_s=1e6)
+    assert peer.act(names.START_SPEC).ok
+    (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))
+    assert spectrum.filename.endswith(".npz")
+
+
+def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    strike(made, "autosave-off", duration_s=1e6)
+    assert peer.act(names.START_SCAN).ok
+    ends_s = made.clock.now_s()
+    found = scans(peer.until(FREE))
+    assert found[0].filename.endswith(".npz")
+    assert made.clock.now_s() - ends_s < 8.0 + 5.0, "the scan itself lasts 8 s, and no file is waited for"
+
+
+# --- the tip, and people ---
+
+
+def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    strike(made, "panel-stop")
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not scans(heard)
+
+
+def test_after_the_safe_tip_nothing_is_measured_until_the_tip_is_brought_back(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    strike(made, "safe-tip")
+    for action in (names.START_SCAN, names.START_SPEC, names.CRASH):
+        response = peer.act(action)
+        assert response.code in (ControlResponse.ACTION_ERROR, ControlResponse.NOT_FREE), action
+    peer.until(FREE)
+    response = peer.act(names.START_SCAN)
+    assert "safe tip" in response.reason
+    assert "Nanonis' safe tip has withdrawn the tip" in made.said()
+    assert peer.act(names.ENGAGE).ok
+    peer.until(FREE)
+    assert peer.act(names.START_SCAN).ok
+    assert scans(peer.until(FREE))
+
+
+def test_a_scan_that_ended_while_the_connection_was_lost_is_not_lost(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    strike(made, "cut", count=2)
+    peer.until(UNDEFINED)
+    found = scans(peer.until(FREE))
+    assert found[0].filename.endswith("unnamed001.sxm")
+
+
+def test_a_translator_that_was_killed_publishes_what_ended_meanwhile(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.process.kill()
+    made.process.wait(10)
+    assert made.emulator.scan_ended.wait(30)
+    again = made.start()
+    found = scans(again.until(FREE))
+    assert found[0].filename.endswith("unnamed001.sxm")
+
+
+def test_an_address_without_anybody_is_named(bench: Make) -> None:
+    made = bench()
+    made.address = "127.0.0.1:1"
+    peer = made.start()
+    response = peer.get_response(names.TIP_BIAS_VOLTAGE)
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "127.0.0.1:1: no connection" in made.said()
+    assert "is Nanonis running" in made.said()
