@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
-from afspm.emulators.nanonis import panel, wire
+from afspm.emulators.nanonis import on_curves, on_scans, on_signals, on_tip, panel, wire
 from afspm.emulators.nanonis.answers import Later, Nope, Results, answer
 from afspm.emulators.nanonis.panel import Panel
 from afspm.emulators.nanonis.server import Connection, Server
@@ -20,6 +20,8 @@ RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "
 """By the year of the software: the first that has what the protocol has from then on."""
 _PORTS: Final = 4
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
+_ANSWERING: Final = (on_curves, on_scans, on_signals, on_tip)
+"""What answers to the functions, by having been imported."""
 _OTHER_NAME: Final = "Util.RTFreqGet"
 
 

@@ -1,0 +1,140 @@
+"""Scans."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from afspm.emulators.nanonis.answers import Answer, Later, Nope, answers, chosen, deadline_s
+from afspm.emulators.nanonis.panel import Panel
+
+
+@answers("Scan.Action")
+def _action(panel: Panel, action: int, direction: int) -> Answer:
+    now_s, scan = panel.clock.now_s(), panel.rig.scan
+    if action == 0:
+        if panel.scanning is not None:  # it begins anew
+            panel.rig.stop_scan()
+            panel.advance(now_s)
+        panel.start_scan(bool(direction))
+    elif action == 1:
+        panel.rig.stop_scan()
+    elif action == 2 and scan is not None:
+        scan.pause(now_s)
+    elif action == 3 and scan is not None:
+        scan.resume(now_s)
+    elif action not in (2, 3, 4, 5, 6):
+        raise Nope(f"{action} is no action")
+    return ()
+
+
+@answers("Scan.StatusGet")
+def _scan_status(panel: Panel) -> Answer:
+    running = panel.scanning is not None and panel.scanning.scan.running(panel.clock.now_s())
+    return (int(running),)
+
+
+@answers("Scan.WaitEndOfScan")
+def _wait_end_of_scan(panel: Panel, timeout_ms: int) -> Answer:
+    """Of the next end: one that has been is none."""
+    ends = panel.ends
+    return Later(lambda _: (0, panel.last_path) if panel.ends > ends else None, deadline_s(panel, timeout_ms), (1, ""))
+
+
+@answers("Scan.FrameSet")
+def _frame_set(panel: Panel, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
+    if not (min(width, height) > 0.0 and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
+        raise Nope("the frame is empty")
+    panel.set_frame(x, y, width, height, angle_deg)
+    return ()
+
+
+@answers("Scan.FrameGet")
+def _frame_get(panel: Panel) -> Answer:
+    return panel.frame
+
+
+@answers("Scan.BufferSet")
+def _buffer_set(panel: Panel, channels: list[int], pixels: int, lines: int) -> Answer:
+    if not all(0 <= channel < 128 for channel in channels) or pixels < 1 or lines < 0:
+        raise Nope("no such channel or number of pixels")
+    panel.set_buffer(channels, pixels, lines)
+    return ()
+
+
+@answers("Scan.BufferGet")
+def _buffer_get(panel: Panel) -> Answer:
+    return panel.channels, panel.pixels, panel.lines
+
+
+@answers("Scan.SpeedSet")
+def _speed_set(panel: Panel, *speed: Any) -> Answer:
+    """1 keeps the speed and 2 the time; which of both is kept says which of both counts now."""
+    forward, backward, forward_s, backward_s, keep, ratio = speed
+    keeps_time = panel.speed[4] if keep == 0 else keep - 1
+    width = panel.frame[2]
+    if min(forward, backward, forward_s, backward_s) <= 0.0 or keep > 2:
+        raise Nope("no such speed")
+    if keeps_time:
+        forward, backward = width / forward_s, width / backward_s
+    else:
+        forward_s, backward_s = width / forward, width / backward
+    panel.speed = (forward, backward, forward_s, backward_s, keeps_time, ratio)
+    return ()
+
+
+@answers("Scan.SpeedGet")
+def _speed_get(panel: Panel) -> Answer:
+    return panel.speed
+
+
+@answers("Scan.PropsSet")
+def _props_set(
+    panel: Panel, continuous: int, bouncy: int, autosave: int, series: str, comment: str, *rest: Any
+) -> Answer:
+    panel.continuous = bool(chosen(continuous, panel.continuous, 1, 0))
+    panel.bouncy = bool(chosen(bouncy, panel.bouncy, 1, 0))
+    panel.autosave = chosen(autosave, panel.autosave, "all", "next", "off")
+    panel.series, panel.comment = series or panel.series, comment
+    if rest:
+        panel.modules = rest[0]
+    return ()
+
+
+@answers("Scan.PropsGet")
+def _props_get(panel: Panel) -> Answer:
+    counts = [1] * len(panel.modules)
+    table = [["Setpoint"] for _ in panel.modules]
+    autosave = {"all": 0, "next": 1, "off": 2}[panel.autosave]
+    flags = int(panel.continuous), int(panel.bouncy), autosave
+    return *flags, panel.series, panel.comment, panel.modules, counts, table, 3
+
+
+@answers("Scan.FrameDataGrab")
+def _frame_data_grab(panel: Panel, channel: int, forward: int) -> Answer:
+    last = panel.last
+    if channel not in (last.channels if last else panel.channels):
+        raise Nope("the channel is not among the acquired ones")
+    now_s = panel.clock.now_s()
+    if last is None or last.scan.drawing:
+        raw, upwards = np.full((panel.lines, panel.pixels), np.nan), True
+    else:
+        *_, there, back = panel.images(last, now_s)[channel]
+        raw, upwards = (there if forward else back[:, ::-1]), last.scan.upwards
+    rows = raw if panel.rows_as_recorded and upwards else raw[::-1]
+    return panel.signals[channel], rows, int(upwards)
+
+
+@answers("Scan.XYPosGet")
+def _scan_position(panel: Panel, wait: int) -> Answer:
+    return panel.rig.probe_at(panel.clock.now_s())
+
+
+@answers("Scan.Save")
+def _save(panel: Panel, wait: int, timeout_ms: int) -> Answer:
+    if panel.last is None:
+        raise Nope("there is no scan to save")
+    panel.save_scan(panel.last, panel.clock.now_s())
+    return (0,)

@@ -1,0 +1,189 @@
+"""The tip: where it is, the z controller, the bias, and what is done to it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from afspm.emulators.nanonis.answers import REGISTERS_AT_FIRST, Answer, Nope, answers, chosen, until_free
+from afspm.emulators.nanonis.panel import Panel
+
+
+@answers("FolMe.XYPosSet")
+def _position_set(panel: Panel, x: float, y: float, wait: int) -> Answer:
+    if panel.scanning is not None:
+        raise Nope("the tip can't be moved while it scans")
+    panel.rig.move_speed_m_s = panel.own_speed_m_s if panel.own_speed else panel.speed[0]
+    reach_x, reach_y = panel.range_m[0] / 2, panel.range_m[1] / 2
+    panel.rig.move_probe((float(np.clip(x, -reach_x, reach_x)), float(np.clip(y, -reach_y, reach_y))))
+    return until_free(panel, wait)
+
+
+@answers("FolMe.XYPosGet")
+def _position_get(panel: Panel, wait: int) -> Answer:
+    return panel.rig.probe_at(panel.clock.now_s())
+
+
+@answers("FolMe.SpeedSet")
+def _move_speed_set(panel: Panel, speed_m_s: float, own: int) -> Answer:
+    if speed_m_s <= 0.0:
+        raise Nope("no such speed")
+    panel.own_speed_m_s, panel.own_speed = speed_m_s, bool(own)
+    return ()
+
+
+@answers("FolMe.SpeedGet")
+def _move_speed_get(panel: Panel) -> Answer:
+    return panel.own_speed_m_s, int(panel.own_speed)
+
+
+@answers("FolMe.Stop")
+def _stop_move(panel: Panel) -> Answer:
+    panel.rig.stop_move()
+    return ()
+
+
+@answers("ZCtrl.OnOffSet")
+def _z_on_off_set(panel: Panel, on: int) -> Answer:
+    delay_s = panel.registers.get("ZCtrl.SwitchOffDelay", REGISTERS_AT_FIRST["ZCtrl.SwitchOffDelay"])[0]
+    panel.set_z_controller(panel.clock.now_s(), on=bool(on), off_delay_s=delay_s)
+    return ()
+
+
+@answers("ZCtrl.OnOffGet")
+def _z_on_off_get(panel: Panel) -> Answer:
+    return (int(panel.z_is_on(panel.clock.now_s())),)
+
+
+@answers("ZCtrl.StatusGet")
+def _z_status(panel: Panel) -> Answer:
+    return (panel.z_status(panel.clock.now_s()),)
+
+
+@answers("ZCtrl.ZPosSet")
+def _z_position_set(panel: Panel, z_m: float) -> Answer:
+    if panel.z_controller == "on":
+        raise Nope("the Z-Controller is on")
+    panel.registers["ZCtrl.ZPos"] = (z_m,)
+    return ()
+
+
+@answers("ZCtrl.SetpntSet")
+def _setpoint_set(panel: Panel, setpoint: float) -> Answer:
+    panel.rig.feedback = replace(panel.rig.feedback, setpoint=setpoint)
+    return ()
+
+
+@answers("ZCtrl.SetpntGet")
+def _setpoint_get(panel: Panel) -> Answer:
+    return (panel.rig.feedback.setpoint or 0.0,)
+
+
+@answers("ZCtrl.GainSet")
+def _gain_set(panel: Panel, proportional: float, time_s: float, integral: float) -> Answer:
+    """I = P / T: P and T count."""
+    integral = proportional / time_s if time_s > 0.0 else integral
+    panel.rig.feedback = replace(panel.rig.feedback, proportional_gain=proportional, integral_gain=integral)
+    return ()
+
+
+@answers("ZCtrl.GainGet")
+def _gain_get(panel: Panel) -> Answer:
+    proportional, integral = panel.rig.feedback.proportional_gain or 0.0, panel.rig.feedback.integral_gain or 0.0
+    return proportional, proportional / integral if integral else math.inf, integral
+
+
+@answers("ZCtrl.CtrlListGet")
+def _z_controllers(panel: Panel) -> Answer:
+    return ["log Current"], 0
+
+
+@answers("ZCtrl.Withdraw")
+def _withdraw(panel: Panel, wait: int, timeout_ms: int) -> Answer:
+    panel.rig.withdraw()
+    panel.z_controller = "off"
+    panel.rig.feedback = replace(panel.rig.feedback, on=False)
+    return until_free(panel, wait, timeout_ms)
+
+
+@answers("AutoApproach.OnOffSet")
+def _approach_set(panel: Panel, on: int) -> Answer:
+    if on:
+        panel.rig.engage()
+        panel.set_z_controller(panel.clock.now_s(), on=True)
+    return ()
+
+
+@answers("AutoApproach.OnOffGet")
+def _approach_get(panel: Panel) -> Answer:
+    return (int(panel.rig.engaged and panel.rig.doing(panel.clock.now_s()) == "approach"),)
+
+
+@answers("Bias.Set")
+def _bias_set(panel: Panel, bias_v: float) -> Answer:
+    if not abs(bias_v) <= 10.0:
+        raise Nope("the bias is limited to 10 V")
+    panel.rig.bias_v = bias_v
+    return ()
+
+
+@answers("Bias.Get")
+def _bias_get(panel: Panel) -> Answer:
+    return (panel.rig.bias_v,)
+
+
+@answers("Bias.Pulse")
+def _pulse(panel: Panel, wait: int, width_s: float, bias_v: float, hold: int, absolute: int) -> Answer:
+    relative = 1
+    panel.rig.pulse(bias_v + (panel.rig.bias_v if absolute == relative else 0.0), width_s)
+    return until_free(panel, wait)
+
+
+@answers("TipShaper.Start")
+def _shape(panel: Panel, wait: int, timeout_ms: int) -> Answer:
+    props = panel.registers.get("TipShaper.Props", REGISTERS_AT_FIRST["TipShaper.Props"])
+    lift_m, lift_s = props[3:5]
+    if lift_m < 0.0:
+        panel.rig.crash(-lift_m, -lift_m / max(lift_s, 1e-6))
+    else:
+        panel.rig.occupy("shaper", lift_s)
+    return until_free(panel, wait, timeout_ms)
+
+
+@answers("Piezo.TiltSet")
+def _tilt_set(panel: Panel, x_deg: float, y_deg: float) -> Answer:
+    panel.registers["Piezo.Tilt"] = (x_deg, y_deg)
+    panel.rig.slope = (math.tan(math.radians(x_deg)), math.tan(math.radians(y_deg)))
+    return ()
+
+
+@answers("Piezo.RangeGet")
+def _range(panel: Panel) -> Answer:
+    return panel.range_m
+
+
+@answers("Piezo.DriftCompSet")
+def _drift_set(panel: Panel, on: int, *rest: float) -> Answer:
+    was_on, *_ = panel.registers.get("drift", (0,))
+    x, y, z, *limit = rest
+    panel.registers["drift"] = (chosen(on, was_on, 1, 0), x, y, z, limit[0] if limit else 10.0)
+    return ()
+
+
+@answers("Piezo.DriftCompGet")
+def _drift_get(panel: Panel) -> Answer:
+    on, x, y, z, limit = panel.registers.get("drift", (0, 0.0, 0.0, 0.0, 10.0))
+    return on, x, y, z, 0, 0, 0, limit
+
+
+@answers("Motor.StartMove")
+def _motor(panel: Panel, direction: int, steps: int, group: int, wait: int) -> Answer:
+    if direction > 5:
+        raise Nope(f"{direction} is no direction")
+    where = list(panel.registers.get("Motor.Pos", (0.0, 0.0, 0.0)))
+    where[direction // 2] += (-1 if direction % 2 else 1) * steps * 1e-7
+    panel.registers["Motor.Pos"] = tuple(where)
+    panel.rig.occupy("motor", steps * 0.001)
+    return until_free(panel, wait)
