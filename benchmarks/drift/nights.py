@@ -57,6 +57,12 @@ class Drift:
         walked = np.stack([np.interp(t[..., 0], at, self._walk_m[:, axis]) for axis in range(2)], axis=-1)
         return np.asarray(smooth + walked)
 
+    def during_m(self, start_s: float) -> Array:
+        """(2,) mean over the rows of a scan: where it shows the sample as a whole. For a steady drift, that is where
+        the sample is at its middle."""
+        rows_s = start_s + ROW_S * np.arange(PIXELS, dtype=np.float64)
+        return np.asarray(self.at(np.asarray(rows_s)).mean(axis=0))
+
 
 @dataclass
 class Night:
@@ -87,12 +93,11 @@ class Night:
         return DriftScan(values, region, start_s, start_s + FRAME_S, upwards, f"{number}")
 
     def followed(self, tracker: Tracker, *, up_and_down: bool = False) -> Iterator[tuple[Array, Update]]:
-        """(2,) where the sample is in the middle of each scan, less where it was in that of the first; and what the
-        tracker says of it. A second frame, downwards and right after the first one, is not given out."""
-        start_m = self.drift.at(np.array(FRAME_S / 2))
+        """(2,) where each scan shows the sample, less where the first one does; and what the tracker says of it. A
+        second frame, downwards and right after the first one, is not given out."""
         for number in range(self.scans):
             update = self._taken(tracker, number, number * INTERVAL_S)
-            yield self.drift.at(np.array(update.after.time_s)) - start_m, update
+            yield self.drift.during_m(number * INTERVAL_S) - self.drift.during_m(0.0), update
             if up_and_down and number == 0:
                 self._taken(tracker, self.scans, FRAME_S + ROW_S, upwards=False)
 
@@ -109,10 +114,11 @@ class Oracle:
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         there = np.array(scan.region.center_m)
-        now_m, then_s = self.drift.at(np.array(scan.mid_s)), reference.mid_s
+        moved_m, later_m = self.drift.during_m(scan.start_s) - self.drift.during_m(reference.start_s), np.zeros(2)
         for _ in range(3):  # when the reference passed what is in the middle of the scan
-            displacement = now_m - self.drift.at(np.array(then_s))
-            then_s = reference.mid_s + (row_delay_s(reference, there - displacement) or 0.0)
+            displacement = moved_m - later_m
+            passed_s = reference.mid_s + (row_delay_s(reference, there - displacement) or 0.0)
+            later_m = self.drift.at(np.array(passed_s)) - self.drift.at(np.array(reference.mid_s))
         return Registration(
             accepted=True,
             reason="",

@@ -28,7 +28,6 @@ NIGHTS = {"rough": 3, "particles": 1, "steps": 1, "stamper": 1}
 # A thousand would take longer than all the rest. If errors added up, they would grow with the root of the number.
 LONG_SCANS = 300
 LONG_REFERENCES = 2
-MEASURED = "rough"  # the surface of the targets; the table has them all
 STARTS = {"rough": 6, "stamper": 4}
 
 OURS, ORACLE, PAPER, FEATURES = "bank", "oracle, bank", "paper's scheme", "paper's scheme, brief"
@@ -133,12 +132,11 @@ def _figures(here: Sequence[Followed]) -> list[str]:
 
 def _rows(nights: Sequence[Followed], starts: Sequence[Followed], long: Followed) -> Iterator[Row]:
     def late_nm(scheme: str) -> float:
-        return 1e9 * _late_m([one for one in nights if (one.scheme, one.surface) == (scheme, MEASURED)])
+        return 1e9 * _late_m([one for one in nights if one.scheme == scheme])
 
-    yield Row(f"tracking, {MEASURED}: late misplacement, beside the oracle", "nm", late_nm(OURS), late_nm(ORACLE), 1.1)
+    yield Row("tracking: late misplacement, beside the oracle", "nm", late_nm(OURS), late_nm(ORACLE), 1.1)
     if any(one.scheme == FEATURES for one in nights):
-        name = f"tracking, {MEASURED}: beside the paper's scheme and BRIEF"
-        yield Row(name, "nm", late_nm(OURS), late_nm(FEATURES), 0.33)
+        yield Row("tracking: beside the paper's scheme and BRIEF", "nm", late_nm(OURS), late_nm(FEATURES), 0.33)
     last_px = _rms_m([long.mistaken_m[-20:]]) / PIXEL_M
     yield Row(f"tracking: error after {len(long.misplaced_m)} scans", "px", last_px, None, 0.03)
     jump_nm = 1e9 * _jump_m([one for one in starts if one.scheme == STARTED])
