@@ -105,7 +105,7 @@ def report(
     full = (*path, *location)
     place = document.place(*full)
     shown = name_of(full)
-    if error["type"] == "extra_forbidden":
+    if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         findings.error(f"{shown} is not a setting", place, nearest(str(location[-1]), known))
     elif error["type"] == "missing":
         findings.error(f"{shown} is missing", place)

@@ -1,0 +1,118 @@
+"""Real processes on a sample that drifts: who thinks in sample coordinates sees it stand still."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drift_rig import Rig, Surveyed, surveyed, table, worker_of
+
+pytestmark = [pytest.mark.timeout(180), pytest.mark.xdist_group("drift")]
+KNOWN_M = 2e-9
+"""How well a scan is known to lie; a pixel is 16 nm."""
+PLACED_M = 20e-9
+"""How well one lies where it was asked for, once the rate is known; the sample drifts by 60 nm and more between two."""
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path)
+    yield made
+    made.close()
+
+
+def away_m(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.asarray(np.hypot(*(a - b).T))
+
+
+def require_it_stood_still(found: Surveyed, scans: int) -> None:
+    assert len(found.said_m) == len(found.spectra_said_m) == scans
+    assert away_m(found.drift_m[-1:], found.drift_m[:1])[0] > 200e-9  # there was something to correct
+    assert (away_m(found.said_m, found.true_m) < KNOWN_M).all(), found
+    assert (away_m(found.true_m[2:], np.zeros(2)) < PLACED_M).all(), found
+    assert (away_m(found.spectra_said_m, found.spectra_true_m)[1:] < 10e-9).all(), found
+    assert (away_m(found.spectra_true_m[2:], np.array([0.2e-6, 0.1e-6])) < PLACED_M).all(), found
+
+
+def test_a_sample_that_drifts_stands_still_for_components(rig: Rig) -> None:
+    run = rig.start('rescan = { rule = "never" }', scans=5)
+    assert run.end() == 0, run.output
+    require_it_stood_still(surveyed(run), 5)
+    rows = table(run)
+    assert [row["matched"] for row in rows] == ["yes"] * 5, rows
+    assert len({row["filename"] for row in rows}) == 5
+    rate = [float(rows[-1][f"rate_{axis}"]) for axis in "xy"]
+    np.testing.assert_allclose(rate, [0.25e-9, -0.15e-9], atol=0.02e-9)
+
+
+def test_killed_in_the_middle_the_scheduler_and_its_worker_know_where_the_sample_is(rig: Rig) -> None:
+    run = rig.start('rescan = { rule = "never" }', scans=5)
+    run.wait_for("surveyor .*round 1 is done")
+    os.kill(worker_of(run), signal.SIGKILL)
+    run.wait_for("surveyor .*round 2 is done")
+    run.signal("scheduler", signal.SIGKILL)
+    assert run.end() == 0, run.output
+    assert "is started again: exit code -9" in run.output
+    require_it_stood_still(surveyed(run), 5)
+    rows = table(run)
+    assert [row["matched"] for row in rows] == ["yes"] * len(rows), rows
+    assert len({row["filename"] for row in rows}) == len(rows)  # no scan was told twice
+
+
+def test_without_correction_drift_is_told_and_seen(rig: Rig) -> None:
+    run = rig.start("correct = false", scans=3)
+    assert run.end() == 0, run.output
+    found = surveyed(run)
+    np.testing.assert_array_equal(found.said_m, np.zeros((3, 2)))
+    rows = table(run)
+    told = np.array([[float(row["drift_x_m"]), float(row["drift_y_m"])] for row in rows])
+    assert (away_m(told, found.drift_m) < KNOWN_M).all(), (told, found.drift_m)
+    assert {row["correcting"] for row in rows} == {"no"}
+
+
+def test_at_the_start_a_scan_up_and_one_down_tell_the_velocity(rig: Rig) -> None:
+    run = rig.start('at_start = "up-down", rescan = { rule = "never" }', scans=3)
+    assert run.end() == 0, run.output
+    run.wait_for("rescanner is in control to solve thermal-drift")
+    run.wait_for("thermal-drift is cleared by rescanner")
+    found = surveyed(run)
+    assert (away_m(found.said_m, found.true_m) < KNOWN_M).all(), found
+    assert (away_m(found.true_m[1:], np.zeros(2)) < PLACED_M).all(), found  # without it the first is 60 nm off
+    assert len(table(run)) == 4
+
+
+def test_a_scan_that_lies_too_far_off_is_taken_again(rig: Rig) -> None:
+    run = rig.start('rescan = { tolerance = "40 nm" }', scans=2)
+    assert run.end() == 0, run.output
+    run.wait_for("rescanner .*the same region again: it is .* nm off")
+    run.wait_for("thermal-drift is cleared by rescanner")
+    found, rows = surveyed(run), table(run)
+    assert away_m(found.true_m[1:], np.zeros(2))[0] > 40e-9
+    assert len(rows) == 3
+    misplaced = [[float(rows[2][f"{what}_{axis}_m"]) for axis in "xy"] for what in ("center", "drift")]
+    assert away_m(*np.array(misplaced)[:, None])[0] < PLACED_M
+
+
+def test_a_user_s_own_estimator_is_named_in_the_experiment_file(rig: Rig) -> None:
+    run = rig.start('estimator = "surveyor.Drifts", rescan = { rule = "never" }', scans=3)
+    assert run.end() == 0, run.output
+    found = surveyed(run)
+    assert (away_m(found.said_m, found.true_m) < KNOWN_M).all(), found
+
+
+def test_an_estimator_that_fails_costs_no_scan_and_says_why(rig: Rig) -> None:
+    run = rig.start('estimator = "surveyor.Nothing", rescan = { rule = "never" }', scans=2)
+    assert run.end() == 0, run.output
+    assert "ZeroDivisionError: nothing is known" in table(run)[1]["reason"]
+    assert len(surveyed(run).said_m) == 2
+
+
+def test_an_estimator_that_hangs_costs_no_scan(rig: Rig) -> None:
+    run = rig.start('estimator = "surveyor.Hangs", longest_registration = "3 s"', scans=2)
+    assert run.end() == 0, run.output
+    run.wait_for("scheduler .*was not registered within 3 s, it goes out as predicted")
+    assert len(surveyed(run).said_m) == 2
