@@ -52,20 +52,24 @@ class Roles(ExitStack):
 
     def microscope(self, **settings: Any) -> str:
         """The real translator of a simulated microscope; returns the address where it is asked."""
+        return self.translator("afspm.microscopes.simulator.Simulator", **settings)[1]
+
+    def translator(self, class_: str, **settings: Any) -> tuple[str, str]:
+        """The real translator of a microscope; returns the addresses (publish, serve)."""
         folder = self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
-        serve = PORTS.address()
+        publish, serve = PORTS.address(), PORTS.address()
         launch = Launch(
             "microscope",
-            "afspm.microscopes.simulator.Simulator",
+            class_,
             settings,
-            sockets=Sockets(PORTS.address(), serve=serve),
+            sockets=Sockets(publish, serve=serve),
             run_dir=folder,
             state_dir=f"{folder}/state",
             log_level="CRITICAL",
             simulated=True,
         )
         self._host(launch)
-        return serve
+        return publish, serve
 
     def _host(self, launch: Launch) -> None:
         process = subprocess.Popen([sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE)

@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-EAGER_S = 0.015
+EAGER_S = 0.01
 """Between two looks when the end may come at any moment: what is left of 20 ms is for the look itself."""
 _PART = 0.1  # of what is left until the end: this much of it passes between two looks
 _GUESSED, _BY_OTHERS, _SAME = 0.35, 0.03, 0.005  # how wrong an expectation may be, as a part of the duration

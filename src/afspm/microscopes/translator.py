@@ -316,7 +316,8 @@ class Translator:
     def _about_to_act(self, request: Request) -> None:
         self._acting = request
         self._ledger.begin(request)
-        if request.id and not self.microscope.memory_is_all:
+        # what a kill leaves half set may be set again; an action may not be done again
+        if request.id and request.kind == ControlRequest.ACTION and not self.microscope.memory_is_all:
             self._save()
 
     def _finish(self, request: Request, response: Response) -> None:
@@ -378,7 +379,8 @@ def run_translator(microscope: Microscope, context: Context, make: Callable[...,
     from afspm.transport.launching import open_server_port
 
     launch = context.launch
-    memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None)
+    # saved several times with each request: it is for a kill, and after a power cut no request is waiting any more
+    memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None, synced=False)
     port = open_server_port(launch, context.clock)
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     run_dir = Path(launch.run_dir or ".")

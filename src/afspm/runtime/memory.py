@@ -17,17 +17,20 @@ class Memory(MutableMapping[str, Any]):
 
     Args:
         path: the file; None keeps nothing over a restart.
+        synced: whether saving waits for the disk, which takes ten milliseconds and more, so that it outlives a power
+            cut. A kill, of any process, it outlives in any case.
 
     Raises:
         FileError: the file can't be read, or holds something else.
     """
 
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self, path: Path | None, *, synced: bool = True) -> None:
         self._path = path
+        self._synced = synced
         self._values = _load(path) if path else {}
 
     def save(self) -> None:
-        """Write everything to disk; when this returns it survives a kill and a power cut.
+        """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
 
         Raises:
             InvalidValue: a value is not of JSON's types.
@@ -40,7 +43,7 @@ class Memory(MutableMapping[str, Any]):
                 f"a value can't be kept: {error}", where="memory", hint="keep numbers, texts, lists and dicts"
             ) from error
         if self._path is not None:
-            write_whole(self._path, [text.encode()])
+            write_whole(self._path, [text.encode()], synced=self._synced)
 
     def __getitem__(self, key: str) -> Any:
         return self._values[key]
@@ -63,8 +66,11 @@ class Memory(MutableMapping[str, Any]):
         return f"<Memory {self._values!r}>"
 
 
-def write_whole(path: Path, parts: list[bytes]) -> None:
-    """Write a file so that it is there completely or as it was before, whenever the power goes.
+def write_whole(path: Path, parts: list[bytes], *, synced: bool = True) -> None:
+    """Write a file so that it is there completely or as it was before, whenever the process is killed.
+
+    Args:
+        synced: the same of a power cut; that waits for the disk.
 
     Raises:
         FileError: it can't be written.
@@ -74,8 +80,9 @@ def write_whole(path: Path, parts: list[bytes]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with new.open("wb") as file:
             file.writelines(parts)
-            file.flush()
-            os.fsync(file.fileno())
+            if synced:
+                file.flush()
+                os.fsync(file.fileno())
         new.replace(path)
     except OSError as error:
         with contextlib.suppress(OSError):
