@@ -77,3 +77,7 @@ DOWN: Final = "down"
 EXTENSION_PARAMETERS: Final = (
     FEEDBACK_ON, SPEC_KIND, SCAN_DIRECTION, PULSE_VOLTAGE, PULSE_DURATION, CRASH_SPEED, CRASH_DEPTH, CONTROLLER,
 )  # fmt: skip
+
+# The velocity with which a controller moves its tip along with a sample that drifts.
+DRIFT_RATE_X: Final = "x-drift-rate-x"
+DRIFT_RATE_Y: Final = "x-drift-rate-y"

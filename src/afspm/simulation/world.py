@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import chance, marks, spectra
-from afspm.simulation.drift import Drift
+from afspm.simulation.drift import Compensation, Drift
 from afspm.simulation.feedback import Loop
 from afspm.simulation.fields import Array
 from afspm.simulation.marks import Mark
@@ -51,6 +51,7 @@ class World:
         self._surface = surface_from(self._surface_table)
         self._surface_seed = chance.subseed(seed, "surface") % 2**62
         self._drift = Drift(self.settings.drift, seed, start_s)
+        self._compensation = Compensation()
         self._maker = TipMaker(self.settings.tip)
         first = self._maker.first(chance.generator(seed, 0))
         self._tips = TipHistory([TipChange(start_s, "start", first)])
@@ -118,6 +119,8 @@ class World:
             "tips": [{"t_s": t, **tip.to_dict()} for t, tip in tips],
             "drift_start_m": self.drift_m(start_s).tolist(),
             "drift_end_m": self.drift_m(course.end_s).tolist(),
+            "compensated_start_m": self._compensation.at(start_s).tolist(),
+            "compensated_end_m": self._compensation.at(course.end_s).tolist(),
             "pressed_m": measured.pressed_m,
         }
         return SimulatedScan(course, drift, truth, measured.channels)
@@ -153,6 +156,16 @@ class World:
     def spectrum_s(self, kind: str) -> float:
         """How long such a curve takes."""
         return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
+
+    def compensate(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
+        """From a time on, the scanner moves along with the sample by itself, with this velocity (x, y).
+
+        Raises:
+            InvalidValue: before the time of the velocity that it has.
+        """
+        if not all(map(math.isfinite, (*velocity_m_per_s, t_s))):
+            raise InvalidValue(f"a velocity of {velocity_m_per_s} m/s from {t_s} s on")
+        self._compensation.set(velocity_m_per_s, t_s)
 
     # -- treating the tip
 
@@ -207,6 +220,10 @@ class World:
         """(x, y, z) by which the sample is displaced: x_tip = x_sample + drift. Shape t.shape + (3,)."""
         return self._drift.at(t_s)
 
+    def seen_drift_m(self, t_s: ArrayLike) -> Array:
+        """The same as far as the scanner does not follow it by itself."""
+        return self._drift.at(t_s) - self._compensation.at(t_s)
+
     @property
     def tip(self) -> TipState:
         """The tip after all that has been asked for so far."""
@@ -230,6 +247,7 @@ class World:
             "seed": self.seed,
             "surface": dict(self._surface_table),
             "drift_m": self.drift_m(t_s).tolist(),
+            "compensated_m": self._compensation.at(t_s).tolist(),
             "tip": self._tips.at(t_s).to_dict(),
             "tip_changes": [
                 {"t_s": c.t_s, "cause": c.cause, "tip": c.tip.to_dict()} for c in self._tips.changes if c.t_s <= t_s
@@ -253,6 +271,7 @@ class World:
             "held_z_m": self._held_z_m,
             "tips": [{"t_s": c.t_s, "cause": c.cause, "tip": c.tip.to_dict()} for c in self._tips.changes],
             "marks": [asdict(mark) for mark in self._marks],
+            "compensation": self._compensation.to_list(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -271,11 +290,14 @@ class World:
             calls, until = int(state["calls"]), float(state["scheduled_until_s"])
             at, came_from = (tuple(map(float, state[name])) for name in ("at_m", "came_from_m"))
             came_s, held = float(state["came_s"]), state["held_z_m"]
+            compensation = Compensation()
+            compensation.restore(state.get("compensation", ()))
         except (KeyError, TypeError, ValueError, ConfigError) as error:
             raise InvalidValue(f"a damaged saved state: {error}") from error
         self._tips, self._marks, self._calls, self._scheduled_until_s = TipHistory(tips), found, calls, until
         self._at_m, self._came_from_m = (at[0], at[1]), (came_from[0], came_from[1])
         self._came_s, self._held_z_m = came_s, held
+        self._compensation = compensation
 
     # -- inside
 
@@ -339,7 +361,7 @@ class World:
         self._marks.append(Mark(self._on_sample(position_m, t_s), depth_m, radius_m, t_s, kind))
 
     def _on_sample(self, position_m: tuple[float, float], t_s: float) -> tuple[float, float]:
-        drift = self.drift_m(t_s)
+        drift = self.seen_drift_m(t_s)
         return float(position_m[0] - drift[0]), float(position_m[1] - drift[1])
 
     def _relief(self, x_m: Array, y_m: Array, resolution_m: float, t_s: float) -> Relief:
@@ -352,7 +374,7 @@ class World:
     def _setup(self, loop: Loop, bias_v: float, slope: tuple[float, float], start_s: float) -> Setup:
         return Setup(
             sample=lambda x, y, resolution_m: self._relief(x, y, resolution_m, start_s),
-            drift_m=self._drift.at,
+            drift_m=self.seen_drift_m,
             offset_m=self._creep_m,
             scanner=self.settings.scanner,
             noise=self.settings.noise,

@@ -8,6 +8,7 @@ import os
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,11 +152,16 @@ def surveyed(run: AfspmRun) -> Surveyed:
     )
 
 
-def _drift_m(event: dict[str, dict[str, list[float]]]) -> np.ndarray:
+def _drift_m(event: dict[str, Any]) -> np.ndarray:
+    """Of the sample under the tip, less what the controller follows by itself."""
     if "scan" in event:
-        scan = event["scan"]
-        return (np.array(scan["drift_start_m"]) + np.array(scan["drift_end_m"]))[:2] / 2
-    return np.array(event["truth"]["drift_m"])[:2]
+        scan = {
+            name: np.array(value)[:2] for name, value in event["scan"].items() if name.endswith(("start_m", "end_m"))
+        }
+        seen = [scan[f"drift_{when}_m"] - scan[f"compensated_{when}_m"] for when in ("start", "end")]
+        return np.asarray((seen[0] + seen[1]) / 2)
+    truth = event["truth"]
+    return np.subtract(truth["drift_m"], truth["compensated_m"])[:2]
 
 
 def table(run: AfspmRun) -> list[dict[str, str]]:

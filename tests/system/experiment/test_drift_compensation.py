@@ -97,6 +97,16 @@ def test_a_scan_that_lies_too_far_off_is_taken_again(rig: Rig) -> None:
     assert away_m(*np.array(misplaced)[:, None])[0] < PLACED_M
 
 
+def test_a_controller_that_is_given_the_rate_keeps_the_tip_on_the_sample_by_itself(rig: Rig) -> None:
+    rates = 'compensate = { x = "x-drift-rate-x", y = "x-drift-rate-y" }'
+    run = rig.start(f'{rates}, rescan = {{ rule = "never" }}', scans=4)
+    assert run.end() == 0, run.output
+    found = surveyed(run)
+    assert (away_m(found.said_m, found.true_m) < KNOWN_M).all(), found
+    assert (away_m(found.true_m[2:], np.zeros(2)) < PLACED_M).all(), found
+    assert (away_m(found.drift_m[3:], found.drift_m[2:3]) < 10e-9).all(), found  # 60 nm and more without it
+
+
 def test_a_user_s_own_estimator_is_named_in_the_experiment_file(rig: Rig) -> None:
     run = rig.start('estimator = "surveyor.Drifts", rescan = { rule = "never" }', scans=3)
     assert run.end() == 0, run.output

@@ -37,6 +37,8 @@ _AT_FIRST: dict[str, Any] = {
     names.SCAN_RESOLUTION_Y: 128,
     names.SCAN_SPEED: "2 um/s",
     names.SCAN_DIRECTION: names.UP,
+    names.DRIFT_RATE_X: 0.0,
+    names.DRIFT_RATE_Y: 0.0,
     names.MOVE_SPEED: "5 um/s",
     names.PROBE_POS_X: 0.0,
     names.PROBE_POS_Y: 0.0,

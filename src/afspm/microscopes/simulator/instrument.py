@@ -185,6 +185,10 @@ class Instrument:
         before = self._si(self._kept["values"])
         self._kept["values"].update(values)
         after = self._si(self._kept["values"])
+        rate_m_s = (float(after[names.DRIFT_RATE_X]), float(after[names.DRIFT_RATE_Y]))
+        if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
+            self._world.compensate(rate_m_s, now_s)
+            self._settle()
         speed_m_s = float(after[names.MOVE_SPEED])
         distance_m = max(
             _distance(before, after, names.PROBE_POS_X, names.PROBE_POS_Y),

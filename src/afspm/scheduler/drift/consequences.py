@@ -10,7 +10,7 @@ import numpy as np
 from afspm.logic.desk import OwnEnd
 from afspm.logic.events import Announced, Effect, Input, Log, ProblemSeen
 from afspm.logic.scheduling import SchedulerCore
-from afspm.model import ControlRequest, Parameter, Problem, Request, Response, names
+from afspm.model import ControlRequest, ControlResponse, Parameter, Problem, Request, Response, names
 from afspm.scheduler.drift.frame import DriftFrame
 from afspm.scheduler.drift.knowledge import Knowledge
 from afspm.scheduler.drift.settings import DriftSettings
@@ -116,6 +116,8 @@ class Consequences:
 
     def _answered(self, axis: str, total_m_s: list[float]) -> OwnEnd:
         def ended(response: Response, now_s: float, now_ns: int) -> list[Effect]:
+            if response.code == ControlResponse.NOT_FREE:
+                return []  # a scan has begun already: it is handed over after the next
             if not response.ok:
                 return [Log("ERROR", f"the controller does not take the rate of the drift, {axis}: {response.reason}")]
             self._accepted[axis] = now_ns * 1e-9
