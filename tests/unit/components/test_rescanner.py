@@ -1,0 +1,121 @@
+"""The Rescanner in the laboratory in memory: what it scans again, how often, and what it leaves behind."""
+
+from __future__ import annotations
+
+import pytest
+from runtime_lab import REGION, Lab, run
+
+from afspm import wire
+from afspm.components.rescanner import AGAIN, OPPOSITE, SEARCH, Rescanner
+from afspm.errors import ConfigError
+from afspm.model import Problem, Region, ScanParameters, names
+from afspm.runtime.exit_codes import ExitCode
+from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
+from afspm.wire.generated.scan_pb2 import ScanParameters2d
+
+DRIFT, MALFUNCTION = Problem.THERMAL_DRIFT, Problem.DEVICE_MALFUNCTION
+ELSEWHERE = Region((3e-6, 1e-6), (1e-6, 0.5e-6), 0.2)
+
+
+class Drifting(Lab):
+    """A scheduler that tells what it was told to of each scan: "well", "off", "lost" or "unmatched"."""
+
+    def __init__(self, told: list[str]) -> None:
+        super().__init__("rescanner")
+        self.told = iter(told)
+        self.parameters = ScanParameters(REGION, (8, 8))
+        self.publish(self.parameters)
+        self.values |= dict.fromkeys((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), "0")
+        self.values |= dict.fromkeys((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), "0")
+        self.values |= dict.fromkeys((names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y), "0")
+        self.values[names.SCAN_DIRECTION] = names.UP
+        self.directions: list[str] = []
+
+    def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
+        told = next(self.told, "well")
+        self.publish(
+            DriftMapping(
+                matched=told not in ("lost", "unmatched"),
+                lost=told == "lost",
+                rescan="too far" if told == "off" else "",
+            )
+        )
+        self.directions.append(self.values[names.SCAN_DIRECTION])
+        super().publish_scan(region, shape)
+
+    def wants(self, kind: int, region: Region = REGION, *, upwards: bool | None = None) -> None:
+        params = ScanParameters2d.FromString(wire.encode(ScanParameters(region, (8, 8)))[1])
+        message = DriftRescan(kind=kind, params=params, reason="drift", upwards=upwards)  # type: ignore[arg-type]
+        message.timestamp.FromNanoseconds(self.clock.now_ns())
+        self.publish(message)
+
+    @property
+    def problems(self) -> tuple[int, ...]:
+        return self.control.published().problems
+
+
+def asked(
+    kind: int, told: list[str], region: Region = REGION, *, upwards: bool | None = None, **settings: float
+) -> Drifting:
+    """A Rescanner that was asked once."""
+    lab = Drifting(told)
+    lab.at(10.0, lambda: lab.wants(kind, region, upwards=upwards))
+    lab.at(5000.0, lab.kill)
+    assert run(Rescanner(**settings), lab) == ExitCode.ENDED  # type: ignore[arg-type]
+    return lab
+
+
+def test_the_region_is_taken_again_with_the_problem_flagged_meanwhile() -> None:
+    lab = asked(AGAIN, ["well"], ELSEWHERE)
+    assert [region.center_m for region in lab.finished] == [pytest.approx(ELSEWHERE.center_m)]
+    assert lab.problems == ()
+    assert lab.control.holder is None
+
+
+def test_it_is_tried_again_until_it_lies_well() -> None:
+    assert len(asked(AGAIN, ["off", "unmatched", "well"]).finished) == 3
+
+
+def test_after_its_attempts_it_lets_the_experiment_go_on() -> None:
+    lab = asked(AGAIN, ["off"] * 10, attempts=2)
+    assert len(lab.finished) == 2
+    assert lab.problems == ()
+
+
+def test_the_other_direction_is_scanned_and_the_direction_set_back() -> None:
+    lab = asked(OPPOSITE, ["well"], upwards=False)
+    assert lab.directions == [names.DOWN]
+    assert lab.values[names.SCAN_DIRECTION] == names.UP
+    assert lab.problems == ()
+
+
+def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_back() -> None:
+    lab = asked(SEARCH, ["lost", "lost", "unmatched"])
+    assert [region.size_m[0] for region in lab.finished] == pytest.approx([2e-6, 4e-6, 8e-6])
+    assert {region.center_m for region in lab.finished} == {REGION.center_m}
+    assert lab.problems == ()
+    assert float(lab.values[names.SCAN_SIZE_X]) == pytest.approx(REGION.size_m[0])
+    assert float(lab.values[names.SCAN_TOP_LEFT_X]) == pytest.approx(REGION.top_left_m[0])
+    assert float(lab.values[names.SCAN_RESOLUTION_X]) == 8
+
+
+def test_a_sample_that_is_not_found_again_is_a_person_s_business() -> None:
+    lab = asked(SEARCH, ["lost"] * 10)
+    assert len(lab.finished) == 3
+    assert lab.problems == (MALFUNCTION,)
+
+
+def test_what_it_was_asked_for_by_its_own_scans_is_not_done_again() -> None:
+    lab = Drifting(["off", "off"])
+    lab.at(10.0, lambda: lab.wants(AGAIN))
+    lab.at(10.0 + 105.0, lambda: lab.wants(AGAIN))  # of its first scan
+    lab.at(5000.0, lab.kill)
+    assert run(Rescanner(), lab) == ExitCode.ENDED
+    assert len(lab.finished) == 3
+    assert lab.problems == ()
+
+
+@pytest.mark.parametrize("settings", [{"attempts": 0}, {"widen": 1.0}, {"most_pixels": 1}])
+def test_settings_that_can_not_be_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(ConfigError):
+        Rescanner(**settings)  # type: ignore[arg-type]
