@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 from afspm.drift.estimators.least_squares.prepare import flatten_rows
 from afspm.drift.estimators.least_squares.rows import noise_metric, products, seen, without_lines
 from afspm.drift.estimators.least_squares.shrink import denoised
-from afspm.drift.estimators.least_squares.warp import Pair, derivative
+from afspm.drift.estimators.least_squares.warp import COUNT, Pair, derivative
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-SHIFT: Index = np.array([0, 1, 2], dtype=np.intp)  # of theta: the shift and the gain
-ALL: Index = np.arange(7, dtype=np.intp)
+SHIFT: Index = np.array([0, 1, 6], dtype=np.intp)  # of theta: the shift and the gain
+ALL: Index = np.arange(COUNT, dtype=np.intp)
 ENOUGH_PX = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """What is known of theta before: its mean and inverse covariance, (7,) and (7, 7)."""
+    """What is known of theta before: its mean and inverse covariance, (8,) and (8, 8)."""
 
     mean: Array
     precision: Array
@@ -33,10 +33,10 @@ class Fit:
     """Where it has come to, and the equations there, per block of the image and over the variance of the noise.
 
     Attributes:
-        theta: (7,), see `Pair`.
-        curvature: (n, 7, 7), H'QJ with J the gradient as it is and H what of it is signal.
-        spread: (n, 7, 7), H'QH, the covariance of `slope`.
-        slope: (n, 7), H'Qr.
+        theta: (8,), see `Pair`.
+        curvature: (n, 8, 8), H'QJ with J the gradient as it is and H what of it is signal.
+        spread: (n, 8, 8), H'QH, the covariance of `slope`.
+        slope: (n, 8), H'Qr.
     """
 
     theta: Array
@@ -54,8 +54,8 @@ def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, ste
         columns = pair.columns(derivative(mean, 1), derivative(mean, 0), mean, two - one)
         columns_q = seen(columns, known.astype(np.float64), None)
         normal = np.tensordot(columns_q, columns, ((0, 2), (0, 2)))
-        normal *= max(known.sum(), 1) / max(normal[7, 7], 1e-300)
-        theta, moved = _stepped(theta, normal[:7, :7], normal[:7, 7], believed, free)
+        normal *= max(known.sum(), 1) / max(normal[-1, -1], 1e-300)
+        theta, moved = _stepped(theta, normal[:-1, :-1], normal[:-1, -1], believed, free)
         if moved < 0.01:
             break
     return theta
@@ -80,9 +80,9 @@ def _round(pair: Pair, theta: Array, believed: Believed, steps: int) -> Fit:
     signal = pair.columns(*_signal(gradient, left / 2, known), mean, residual)
     weight = known * _row_weights(left, known)[:, None]
     signal_q = seen(signal, weight, noise_metric(left, known))
-    signal_q *= max(weight.sum(), 1.0) / max(float(np.vdot(signal_q[:, 7], residual)), 1e-300)
-    signal_q, signal = signal_q[:, :7], signal[:, :7]
-    curvature = products(signal_q, pair.columns(*gradient, mean, residual)[:, :7])
+    signal_q *= max(weight.sum(), 1.0) / max(float(np.vdot(signal_q[:, -1], residual)), 1e-300)
+    signal_q, signal = signal_q[:, :-1], signal[:, :-1]
+    curvature = products(signal_q, pair.columns(*gradient, mean, residual)[:, :-1])
     slope = products(signal_q, residual[:, None])[:, :, 0]
     for step in range(steps):
         theta, moved = _stepped(theta, curvature.sum(axis=0), slope.sum(axis=0), believed, ALL)

@@ -13,11 +13,11 @@ FLOOR_PX = 1e-3
 
 
 def covariance(fit: Fit, believed: Believed) -> Array:
-    """(7, 7) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982),
+    """(8, 8) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982),
     scaled by what the shift really varies with the blocks of the image left out.
 
     The variation is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb, J. Appl. Econom. 38, 671, 2023),
-    which allows for noise that is correlated within a block. Of 7 x 7 numbers it would know little, as few blocks hold
+    which allows for noise that is correlated within a block. Of 8 x 8 numbers it would know little, as few blocks hold
     most of the features: only its size is taken, and only where it is larger.
     """
     used = np.abs(fit.curvature).max(axis=(1, 2)) > 0.0

@@ -30,13 +30,14 @@ from afspm.drift.estimators.least_squares.rows import without_lines
 from afspm.drift.estimators.least_squares.score import Scorer
 from afspm.drift.estimators.least_squares.search import PixelPrior, candidates, channels
 from afspm.drift.estimators.least_squares.spectra import fine_filtered
-from afspm.drift.estimators.least_squares.warp import Box, Pair, Spline
+from afspm.drift.estimators.least_squares.warp import COUNT, LINEAR, Box, Pair, Spline
 from afspm.drift.registration import DriftScan, Prior, Registration
 
 Array = NDArray[np.float64]
 
-WIDEST_SHEAR = 0.03
+WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
 GAIN_SD = 1.0  # of the logarithm
+BEND_SD = 0.15
 
 
 class LeastSquares:
@@ -77,7 +78,7 @@ class LeastSquares:
             return Registration.refused("the scans overlap too little")
         believed = _believed(prior)
         smooth = _pair((channels(images[0])[0], channels(images[1])[0]), images, box)
-        theta = np.concatenate([shift, np.zeros(5)])
+        theta = np.concatenate([shift, np.zeros(COUNT - 2)])
         theta = least_squares(smooth, theta, believed, SHIFT, steps=4)
         theta = least_squares(smooth, theta, believed, ALL, steps=4)
         fine = fine_filtered(images)
@@ -89,7 +90,7 @@ class LeastSquares:
     def _registration(
         self, theta: Array, total: Array, box: Box, grid: Grid, found: Evidence, *, expected: bool
     ) -> Registration:
-        linear = theta[3:].reshape(2, 2)
+        linear = theta[LINEAR].reshape(2, 2)
         reason = self._limits.reason(found, expected=expected)
         return Registration(
             accepted=not reason,
@@ -130,8 +131,8 @@ def _pixel_prior(prior: Prior, grid: Grid) -> PixelPrior:
 
 
 def _believed(prior: PixelPrior | None) -> Believed:
-    mean, precision = np.zeros(7), np.zeros((7, 7))
-    precision[2:, 2:] = np.diag([1.0 / GAIN_SD**2, *[1 / 0.01**2, 1 / WIDEST_SHEAR**2] * 2])
+    mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
+    precision[2:, 2:] = np.diag(1.0 / np.square([*WIDEST, *WIDEST, GAIN_SD, BEND_SD]))
     if prior is not None:
         mean[:2], precision[:2, :2] = prior.mean, np.linalg.inv(prior.covariance)
     return Believed(mean, precision)

@@ -13,7 +13,7 @@ from afspm.drift.estimators.least_squares.prepare import Image
 from afspm.drift.estimators.least_squares.rows import without_lines
 from afspm.drift.estimators.least_squares.search import PixelPrior, channels
 from afspm.drift.estimators.least_squares.spectra import independent_values
-from afspm.drift.estimators.least_squares.warp import Box, Pair, Spline
+from afspm.drift.estimators.least_squares.warp import COUNT, Box, Pair, Spline
 
 Array = NDArray[np.float64]
 
@@ -54,8 +54,8 @@ class Scorer:
         box = Box.of_overlap(*self._shapes, shift)
         if box is None:
             return None
-        flat = Believed(np.zeros(7), np.zeros((7, 7)))
-        theta = np.concatenate([shift, np.zeros(5)])
+        flat = Believed(np.zeros(COUNT), np.zeros((COUNT, COUNT)))
+        theta = np.concatenate([shift, np.zeros(COUNT - 2)])
         theta = least_squares(Pair(*self._channels[0][:2], box), theta, flat, SHIFT, steps=2)
         if np.hypot(*(theta[:2] - shift)) > 4.0:
             theta[:2] = shift

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.drift.estimators.least_squares.warp import LINEAR
+
 Array = NDArray[np.float64]
 
 DRIFTS = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)  # pixels per row
@@ -48,13 +50,13 @@ def averaged(theta: Array, covariance: Array, covariances: Iterable[Array], mean
         theta and its covariance, the moments of the mixture.
     """
     weights, thetas, totals = [], [], []
-    off = theta[3:] - mean
+    off = theta[LINEAR] - mean
     for model in covariances:
-        spread = covariance[3:, 3:] + model
-        gain = covariance[:, 3:] @ np.linalg.inv(spread)
+        spread = covariance[LINEAR, LINEAR] + model
+        gain = covariance[:, LINEAR] @ np.linalg.inv(spread)
         weights.append(-0.5 * off @ np.linalg.solve(spread, off) - 0.5 * np.linalg.slogdet(spread)[1])
         thetas.append(theta - gain @ off)
-        totals.append(covariance - gain @ covariance[3:])
+        totals.append(covariance - gain @ covariance[LINEAR])
     weight = np.exp(np.array(weights) - max(weights))
     weight /= weight.sum()
     best: Array = weight @ np.array(thetas)

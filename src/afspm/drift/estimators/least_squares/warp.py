@@ -70,34 +70,40 @@ class Box:
         return np.array([self.x.mean(), self.y.mean()])
 
 
+COUNT = 8  # of the parameters theta of a pair
+LINEAR = slice(2, 6)  # the linear map among them
+
+
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two images on a box. Parameters are theta = (ux, uy, g, axx, axy, ayx, ayy): shift u px and linear map A about
-    the centre of the box, d(q) = u + A (q - centre), and logarithm g of the gain of the second over the first."""
+    """Two images on a box. Parameters are theta = (ux, uy, axx, axy, ayx, ayy, g, h): shift u px and linear map A about
+    the centre of the box, d(q) = u + A (q - centre); logarithm g of the gain of the second over the first, and h, by
+    how much more the second is bent (heights z appear as z + h z² / 2: feedback and tip do that to edges)."""
 
     first: Spline
     second: Spline
     box: Box
 
     def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
-        """e^(g/2) I1(q - d/2), e^(-g/2) I2(q + d/2), and where both are known.
+        """I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and where both are known.
 
         Both are moved by half: so both carry equal interpolation noise, the gradient of their mean is not correlated
         with the noise of their difference, and the shift is not pulled towards whole pixels.
         """
         cx, cy = self.box.center
         x, y = np.meshgrid(self.box.x, self.box.y)
-        dx = theta[0] + theta[3] * (x - cx) + theta[4] * (y - cy)
-        dy = theta[1] + theta[5] * (x - cx) + theta[6] * (y - cy)
+        dx = theta[0] + theta[2] * (x - cx) + theta[3] * (y - cy)
+        dy = theta[1] + theta[4] * (x - cx) + theta[5] * (y - cy)
         one, known1 = self.first.at(x - dx / 2, y - dy / 2)
         two, known2 = self.second.at(x + dx / 2, y + dy / 2)
-        return np.exp(theta[2] / 2) * one, np.exp(-theta[2] / 2) * two, known1 & known2
+        one, two = np.exp(theta[6] / 2) * one, np.exp(-theta[6] / 2) * two
+        return one + theta[7] / 4 * one**2, two - theta[7] / 4 * two**2, known1 & known2
 
     def columns(self, gx: Array, gy: Array, mean: Array, residual: Array) -> Array:
-        """[y, 8, x]: the derivatives of the residual by theta, given the gradient of the mean; and the residual."""
+        """[y, 9, x]: the derivatives of the residual by theta, given the gradient of the mean; and the residual."""
         cx, cy = self.box.center
         x, y = self.box.x[None, :] - cx, self.box.y[:, None] - cy
-        return np.stack([gx, gy, -mean, gx * x, gx * y, gy * x, gy * y, residual], axis=1)
+        return np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, -mean, -(mean**2) / 2, residual], axis=1)
 
 
 def derivative(values: Array, axis: int) -> Array:
