@@ -112,11 +112,19 @@ class Bench:
     def __init__(self, folder: Path, stack: ExitStack, speed: float, emulator: dict[str, Any]) -> None:
         self.folder, self._stack = folder, stack
         self.clock = ExperimentClock.starting_now(speed=speed)
-        world = {"port": 0, "surface": "steps", **emulator}
-        self.emulator = Emulated(**world)
+        self._settings = {"port": 0, "surface": "steps", **emulator}
         self.session = folder / "session"
-        self.address = stack.enter_context(self.emulator.running(self.session, self.clock))
+        self._start_controller()
         self.log = folder / "log.txt"
+
+    def _start_controller(self) -> None:
+        self.emulator = Emulated(**self._settings)
+        self.address = self._stack.enter_context(self.emulator.running(self.session, self.clock))
+
+    def start_controller_again(self) -> None:
+        """Another one where the last was, which knows nothing of it."""
+        self._settings["port"] = int(self.address.rpartition(":")[2])
+        self._start_controller()
 
     def at_panel(self, do: Callable[[Emulated], None]) -> None:
         """Do something in the emulator's own thread; returns when it is done."""

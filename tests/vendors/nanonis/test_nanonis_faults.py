@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from nanonis_bench import Bench, Peer, states
 
@@ -153,6 +154,21 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
     assert "unnamed001.sxm): it was fetched from Nanonis" in made.said()
 
 
+def test_the_name_of_an_older_file_is_not_believed(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    older = scans(peer.until(FREE))[0]
+    strike(made, "stale-name")
+    assert peer.set(names.SCAN_TOP_LEFT_X, "5", "um").ok
+    peer.until(FREE)
+    assert peer.act(names.START_SCAN).ok
+    newer = scans(peer.until(FREE))[0]
+    assert newer.filename != older.filename
+    assert newer.region.top_left_m[0] == pytest.approx(5e-6)
+    assert not np.array_equal(newer.values, older.values)
+
+
 def test_a_spectrum_that_is_not_saved_is_fetched(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
@@ -226,6 +242,22 @@ def test_a_translator_that_was_killed_publishes_what_ended_meanwhile(bench: Make
     again = made.start()
     found = scans(again.until(FREE))
     assert found[0].filename.endswith("unnamed001.sxm")
+
+
+def test_software_that_vanishes_and_is_started_again_is_found_with_what_is_in_force_then(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    strike(made, "crash")
+    peer.until(UNDEFINED)
+    made.start_controller_again()
+    peer.until(lambda one: getattr(one, "shape", None) == (128, 128))
+    peer.until(FREE)
+    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
+    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
+    peer.until(lambda one: getattr(one, "shape", None) == (8, 16))
+    peer.until(FREE)
+    assert peer.act(names.START_SCAN).ok
+    assert scans(peer.until(FREE))
 
 
 def test_an_address_without_anybody_is_named(bench: Make) -> None:

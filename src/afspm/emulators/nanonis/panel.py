@@ -21,6 +21,7 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
     "file-late": "a file appears only after the duration",
     "half-file": "a file is half written, and whole only after the duration",
     "file-missing": "a file is announced and never written",
+    "stale-name": "the file of the scan before is announced for a scan",
     "autosave-off": "scans and spectra are not saved for the duration, whatever is set",
     "safe-tip": "the safe tip withdraws the tip and ends the scan",
     "panel-stop": "somebody stops the scan at the panel",
@@ -131,7 +132,9 @@ class Panel:
     def _end_scan(self, ended: Scanning, now_s: float) -> None:
         self.scanning = None
         finished = ended.scan.stopped_s is None
-        self.last_path = self.save_scan(ended, now_s) if finished and self._saves(now_s) else ""
+        path = self.save_scan(ended, now_s) if finished and self._saves(now_s) else ""
+        if not (path and self.faults.strikes("stale-name", now_s)):
+            self.last_path = path
         self.ends += 1
         if finished and self.continuous:
             self.start_scan(ended.scan.upwards != self.bouncy)
@@ -296,8 +299,12 @@ class Panel:
         }
 
     def _next_name(self, base: str, digits: int, suffix: str) -> str:
-        self._saved[suffix] += 1
-        return f"{base}{self._saved[suffix]:0{digits}d}{suffix}"
+        """The next number of which there is no file yet."""
+        while True:
+            self._saved[suffix] += 1
+            name = f"{base}{self._saved[suffix]:0{digits}d}{suffix}"
+            if not (self.folder / name).exists():
+                return name
 
     def _save(self, name: str, content: bytes, now_s: float) -> None:
         path = self.folder / name

@@ -177,7 +177,7 @@ class Harvest:
             # whatever the other computer calls its folder, the name is the same
             folder = self._session_dir
             path = Path(ended["told"]) if folder is None else folder / PureWindowsPath(ended["told"]).name
-            return path if path.is_file() else None
+            return path if path.is_file() and path.stat().st_mtime_ns > ended["newest_ns"] else None
         if ended["told"] == "":
             return None
         times = [(file.stat().st_mtime_ns, file) for file in self._files(Path(ended["folder"]), ended["what"])]
