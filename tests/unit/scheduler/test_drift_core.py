@@ -368,3 +368,15 @@ def test_the_plain_scheduler_s_answers_are_the_same(lab: Lab) -> None:
     """A drop-in: what is not about places is decided by the same core."""
     lab.step(RequestIn(99, "stranger", Request(int(ControlRequest.ACTION), names.START_SCAN, b"", "stranger/1/1")))
     assert lab.replies()[-1].code == ControlResponse.NOT_IN_CONTROL
+
+
+def test_what_is_corrected_later_needs_no_scan_down() -> None:
+    lab = Lab(DriftSettings(at_start="up-down", correct_after=1000.0))
+    lab.in_force()
+    set_direction(lab, "up")
+    for number in range(2):
+        lab.scan()
+        lab.says(registered(lab.worker.jobs[number], forecast()))
+        lab.now_s += 1000.0
+    assert not lab.published("DriftRescan")
+    assert not problems(lab)

@@ -54,6 +54,7 @@ class Consequences:
     def of(self, registered: Registered, job: ScanJob, step: Step, now_ns: int) -> list[Effect]:
         """What is done after a scan was published."""
         if not self._knowledge.corrects(now_ns * 1e-9):
+            self._started = True  # until it is corrected there is time enough to learn the velocity
             return []
         if registered.lost:
             effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))

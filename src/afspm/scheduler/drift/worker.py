@@ -48,6 +48,7 @@ class _Worker:
         self._drift = DriftSettings.from_table(settings["drift"])
         self._store = Store(Path(settings["file"]) if settings["file"] else None)
         self._answers = answers
+        self._scheduler = os.getppid()
         self._begin()
         self._tell_forecast()
 
@@ -58,9 +59,15 @@ class _Worker:
         from afspm.scheduler.drift.estimation import Estimation
 
         made = tracker(self._drift.tracker, estimator(self._drift.estimator))
-        self._estimation = Estimation(made, self._drift.rescan, self._store.save)
+        self._estimation = Estimation(made, self._drift.rescan, self._save)
         if (state := self._store.load()) is not None:
             self._estimation.restore(state)
+
+    def _save(self, state: dict[str, Any]) -> None:
+        """Unless the scheduler was killed meanwhile: the next one's worker knows more by now."""
+        if os.getppid() != self._scheduler:
+            raise BrokenPipeError
+        self._store.save(state)
 
     def take(self, head: dict[str, Any], data: bytes) -> None:
         if head["do"] == "register":
@@ -75,6 +82,8 @@ class _Worker:
     def _register(self, head: dict[str, Any], data: bytes) -> None:
         try:
             answer = self._estimation.register(*pipe.job_from_head(head, data))
+        except BrokenPipeError:
+            raise
         except Exception as error:  # of a user's own estimator or tracker, too: it is the reason
             reason = str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"
             self._begin()  # what was half done is not to be built on
