@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-from afspm.errors import ConfigError
+from afspm.errors import ConfigError, InvalidValue
 from afspm.units import Duration, Length
 
 _STRICT = {"extra": "forbid"}
@@ -31,9 +31,9 @@ class RescanRule:
 
     def __post_init__(self) -> None:
         if self.tolerance is not None and not self.tolerance > 0.0:
-            raise ConfigError(f"a tolerance of {self.tolerance} m is none", where="rescan")
+            raise InvalidValue(f"a tolerance of {self.tolerance} m is none", where="rescan")
         if not 0.0 <= self.f_rescan <= 1.0:
-            raise ConfigError(f"f_rescan = {self.f_rescan} is no part of an area", where="rescan", hint="0 to 1")
+            raise InvalidValue(f"f_rescan = {self.f_rescan} is no part of an area", where="rescan", hint="0 to 1")
 
 
 @dataclass(frozen=True)
@@ -77,14 +77,14 @@ class DriftSettings:
         for name in ("correct_after", "longest_registration"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise ConfigError(f"{name} = {value} s can't be", where="drift")
+                raise InvalidValue(f"{name} = {value} s can't be", where="drift")
 
     @classmethod
     def from_table(cls, table: dict[str, Any]) -> DriftSettings:
         """Out of plain JSON, already in SI.
 
         Raises:
-            ConfigError: an unknown setting, or a value that can't be.
+            ConfigError, InvalidValue: an unknown setting, or a value that can't be.
         """
         plain = dict(table)
         try:

@@ -1,0 +1,84 @@
+"""The Drift Compensated Scheduler in an experiment file: its table is checked, and components know what places mean."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from afspm.scheduler import DriftCompensatedScheduler
+
+from .conftest import Write, errors, only_error
+
+SCHEDULER = '[scheduler]\ncomponent = true\nclass = "{name}"\n'
+MICROSCOPE = '[microscope]\ncomponent = true\nclass = "Simulator"\n'
+RESCANNER = '[rescanner]\ncomponent = true\nclass = "{name}"\n'
+
+
+def experiment(drift: str = "", name: str = "DriftCompensatedScheduler", rescanner: str = "Rescanner") -> str:
+    table = f"drift = {{ {drift} }}\n" if drift else ""
+    return MICROSCOPE + SCHEDULER.format(name=name) + table + RESCANNER.format(name=rescanner)
+
+
+def launched(write: Write, text: str) -> dict[str, Any]:
+    made = write(text, frame="")
+    assert not errors(made)
+    ports = iter(range(20_000, 20_100))
+    found = made.launches(
+        take_address=lambda: f"tcp://127.0.0.1:{next(ports)}", only=(), without=(), run_dir="run", state_dir="state"
+    )
+    return {start.launch.name: start.launch for start in found}
+
+
+def test_settings_reach_the_scheduler_in_si_and_a_table_with_a_class_is_left_to_it(write: Write) -> None:
+    drift = 'correct_after = "2 h", tracker = { class = "paper", queue = 3 }, rescan = { tolerance = "20 nm" }'
+    launch = launched(write, experiment(drift))["scheduler"]
+    from afspm.runtime.loading import load
+
+    made = load(launch)
+    assert isinstance(made, DriftCompensatedScheduler)
+    assert made.drift.correct_after == 7200.0
+    assert made.drift.rescan.tolerance == pytest.approx(20e-9)
+    assert made.drift.tracker == {"class": "paper", "queue": 3}
+
+
+@pytest.mark.parametrize(
+    ("drift", "said"),
+    [
+        ('estimator = "sit"', "there is no estimator 'sit'"),
+        ('estimator = "parts.NoSuch"', "no class NoSuch"),
+        ('tracker = { class = "paper", queu = 3 }', "no setting 'queu'"),
+        ('correct_afer = "2 h"', "drift.correct_afer is not a setting"),
+        ('rescan = { tolerance = "20 s" }', "s can't be converted to m"),
+        ('rescan = { rule = "papr" }', "not 'papr'"),
+        ('compensate = { x = "x-rate" }', "drift.compensate.y is missing"),
+        ("rescan = { tolerance = 0.0 }", "a tolerance of 0.0 m is none"),
+    ],
+)
+def test_what_is_wrong_with_it_is_told_before_it_runs(write: Write, drift: str, said: str) -> None:
+    assert said in only_error(write(experiment(drift), frame="")).what
+
+
+def test_components_know_whose_places_they_see(write: Write) -> None:
+    compensated = launched(write, experiment())
+    assert compensated["rescanner"].sample_coordinates
+    assert not compensated["microscope"].sample_coordinates
+    assert not launched(write, experiment(name="Scheduler"))["rescanner"].sample_coordinates
+
+
+def test_drift_must_be_somebody_s_business(write: Write) -> None:
+    alone = MICROSCOPE + SCHEDULER.format(name="DriftCompensatedScheduler")
+    assert "thermal-drift" in only_error(write(alone, frame="")).what
+    assert not errors(write(alone + '[control]\nsolved_by_hand = ["thermal-drift"]\n', frame=""))
+
+
+def test_the_published_names_are_ours(write: Write) -> None:
+    names = launched(
+        write,
+        experiment(
+            name="afspm.components.drift.scheduler.DriftCompensatedScheduler",
+            rescanner="afspm.components.drift.rescanner.DriftRescanner",
+        ),
+    )
+    assert names["scheduler"].class_.endswith("scheduler.drift.scheduler.DriftCompensatedScheduler")
+    assert names["rescanner"].class_.endswith("rescanner.Rescanner")
