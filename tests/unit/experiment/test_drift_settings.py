@@ -63,7 +63,12 @@ def test_components_know_whose_places_they_see(write: Write) -> None:
     compensated = launched(write, experiment())
     assert compensated["rescanner"].sample_coordinates
     assert not compensated["microscope"].sample_coordinates
-    assert not launched(write, experiment(name="Scheduler"))["rescanner"].sample_coordinates
+    plain = launched(write, MICROSCOPE + SCHEDULER.format(name="Scheduler") + RESCANNER.format(name="Metadata"))
+    assert not plain["rescanner"].sample_coordinates
+
+
+def test_a_rescanner_without_anybody_to_ask_it_is_told_of(write: Write) -> None:
+    assert "nobody publishes" in only_error(write(experiment(name="Scheduler"), frame="")).what
 
 
 def test_drift_must_be_somebody_s_business(write: Write) -> None:
