@@ -28,7 +28,7 @@ _ASKED_FOR = {
     ControlRequest.SET_CONTROL_MODE: "the mode",
     ControlRequest.END_EXPERIMENT: "ending the experiment",
 }
-_NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
+NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
 
 class Asker:
@@ -93,6 +93,9 @@ class Asker:
         self._link.wait(lambda: self._link.view.status is not None, give_up_s)
         while True:
             response = self._link.request(kind, subject, request_id=request_id, until_s=until_s)
+            if told and response.code in NOT_IN_CONTROL:  # now; whether it was done before is as unknown as it was
+                self._holding.lost(response.reason)
+                return Response(ControlResponse.NO_RESPONSE, reason=response.reason, id=request_id)
             if response.code != ControlResponse.NO_RESPONSE or self._holding.was_lost:
                 return response
             if is_seen():
@@ -116,7 +119,7 @@ class Asker:
         """
         if response.code == ControlResponse.NO_RESPONSE:
             return  # control is lost, and waited for when it is asked again
-        if response.code in _NOT_IN_CONTROL:
+        if response.code in NOT_IN_CONTROL:
             self._holding.lost(response.reason)
         elif response.code == ControlResponse.NOT_FREE:
             self.wait_free(states, until_s)

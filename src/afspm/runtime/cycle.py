@@ -43,6 +43,10 @@ class Cycle:
         self.outcome: Outcome | None = None
         self.results: list[Any] = []
 
+    def control_was_lost(self) -> None:
+        """Somebody else may measure from now on, as after an earlier life of ours."""
+        self._resumed = True
+
     def on_state(self, state: ScopeState, time_ns: int | None) -> None:
         """The microscope said what it is doing."""
         if self.outcome is not None or self._is_old(time_ns):

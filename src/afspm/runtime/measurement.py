@@ -10,8 +10,8 @@ from typing import Any
 from afspm import wire
 from afspm.errors import NoResponse, WireError
 from afspm.logic.sessions import KEYED
-from afspm.model import ControlRequest, Packet, ScopeState
-from afspm.runtime.asking import Asker
+from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
+from afspm.runtime.asking import NOT_IN_CONTROL, Asker
 from afspm.runtime.cycle import Cycle, Outcome
 from afspm.runtime.holding import Holding
 from afspm.runtime.link import Link
@@ -138,24 +138,31 @@ class Measuring:
 
     def _measure(self, progress: _Progress, cycle: Cycle | None) -> Cycle:
         """Attempt after attempt, until one is complete."""
+        if cycle is not None and cycle.outcome is Outcome.COMPLETED and self._is_done(progress, cycle):
+            self._forget_resumed()  # what was begun in an earlier life ended while control was waited for
+            return cycle
         again = cycle is not None and cycle.outcome is None
         while True:
             if not again:
                 self._forget_resumed()
                 progress.attempt += 1
                 cycle = None
-            again = False
             cycle = self._attempt(progress, cycle)
-            if cycle is not None and self._is_done(progress, cycle):
+            again = cycle is not None and cycle.outcome is None
+            if cycle is not None and not again and self._is_done(progress, cycle):
                 return cycle
 
     def _attempt(self, progress: _Progress, resumed: Cycle | None) -> Cycle | None:
         """Prepare and begin once, follow to the end; None if it could not be begun and is to be tried again.
 
-        What was asked for in an earlier life is asked for with the same id: it is not executed twice.
+        What was asked for in an earlier life is asked for with the same id: it is not executed twice. So is what comes
+        back without an outcome, since control was lost before the microscope had answered.
         """
         link, plan = self._link, progress.plan
         self._holding.regain(progress.until_s)
+        if resumed is not None and resumed.outcome is not None:  # it had begun, and ended while control was waited for
+            self._forget_resumed()
+            return resumed
         if resumed is None:
             self._write_down(progress)
         plan.prepare(progress.until_s)
@@ -174,7 +181,11 @@ class Measuring:
             if not response.ok and not cycle.begun:
                 is_unknown = False
                 self._asker.get_over(ControlRequest.ACTION, response, states, progress.until_s)
-                return None
+                if not _may_have_begun(response, resumed):
+                    return None
+                cycle.control_was_lost()
+                self._forget_resumed, forget = forget, _nothing  # listened for until it is asked for again
+                return cycle
             self._follow(progress, cycle)
             is_unknown = False
             return cycle
@@ -252,6 +263,16 @@ class Measuring:
                 self._link.log.warning("a %s that can't be read: %s", packet.envelope, error)
 
         return on_packet
+
+
+def _may_have_begun(response: Response, resumed: Cycle | None) -> bool:
+    """Whether control was lost before the microscope had answered, now or in the life before."""
+    unanswered = response.code == ControlResponse.NO_RESPONSE
+    return unanswered or (resumed is not None and response.code in NOT_IN_CONTROL)
+
+
+def _nothing() -> None:
+    """Something else forgets it."""
 
 
 def _newest_of_each(plan: Plan, things: list[Any]) -> list[Any]:

@@ -203,6 +203,26 @@ class Lab:
         """What was running is gone without a word."""
         self._go(ScopeState.FREE)
 
+    def begin_unheard(self, region: Region, in_s: float, asked: str = "start-scan") -> None:
+        """The translator dies as soon as it has begun a scan of `region`, and is back with it `in_s` later."""
+        back_s = self.clock.passed_s + in_s
+
+        def dies(request: Request) -> Response | str:
+            if request.subject != asked or self.clock.passed_s >= back_s:
+                return "go on"
+            if request.id not in self.answers:
+                self.begun_scans += 1
+                self.answers[request.id] = Response(ControlResponse.SUCCESS)
+            return Response(ControlResponse.NO_RESPONSE, reason="the translator is not connected")
+
+        def back() -> None:
+            self._go(ScopeState.SCANNING)
+            self.publish_scan(region)
+            self._go(ScopeState.FREE)
+
+        self.intercept = dies
+        self.at(in_s, back)
+
     def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
         for channel in self.channels:
             self.publish(Scan(region, channel, "m", np.zeros(shape), self.clock.now_ns()))

@@ -114,6 +114,21 @@ def test_a_scan_that_was_finished_during_the_death_is_found_in_the_cache(tmp_pat
     assert lab.control.holder is None, "control of the earlier life is given back"
 
 
+def test_a_scan_that_is_finished_while_a_later_life_waits_for_control_is_taken_up(tmp_path: Path) -> None:
+    lab = Lab()
+    lab.begin_unheard(TILES[0], in_s=20.0)
+    lab.at(2.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    port = LabPort(lab)
+    kill_in(lab, 5.0, port)
+    with pytest.raises(Kill9):
+        scope_of(lab, tmp_path, 0, port).scan(TILES[0], shape=(8, 8), key="tile-0")
+    lab.restart_component()
+    scans = scope_of(lab, tmp_path, 1).scan(TILES[0], shape=(8, 8), key="tile-0")
+    assert scans.region == TILES[0]
+    assert lab.begun_scans == 1
+
+
 def test_interruptions_of_an_earlier_life_are_said_too(tmp_path: Path) -> None:
     lab = Lab()
     lab.at(20.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))

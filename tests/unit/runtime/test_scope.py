@@ -225,6 +225,36 @@ def test_a_lost_answer_repeats_the_request_with_its_id_and_executes_it_once(lab:
     assert lab.begun_scans == 1
 
 
+def test_a_scan_that_went_on_unheard_while_control_was_lost_is_not_taken_again(lab: Lab, scope: Scope) -> None:
+    lab.begin_unheard(REGION, in_s=20.0)
+    lab.at(5.0, lambda: lab.flag(TIP))
+    lab.at(40.0, lambda: lab.clear(TIP))
+    scope.scan(REGION, shape=(8, 8))
+    assert lab.begun_scans == 1
+    assert len({request.id for request in lab.requests if request.subject == "start-scan"}) == 1
+
+
+def test_a_scan_that_never_began_before_control_was_lost_is_asked_for_with_the_same_id(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: (
+        Response(ControlResponse.NO_RESPONSE)
+        if request.subject == "start-scan" and lab.clock.passed_s < 20.0
+        else "go on"
+    )
+    lab.at(5.0, lambda: lab.flag(TIP))
+    lab.at(40.0, lambda: lab.clear(TIP))
+    scope.scan(REGION, shape=(8, 8))
+    assert lab.begun_scans == 1
+    assert len({request.id for request in lab.requests if request.subject == "start-scan"}) == 1
+
+
+def test_a_scan_of_somebody_else_while_control_was_lost_is_not_ours(lab: Lab, scope: Scope) -> None:
+    lab.begin_unheard(OTHER_REGION, in_s=20.0)  # a test scan of the repair; ours was begun and is lost
+    lab.at(5.0, lambda: lab.flag(TIP))
+    lab.at(40.0, lambda: lab.clear(TIP))
+    assert scope.scan(REGION, shape=(8, 8)).region == REGION
+    assert lab.begun_scans == 2
+
+
 def test_a_translator_that_is_silent_for_a_while_is_asked_with_the_same_id(lab: Lab, scope: Scope) -> None:
     def silent(request: model.Request) -> Response | str:
         late = lab.clock.passed_s < 20.0 and request.kind == ControlRequest.SET_SCAN_PARAMS
