@@ -284,19 +284,25 @@ class Desk:
                 self._learn(job, response, now_ns)
         if not job.client:
             self._own_ended(job, end, response, now_s, now_ns)
+        elif end is End.ANSWERED and _was_not_sent(response):
+            self._forget(job, response)
         elif end is End.ANSWERED:
-            self._finish(job, response)
+            self._finish(job, response, _unknown_fate(response))
         elif end is End.LATE:
-            self._once.note(job.client, job.request, response)
+            self._once.note(job.client, job.request, _unknown_fate(response) or response)
             self._log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
         elif end is End.UNKNOWN:
             if job.request.kind == _ACTION:
                 self._watchdog.started(str(job.request.subject), job.states_seen)  # as far as we know
             self._finish(job, response, Fate.UNKNOWN)
         else:
-            self._once.forget(job.client, job.request)
-            self._sent = deque((s for s in self._sent if s[:2] != (job.client, job.request.id)), _SENT_REMEMBERED)
-            self._reply_to(job, response)
+            self._forget(job, response)
+
+    def _forget(self, job: Job, response: Response) -> None:
+        """Nothing was done: asked again, with the same id too, it is."""
+        self._once.forget(job.client, job.request)
+        self._sent = deque((s for s in self._sent if s[:2] != (job.client, job.request.id)), _SENT_REMEMBERED)
+        self._reply_to(job, response)
 
     def _finish(self, job: Job, response: Response, fate: Fate | None = None) -> None:
         self._once.note(job.client, job.request, response if fate is None else fate)
@@ -351,6 +357,16 @@ class Desk:
 
     def _log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))
+
+
+def _was_not_sent(response: Response) -> bool:
+    """The translator says that it could not reach the controller, and did nothing."""
+    return response.code == ControlResponse.NO_RESPONSE and response.reason.startswith(NOT_SENT)
+
+
+def _unknown_fate(response: Response) -> Fate | None:
+    """The controller did not answer its translator: whether it was done is for that one to say, when asked again."""
+    return Fate.UNKNOWN if response.code == ControlResponse.NO_RESPONSE else None
 
 
 def is_get(request: Request) -> bool:

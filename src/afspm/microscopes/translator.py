@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, FileError, WireError
+from afspm.logic.forwarding import NOT_SENT
 from afspm.microscopes import in_force
 from afspm.microscopes.ledger import Ledger
 from afspm.microscopes.live import LiveLines
@@ -287,7 +288,7 @@ class Translator:
         except LOST as error:
             if self._connected:
                 self._lose(error)
-            reason = f"the controller can't be reached: {error}"
+            reason = f"{'' if self._acting is request else NOT_SENT}the controller can't be reached: {error}"
             self._finish(request, Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id))
 
     def _end(self) -> None:

@@ -75,9 +75,13 @@ class Lab:
         self.answer(question)
 
     def answer(
-        self, forward: Forward, code: ControlResponse = ControlResponse.SUCCESS, payload: bytes = b""
+        self,
+        forward: Forward,
+        code: ControlResponse = ControlResponse.SUCCESS,
+        payload: bytes = b"",
+        reason: str = "",
     ) -> list[Effect]:
-        return self.step(TranslatorReply(forward.number, Response(int(code), payload, "", forward.request.id)))
+        return self.step(TranslatorReply(forward.number, Response(int(code), payload, reason, forward.request.id)))
 
     def ask(self, name: str, kind: int, subject: Any = None, id_: str = "", user: str | None = None) -> list[Effect]:
         connection = self.connections.get(name) or self.connect(name)

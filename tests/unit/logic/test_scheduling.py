@@ -343,6 +343,24 @@ def test_what_was_not_sent_may_be_asked_again(lab: Lab) -> None:
     assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
 
 
+def test_what_the_translator_could_not_even_begin_is_asked_again(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    reason = "not sent: the controller can't be reached"
+    answer = replies(lab.answer(lab.forwarded[-1], NO_RESPONSE, reason=reason))[0].response
+    assert (answer.code, answer.reason) == (NO_RESPONSE, reason)
+    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
+
+
+def test_what_a_translator_had_no_answer_to_is_for_it_to_say_when_asked_again(lab: Lab) -> None:
+    lab.take_control("experiment")
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    lab.answer(lab.forwarded[-1], NO_RESPONSE, reason="the controller can't be reached")
+    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
+    lab.answer(lab.forwarded[-1])
+    assert lab.says("experiment", ACTION, "x-pulse", "experiment/a/1") is OK
+
+
 def test_a_limit_refuses_and_is_logged() -> None:
     limits = Limits({"tip-bias-voltage": Limit(high=5.0, source="experiment.toml:7")})
     lab = Lab(SchedulerSettings(limits=limits))
