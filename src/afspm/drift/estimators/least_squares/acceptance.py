@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators.least_squares.search import Correlation
-from afspm.drift.estimators.least_squares.spectra import shared_information
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 RINGS_PX = (9, 16)
+PARTS = 8  # of the overlap in each direction
 
 
 @dataclass(frozen=True)
@@ -26,68 +26,94 @@ class Evidence:
     information: float
     agreement: float
     correlation: float
-    correlation_z: float
     correlation_gap: float
     edges_gap: float
+    outliers: float
+    surprise: float
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a match must reach.
+    """What a match must reach. Set by what true and wrong pairs of the benchmark reach.
 
     Attributes:
-        overlap, overlap_expected: of the smaller scan; the latter where there is a prior.
+        overlap, overlap_expected: least part of the smaller scan; the latter where there is a prior.
         sd_px: largest standard deviation of the shift.
         gap: how much likelier, in nats, than any other shift.
         information: mutual information of the aligned scans, nats.
-        agreement: share of 4 x 4 parts of the overlap that correlate.
-        correlation, correlation_z: of the aligned scans, and in standard deviations over what they give at 32 shifts
-            about the match (surrogates), which a wrong match does no better than.
-        correlation_gap: above the best of the surrogates; `edges_gap` the same of a band that favours edges.
+        agreement: share of the parts of the overlap with features that correlate.
+        correlation: mean over the parts, by their features.
+        edges_gap: above the best correlation at 32 shifts about the match (surrogates), which a wrong match does no
+            better than, in a band that favours edges.
+        distinct: with this much of it the place is a place of its own. With less, the surface repeats itself, and more
+            is asked for:
+        correlation_gap: like `edges_gap`, of the scans as they are;
+        outliers: largest variance of the residual over what is typical of it: of features that one scan alone has. In a
+            lattice, defects are all that tells one place from another.
+        surprise: largest chi² of the shift, given the prior.
     """
 
     overlap: float = 0.4
     overlap_expected: float = 0.2
-    sd_px: float = 0.2
+    sd_px: float = 0.3
     gap: float = 1.0
     information: float = 60.0
-    agreement: float = 0.6
-    correlation: float = 0.4
-    correlation_z: float = 2.5
-    correlation_gap: float = 0.02
+    agreement: float = 0.7
+    correlation: float = 0.6
     edges_gap: float = 0.0
+    distinct: float = 0.3
+    correlation_gap: float = 0.02
+    outliers: float = 2.5
+    surprise: float = 14.0
 
     def reason(self, found: Evidence, *, expected: bool) -> str:
         """Why a match is refused, in words; empty if it isn't."""
         overlap = self.overlap_expected if expected else self.overlap
-        if found.overlap < overlap:
-            return f"the scans overlap by {found.overlap:.0%} only, {overlap:.0%} are needed"
         if found.correlation < self.correlation or found.information < self.information:
             return f"no common features (correlation {found.correlation:.2f}, {found.information:.0f} nats in common)"
+        if found.overlap < overlap:
+            return f"the scans overlap by {found.overlap:.0%} only, {overlap:.0%} are needed"
         if found.agreement < self.agreement:
-            return f"only {found.agreement:.0%} of the overlap agree, {self.agreement:.0%} are needed"
+            return f"only {found.agreement:.0%} of the parts with features agree, {self.agreement:.0%} are needed"
         if found.gap < self.gap:
             return f"ambiguous: another displacement is almost as likely ({found.gap:.1f} nats less)"
-        if found.correlation_z < self.correlation_z or found.correlation_gap < self.correlation_gap:
-            return f"other displacements correlate as well ({found.correlation_z:.1f} standard deviations over them)"
-        if found.edges_gap < self.edges_gap:
-            return "the edges correlate better at another displacement"
+        repeats = found.edges_gap < self.distinct
+        if found.edges_gap < self.edges_gap or (repeats and found.correlation_gap < self.correlation_gap):
+            return "other displacements correlate as well"
+        if repeats and found.outliers > self.outliers:
+            return f"the surface repeats itself, and features differ ({found.outliers:.1f} times the typical residual)"
+        if found.surprise > self.surprise:
+            return f"far from what was expected (chi² {found.surprise:.0f})"
         if not found.sd_px < self.sd_px:
             return f"too uncertain: {found.sd_px:.2f} px"
         return ""
 
 
-def agreement(one: Array, two: Array, known: Mask) -> float:
-    """Share of 4 x 4 parts of two aligned images whose correlation exceeds 0.2."""
-    good = total = 0
-    for rows in np.array_split(np.arange(one.shape[0]), 4):
-        for columns in np.array_split(np.arange(one.shape[1]), 4):
-            part = np.ix_(rows, columns)
-            m = known[part]
-            if m.sum() >= 16:
-                total += 1
-                good += correlated(one[part][m], two[part][m]) > 0.2
-    return good / max(total, 1)
+def agreement(one: Array, two: Array, known: Mask) -> tuple[float, float]:
+    """Of 8 x 8 parts of two aligned images: the share of those with features (twice the power of what a typical part
+    has left) that correlate by more than 0.5; and the correlation within the parts, each by its power."""
+    n = np.maximum(_sums(known.astype(np.float64)), 1.0)
+    a, b = _sums(one * known) / n, _sums(two * known) / n
+    aa, bb, ab = (
+        _sums(u * v * known) / n - p * q for u, v, p, q in ((one, one, a, a), (two, two, b, b), (one, two, a, b))
+    )
+    features = np.maximum(aa, bb) > 2.0 * np.median(aa + bb - 2.0 * ab)
+    size = np.sqrt(np.maximum(aa, 0.0) * np.maximum(bb, 0.0))
+    share = float(np.mean(ab[features] > 0.5 * size[features])) if features.any() else 0.0
+    return share, float(ab.sum() / max(size.sum(), 1e-300))
+
+
+def _sums(values: Array) -> Array:
+    """Over each part."""
+    for axis in (0, 1):
+        values = np.add.reduceat(values, np.arange(PARTS) * values.shape[axis] // PARTS, axis=axis)
+    return values
+
+
+def outliers(residual: Array) -> float:
+    """Variance of values over the square of their median absolute deviation; 1 for normal noise."""
+    typical = 1.4826 * float(np.median(np.abs(residual)))
+    return float(np.mean(residual**2)) / max(typical**2, 1e-300)
 
 
 def correlated(one: Array, two: Array) -> float:
@@ -96,24 +122,11 @@ def correlated(one: Array, two: Array) -> float:
     return float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-300))
 
 
-def against_surrogates(one: Array, two: Array, known: Mask) -> tuple[float, float, float]:
-    """Correlation of two aligned images, and how far it stands out from that at 32 shifts on two rings.
-
-    Returns:
-        correlation; its distance from the mean of the others in their standard deviations; and from the best of them.
-    """
+def above_surrogates(one: Array, two: Array, known: Mask) -> float:
+    """By how much the correlation of two aligned images exceeds the best of those at 32 shifts on two rings."""
     correlation = Correlation(known, known).of(one, two)
     cy, cx = np.array(known.shape) - 1
-    others = []
-    for radius in RINGS_PX:
-        angles = 2.0 * np.pi * np.arange(16) / 16
-        y, x = np.rint(radius * np.sin(angles)).astype(int) + cy, np.rint(radius * np.cos(angles)).astype(int) + cx
-        inside = (y >= 0) & (y < correlation.shape[0]) & (x >= 0) & (x < correlation.shape[1])
-        others += correlation[y[inside], x[inside]].tolist()
-    here, surrogates = float(correlation[cy, cx]), np.array(others)
-    return here, float((here - surrogates.mean()) / max(surrogates.std(), 1e-6)), float(here - surrogates.max())
-
-
-def information(one: Array, two: Array, known: Mask) -> float:
-    """See `shared_information`; what is not known counts as zero in both."""
-    return shared_information(one * known, two * known)
+    angles = 2.0 * np.pi * np.arange(16) / 16
+    y, x = (np.rint(np.outer(RINGS_PX, f(angles))).astype(int).ravel() for f in (np.sin, np.cos))
+    inside = (np.abs(y) <= cy) & (np.abs(x) <= cx)
+    return float(correlation[cy, cx] - correlation[y[inside] + cy, x[inside] + cx].max())

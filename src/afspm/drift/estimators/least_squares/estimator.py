@@ -11,15 +11,14 @@ from afspm.drift.estimators.least_squares import shear
 from afspm.drift.estimators.least_squares.acceptance import (
     Evidence,
     Limits,
-    against_surrogates,
+    above_surrogates,
     agreement,
-    information,
+    outliers,
 )
 from afspm.drift.estimators.least_squares.align import (
     ALL,
     SHIFT,
     Believed,
-    Fit,
     generalised_least_squares,
     least_squares,
 )
@@ -29,7 +28,7 @@ from afspm.drift.estimators.least_squares.prepare import Image, Unusable, decima
 from afspm.drift.estimators.least_squares.rows import without_lines
 from afspm.drift.estimators.least_squares.score import Scorer
 from afspm.drift.estimators.least_squares.search import PixelPrior, candidates, channels
-from afspm.drift.estimators.least_squares.spectra import fine_filtered
+from afspm.drift.estimators.least_squares.spectra import fine_filtered, shared_information
 from afspm.drift.estimators.least_squares.warp import COUNT, LINEAR, Box, Pair, Spline
 from afspm.drift.registration import DriftScan, Prior, Registration
 
@@ -84,7 +83,7 @@ class LeastSquares:
         fine = fine_filtered(images)
         fit = generalised_least_squares(_pair((fine[0].values, fine[1].values), images, box), theta, believed)
         theta, total = shear.averaged(fit.theta, covariance(fit, believed), shear.models(), np.zeros(4))
-        found = _evidence(images, smooth, fit, theta, total, gap)
+        found = _evidence(images, smooth, theta, total, gap, prior)
         return self._registration(theta, total, box, grid, found, expected=prior is not None)
 
     def _registration(
@@ -138,20 +137,22 @@ def _believed(prior: PixelPrior | None) -> Believed:
     return Believed(mean, precision)
 
 
-def _evidence(images: tuple[Image, Image], smooth: Pair, fit: Fit, theta: Array, total: Array, gap: float) -> Evidence:
+def _evidence(
+    images: tuple[Image, Image], smooth: Pair, theta: Array, total: Array, gap: float, prior: PixelPrior | None
+) -> Evidence:
     one, two, known = smooth.warped(theta)
     one, two = without_lines(one, known), without_lines(two, known)
-    bands = [channels(image)[2] for image in images]
-    edge1, edge2, _ = _pair((bands[0], bands[1]), images, smooth.box).warped(theta)
-    rho, z, above = against_surrogates(one, two, known)
+    edge1, edge2, _ = _pair((channels(images[0])[2], channels(images[1])[2]), images, smooth.box).warped(theta)
+    share, correlation = agreement(one, two, known)
     return Evidence(
         overlap=float(known.sum() / min(image.known.sum() for image in images)),
         sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
         gap=gap,
-        information=information(one, two, known),
-        agreement=agreement(one, two, known),
-        correlation=rho,
-        correlation_z=z,
-        correlation_gap=above,
-        edges_gap=against_surrogates(edge1, edge2, known)[2],
+        information=shared_information(one, two),
+        agreement=share,
+        correlation=correlation,
+        correlation_gap=above_surrogates(one, two, known),
+        edges_gap=above_surrogates(edge1, edge2, known),
+        outliers=outliers((two - one)[known]),
+        surprise=0.0 if prior is None else prior.surprise(theta[:2], total[:2, :2]),
     )

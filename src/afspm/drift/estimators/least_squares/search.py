@@ -29,6 +29,11 @@ class PixelPrior:
         chi2: Array = np.einsum("...i,ij,...j", off, np.linalg.inv(self.covariance), off)
         return chi2
 
+    def surprise(self, shift_px: Array, covariance: Array) -> float:
+        """chi² of an estimate, which has a covariance too."""
+        off = shift_px - self.mean
+        return float(off @ np.linalg.solve(self.covariance + covariance, off))
+
 
 def channels(image: Image) -> tuple[Array, Array, Array]:
     """Smoothed; its slope along the rows, which the offset of a row does not touch; and a band, which favours edges."""
