@@ -122,11 +122,11 @@ def correlated(one: Array, two: Array) -> float:
     return float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-300))
 
 
-def above_surrogates(one: Array, two: Array, known: Mask) -> float:
+def above_surrogates(one: Array, two: Array, correlation: Correlation) -> float:
     """By how much the correlation of two aligned images exceeds the best of those at 32 shifts on two rings."""
-    correlation = Correlation(known, known).of(one, two)
-    cy, cx = np.array(known.shape) - 1
+    found = correlation.of(one, two)
+    cy, cx = correlation.origin
     angles = 2.0 * np.pi * np.arange(16) / 16
     y, x = (np.rint(np.outer(RINGS_PX, f(angles))).astype(int).ravel() for f in (np.sin, np.cos))
     inside = (np.abs(y) <= cy) & (np.abs(x) <= cx)
-    return float(correlation[cy, cx] - correlation[y[inside] + cy, x[inside] + cx].max())
+    return float(found[cy, cx] - found[y[inside] + cy, x[inside] + cx].max())

@@ -17,7 +17,8 @@ Index = NDArray[np.intp]
 
 SHIFT: Index = np.array([0, 1, 6], dtype=np.intp)  # of theta: the shift and the gain
 ALL: Index = np.arange(COUNT, dtype=np.intp)
-ENOUGH_PX = 5e-4
+ENOUGH_PX = 5e-4  # a step
+SETTLED_PX = 2e-3  # a round
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, ste
     for _ in range(steps):
         one, two, known = pair.warped(theta)
         mean = (one + two) / 2
-        columns = pair.columns(derivative(mean, 1), derivative(mean, 0), mean, two - one)
+        columns = pair.columns(derivative(mean, 1), derivative(mean, 0), mean, two - one, free)
         columns_q = seen(columns, known.astype(np.float64), None)
         normal = np.tensordot(columns_q, columns, ((0, 2), (0, 2)))
         normal *= max(known.sum(), 1) / max(normal[-1, -1], 1e-300)
@@ -66,7 +67,9 @@ def generalised_least_squares(pair: Pair, theta: Array, believed: Believed, roun
     each round, from what the one before has left."""
     fit = _round(pair, theta, believed, steps)
     for _ in range(rounds - 1):
-        fit = _round(pair, fit.theta, believed, steps)
+        before, fit = fit, _round(pair, fit.theta, believed, steps)
+        if np.hypot(*(fit.theta - before.theta)[:2]) < SETTLED_PX:
+            break
     return fit
 
 
@@ -105,9 +108,9 @@ def _signal(gradient: tuple[Array, Array], noise: Array, known: NDArray[np.bool_
 
 def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, free: Index) -> tuple[Array, float]:
     """One step of what is free, and how far the shift moved, px."""
-    sub = np.ix_(free, free)
-    pull = believed.precision @ (theta - believed.mean)
-    step = -np.linalg.solve((curvature + believed.precision)[sub] + 1e-9 * np.eye(free.size), (slope + pull)[free])
+    precision = believed.precision[np.ix_(free, free)]
+    pull = (believed.precision @ (theta - believed.mean))[free]
+    step = -np.linalg.solve(curvature + precision + 1e-9 * np.eye(free.size), slope + pull)
     theta = theta.copy()
     theta[free] += step
     return theta, float(np.hypot(*step[:2]))

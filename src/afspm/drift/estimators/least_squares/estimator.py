@@ -8,13 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators.least_squares import shear
-from afspm.drift.estimators.least_squares.acceptance import (
-    Evidence,
-    Limits,
-    above_surrogates,
-    agreement,
-    outliers,
-)
+from afspm.drift.estimators.least_squares.acceptance import Evidence, Limits, above_surrogates, agreement, outliers
 from afspm.drift.estimators.least_squares.align import (
     ALL,
     SHIFT,
@@ -23,13 +17,15 @@ from afspm.drift.estimators.least_squares.align import (
     least_squares,
 )
 from afspm.drift.estimators.least_squares.covariance import covariance
+from afspm.drift.estimators.least_squares.expected import Expected, shear_by_drift
 from afspm.drift.estimators.least_squares.grid import Grid, onto_common_grid
-from afspm.drift.estimators.least_squares.prepare import Image, Unusable, decimated, decimation, prepare
+from afspm.drift.estimators.least_squares.prepare import Unusable, prepare
 from afspm.drift.estimators.least_squares.rows import without_lines
+from afspm.drift.estimators.least_squares.scene import Scene
 from afspm.drift.estimators.least_squares.score import Scorer
-from afspm.drift.estimators.least_squares.search import PixelPrior, candidates, channels
+from afspm.drift.estimators.least_squares.search import Correlation, candidates
 from afspm.drift.estimators.least_squares.spectra import fine_filtered, shared_information
-from afspm.drift.estimators.least_squares.warp import COUNT, LINEAR, Box, Pair, Spline
+from afspm.drift.estimators.least_squares.warp import COUNT, LINEAR, Box, Pair
 from afspm.drift.registration import DriftScan, Prior, Registration
 
 Array = NDArray[np.float64]
@@ -37,6 +33,7 @@ Array = NDArray[np.float64]
 WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
 GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
+SURROGATES_PX = 16  # the farthest shift that a match is compared with
 
 
 class LeastSquares:
@@ -64,26 +61,13 @@ class LeastSquares:
             except Unusable as reason:
                 return Registration.refused(f"the {name} can't be registered: {reason}")
         grid, *on_grid = onto_common_grid(reference, images[0], scan, images[1])
-        expected = None if prior is None else _pixel_prior(prior, grid)
-        return self._match((on_grid[0], on_grid[1]), grid, expected)
-
-    def _match(self, images: tuple[Image, Image], grid: Grid, prior: PixelPrior | None) -> Registration:
-        start = _coarse(images, prior)
-        if start is None:
-            return Registration.refused("the scans overlap too little, or hold nothing in common")
-        shift, gap = start
-        box = Box.of_overlap(images[0].values.shape, images[1].values.shape, shift)
-        if box is None:
+        scene, expected = Scene(on_grid[0], on_grid[1]), None if prior is None else Expected.of(prior, grid)
+        start = _coarse(scene, expected)
+        box = None if start is None else scene.box(start[0][:2])
+        if start is None or box is None:
             return Registration.refused("the scans overlap too little")
-        believed = _believed(prior)
-        smooth = _pair((channels(images[0])[0], channels(images[1])[0]), images, box)
-        theta = np.concatenate([shift, np.zeros(COUNT - 2)])
-        theta = least_squares(smooth, theta, believed, SHIFT, steps=4)
-        theta = least_squares(smooth, theta, believed, ALL, steps=4)
-        fine = fine_filtered(images)
-        fit = generalised_least_squares(_pair((fine[0].values, fine[1].values), images, box), theta, believed)
-        theta, total = shear.averaged(fit.theta, covariance(fit, believed), shear.models(), np.zeros(4))
-        found = _evidence(images, smooth, theta, total, gap, prior)
+        theta, total = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
+        found = _evidence(scene, box, theta, total, start[1], expected)
         return self._registration(theta, total, box, grid, found, expected=prior is not None)
 
     def _registration(
@@ -96,63 +80,73 @@ class LeastSquares:
             reason=reason,
             displacement_m=grid.displacement_m(theta[:2]),
             covariance_m2=grid.to_m @ total[:2, :2] @ grid.to_m.T,
+            # d is given half-way between both scans, and asked for by where a feature is in the reference
             linear=grid.linear_m(linear @ np.linalg.inv(np.eye(2) - linear / 2)),
             center_m=grid.position_m(box.center - theta[:2] / 2),
             quality=asdict(found),
         )
 
 
-def _coarse(images: tuple[Image, Image], prior: PixelPrior | None) -> tuple[Array, float] | None:
-    """The likeliest shift, px, and its gap to the next, nats; on smaller images where they are large."""
-    factor = decimation(images)
-    small = decimated(images[0], factor), decimated(images[1], factor)
-    offset = _cut(images[1], factor) - _cut(images[0], factor)
-    scaled = None
-    if prior is not None:
-        scaled = PixelPrior((prior.mean - offset) / factor, prior.covariance / factor**2 + 0.3 * np.eye(2))
-    best = Scorer(small[0], small[1], scaled).best(candidates(small[0], small[1], scaled))
-    return None if best is None else (best[0].shift_px * factor + offset, best[1])
+def _coarse(scene: Scene, expected: Expected | None) -> tuple[Array, float] | None:
+    """theta within a fraction of a pixel, and by how many nats it is likelier than any other; on smaller images where
+    they are large."""
+    small, factor, offset = scene.smaller()
+    scaled = None if expected is None else expected.on_smaller(factor, offset)
+    best = Scorer(small, scaled).best(candidates(small, scaled))
+    box = None if best is None else small.box(best[0].shift_px)
+    if best is None or box is None:
+        return None
+    pair = Pair(*small.smooth_splines, box)
+    theta = np.concatenate([best[0].shift_px, np.zeros(COUNT - 2)])
+    theta = least_squares(pair, theta, _believed(scaled), SHIFT, steps=4)
+    theta = least_squares(pair, theta, _believed(scaled), ALL, steps=4)
+    theta[:2] = theta[:2] * factor + offset
+    return theta, best[1]
 
 
-def _cut(image: Image, factor: int) -> Array:
-    """By how much the centre moves, px, when only whole blocks of `factor` pixels are kept."""
-    ny, nx = image.values.shape
-    return -np.array([nx % factor, ny % factor]) / 2
+def _fine(
+    scene: Scene, box: Box, theta: Array, expected: Expected | None, shears: tuple[Array, list[Array]]
+) -> tuple[Array, Array]:
+    """theta and its covariance."""
+    pair = Pair(*scene.splines(fine_filtered(scene.first.values, scene.second.values)), box)
+    believed = _believed(expected)
+    fit = generalised_least_squares(pair, theta, believed)
+    return shear.averaged(fit.theta, covariance(fit, believed), shears[1], shears[0])
 
 
-def _pair(values: tuple[Array, Array], images: tuple[Image, Image], box: Box) -> Pair:
-    return Pair(Spline.of(Image(values[0], images[0].known)), Spline.of(Image(values[1], images[1].known)), box)
-
-
-def _pixel_prior(prior: Prior, grid: Grid) -> PixelPrior:
-    inverse = np.linalg.inv(grid.to_m)
-    return PixelPrior(grid.shift_px(prior.mean_m), inverse @ prior.covariance_m2 @ inverse.T)
-
-
-def _believed(prior: PixelPrior | None) -> Believed:
+def _believed(expected: Expected | None) -> Believed:
     mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
     precision[2:, 2:] = np.diag(1.0 / np.square([*WIDEST, *WIDEST, GAIN_SD, BEND_SD]))
-    if prior is not None:
-        mean[:2], precision[:2, :2] = prior.mean, np.linalg.inv(prior.covariance)
+    if expected is not None:
+        mean[:2], precision[:2, :2] = expected.mean, np.linalg.inv(expected.covariance)
     return Believed(mean, precision)
 
 
-def _evidence(
-    images: tuple[Image, Image], smooth: Pair, theta: Array, total: Array, gap: float, prior: PixelPrior | None
-) -> Evidence:
-    one, two, known = smooth.warped(theta)
+def _shear_models(prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: Grid) -> tuple[Array, list[Array]]:
+    """Mean and covariances of the linear map of pixels, (axx, axy, ayx, ayy)."""
+    mean_m, sd = shear_by_drift(prior, reference, scan)
+    angle = reference.region.angle_rad
+    slow = np.array([-np.sin(angle), np.cos(angle)])
+    width, height = np.hypot(*grid.to_m)
+    mean: Array = np.linalg.inv(grid.to_m) @ np.outer(mean_m, slow) @ grid.to_m
+    return mean.ravel(), shear.models(sd, float(height / width))
+
+
+def _evidence(scene: Scene, box: Box, theta: Array, total: Array, gap: float, expected: Expected | None) -> Evidence:
+    one, two, known = Pair(*scene.smooth_splines, box).warped(theta)
     one, two = without_lines(one, known), without_lines(two, known)
-    edge1, edge2, _ = _pair((channels(images[0])[2], channels(images[1])[2]), images, smooth.box).warped(theta)
+    edges = Pair(*scene.band_splines, box).warped(theta)
     share, correlation = agreement(one, two, known)
+    surrogates = Correlation(known, known, SURROGATES_PX)
     return Evidence(
-        overlap=float(known.sum() / min(image.known.sum() for image in images)),
+        overlap=float(known.sum() / scene.least_known),
         sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
         gap=gap,
         information=shared_information(one, two),
         agreement=share,
         correlation=correlation,
-        correlation_gap=above_surrogates(one, two, known),
-        edges_gap=above_surrogates(edge1, edge2, known),
+        correlation_gap=above_surrogates(one, two, surrogates),
+        edges_gap=above_surrogates(edges[0], edges[1], surrogates),
         outliers=outliers((two - one)[known]),
-        surprise=0.0 if prior is None else prior.surprise(theta[:2], total[:2, :2]),
+        surprise=0.0 if expected is None else expected.surprise(theta[:2], total[:2, :2]),
     )

@@ -107,20 +107,3 @@ def _topography(values: Array, rows: Mask) -> float:
     measured = values[rows] - values[rows].mean(axis=1, keepdims=True)
     power = float(np.mean(measured**2))
     return max(abs(float(np.mean(measured[lag:] * measured[:-lag]))) / power for lag in (1, 2, 3, 4))
-
-
-def decimation(images: tuple[Image, Image]) -> int:
-    """By how much images are made smaller for the search."""
-    largest = max(max(image.values.shape) for image in images)
-    return 1 if largest <= 160 else 2 if largest <= 640 else 4
-
-
-def decimated(image: Image, factor: int) -> Image:
-    """Means of `factor` x `factor` pixels; what doesn't fill one at the end is left out."""
-    if factor == 1:
-        return image
-    ny, nx = (n // factor for n in image.values.shape)
-    blocks = (ny, factor, nx, factor)
-    kept = np.s_[: ny * factor, : nx * factor]
-    known = np.asarray(image.known[kept].reshape(blocks).all(axis=(1, 3)))
-    return Image(image.values[kept].reshape(blocks).mean(axis=(1, 3)), known)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.least_squares.prepare import Image, Mask
+from afspm.drift.estimators.least_squares.expected import Expected
+from afspm.drift.estimators.least_squares.prepare import Mask
+from afspm.drift.estimators.least_squares.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -16,40 +16,11 @@ PEAKS = 4  # of each channel
 APART_PX = 1.5  # nearer peaks are one
 
 
-@dataclass(frozen=True, eq=False)
-class PixelPrior:
-    """Expected shift, px, and its covariance, px²."""
-
-    mean: Array
-    covariance: Array
-
-    def chi2(self, shift_px: Array) -> Array:
-        """Of shifts, shape (..., 2)."""
-        off = shift_px - self.mean
-        chi2: Array = np.einsum("...i,ij,...j", off, np.linalg.inv(self.covariance), off)
-        return chi2
-
-    def surprise(self, shift_px: Array, covariance: Array) -> float:
-        """chi² of an estimate, which has a covariance too."""
-        off = shift_px - self.mean
-        return float(off @ np.linalg.solve(self.covariance + covariance, off))
-
-
-def channels(image: Image) -> tuple[Array, Array, Array]:
-    """Smoothed; its slope along the rows, which the offset of a row does not touch; and a band, which favours edges."""
-    from scipy.ndimage import gaussian_filter
-
-    v = image.values
-    smooth = gaussian_filter(v, 1.0, mode="nearest")
-    slope = gaussian_filter(v, 1.5, order=(0, 1), mode="nearest")
-    return smooth, slope, gaussian_filter(v, 0.8, mode="nearest") - gaussian_filter(v, 3.0, mode="nearest")
-
-
-def candidates(first: Image, second: Image, prior: PixelPrior | None) -> list[Array]:
-    """Shifts (x, y) px worth a closer look, the best first, and the prior mean."""
-    correlation = Correlation(first.known, second.known)
+def candidates(scene: Scene, prior: Expected | None) -> list[Array]:
+    """Shifts (x, y) px worth a closer look, the best first, and the one that is expected."""
+    correlation = Correlation(scene.first.known, scene.second.known)
     peaks: list[tuple[float, Array]] = []
-    for one, two in zip(channels(first), channels(second), strict=True):
+    for one, two in (scene.smooth, scene.slope, scene.band):
         peaks += correlation.peaks(one, two, prior)
     peaks.sort(key=lambda peak: -peak[0])
     shifts = [shift for _, shift in peaks]
@@ -66,14 +37,19 @@ class Correlation:
     """Normalised cross-correlation of two images of which parts are known, for all shifts at once (Padfield, IEEE
     Trans. Image Process. 21, 2706, 2012)."""
 
-    def __init__(self, known1: Mask, known2: Mask):
+    def __init__(self, known1: Mask, known2: Mask, reach_px: int | None = None):
+        """Args:
+        reach_px: of the largest shift, for images of one shape; None: as long as they overlap.
+        """
         from scipy.fft import next_fast_len
 
         (ny1, nx1), (ny2, nx2) = known1.shape, known2.shape
-        self._full = (ny1 + ny2 - 1, nx1 + nx2 - 1)
-        self._fft = tuple(next_fast_len(n, real=True) for n in self._full)
+        reach = max(ny1, nx1, ny2, nx2) if reach_px is None else reach_px
+        self.origin = np.minimum([ny1 - 1, nx1 - 1], reach)
+        self._full = tuple((self.origin + np.minimum([ny2, nx2], reach + 1)).tolist())
+        enough = [min(max(n1, n2) + reach, n1 + n2 - 1) for n1, n2 in zip(known1.shape, known2.shape, strict=True)]
+        self._fft = tuple(next_fast_len(n, real=True) for n in enough)
         self._masks = known1.astype(np.float64), known2.astype(np.float64)
-        self._origin = np.array([ny1 - 1, nx1 - 1])
         self._center = np.array([(nx2 - nx1) / 2, (ny2 - ny1) / 2])
         self._spectra = self._transform(self._masks[0]), self._transform(self._masks[1])
         self.overlap = np.maximum(np.rint(self._correlate(*self._spectra)), 0.0)
@@ -96,10 +72,10 @@ class Correlation:
 
     def shifts_px(self, index: Array) -> Array:
         """Shifts (x, y) between centres that pixels (y, x) of the coefficients stand for, shape (n, 2)."""
-        shifts: Array = (index - self._origin)[..., ::-1] - self._center
+        shifts: Array = (index - self.origin)[..., ::-1] - self._center
         return shifts
 
-    def peaks(self, one: Array, two: Array, prior: PixelPrior | None) -> list[tuple[float, Array]]:
+    def peaks(self, one: Array, two: Array, prior: Expected | None) -> list[tuple[float, Array]]:
         """The highest, by atanh(c) sqrt(n), which has the same variance for every overlap n (Fisher)."""
         from scipy.ndimage import maximum_filter
 
@@ -124,5 +100,5 @@ class Correlation:
         from scipy.fft import irfft2
 
         product = irfft2(np.conj(first) * second, self._fft)
-        rolled: Array = np.roll(product, tuple(self._origin), axis=(0, 1))[: self._full[0], : self._full[1]]
+        rolled: Array = np.roll(product, tuple(self.origin), axis=(0, 1))[: self._full[0], : self._full[1]]
         return rolled

@@ -12,7 +12,7 @@ from afspm.drift.estimators.least_squares.warp import LINEAR
 
 Array = NDArray[np.float64]
 
-DRIFTS = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)  # pixels per row
+DRIFTS = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)  # displacement per length along y
 TURNS_RAD = (2e-4, 0.002, 0.01)
 ANYTHING = (2e-4, 0.003, 0.01)  # of each element: creep, calibration
 
@@ -29,14 +29,17 @@ def of_turn(sd_rad: float) -> Array:
     return sd_rad**2 * np.outer(turn, turn)
 
 
-def models(drift: float | None = None) -> list[Array]:
-    """What the linear map may be: covariances of it.
+def models(drift: float | None, aspect: float) -> list[Array]:
+    """What the linear map of pixel coordinates may be: covariances of it.
 
     Args:
-        drift: pixels per row; None: not known, so all are tried.
+        drift: displacement per length along y; None: not known, so all are tried.
+        aspect: height of a pixel over its width.
     """
+    to_px = np.diag([1.0, aspect, 1.0 / aspect, 1.0])
     besides = [of_turn(t) + ANYTHING[0] ** 2 * np.eye(4) for t in TURNS_RAD] + [a**2 * np.eye(4) for a in ANYTHING[1:]]
-    return [of_drift(d) + more for d, more in itertools.product(DRIFTS if drift is None else (drift,), besides)]
+    drifts = DRIFTS if drift is None else (drift,)
+    return [to_px @ (of_drift(d) + more) @ to_px for d, more in itertools.product(drifts, besides)]
 
 
 def averaged(theta: Array, covariance: Array, covariances: Iterable[Array], mean: Array) -> tuple[Array, Array]:

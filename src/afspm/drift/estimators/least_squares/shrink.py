@@ -31,12 +31,19 @@ def denoised(image: Array, noise: Array) -> Array:
     padded = np.pad(image, [(PATCH_PX, PATCH_PX + STEP_PX)] * 2, mode="reflect")
     coefficients = basis @ _patches(padded) @ basis.T
     squares = coefficients**2
-    power = np.median((basis @ _patches(noise) @ basis.T) ** 2, axis=(0, 1)) / MEDIAN_POWER + 1e-300
-    texture = np.maximum(np.median(squares, axis=(0, 1)) / MEDIAN_POWER - power, 0.0)
+    apart = PATCH_PX // STEP_PX  # patches that don't overlap hold as much
+    power = _typical((basis @ _patches(noise)[::apart, ::apart] @ basis.T) ** 2) + 1e-300
+    texture = np.maximum(_typical(squares[::apart, ::apart]) - power, 0.0)
     gain = np.maximum(1.0 - CERTAIN * power / np.maximum(squares, 1e-300), texture / (texture + power))
     return _joined(basis.T @ (coefficients * gain) @ basis, padded.shape)[
         PATCH_PX : PATCH_PX + image.shape[0], PATCH_PX : PATCH_PX + image.shape[1]
     ]
+
+
+def _typical(squares: Array) -> Array:
+    """Variance of each coefficient, from the median over the patches."""
+    median: Array = np.median(squares.reshape(-1, PATCH_PX, PATCH_PX), axis=0) / MEDIAN_POWER
+    return median
 
 
 def _patches(image: Array) -> Array:

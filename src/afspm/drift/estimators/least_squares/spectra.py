@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.least_squares.prepare import Image
-
 Array = NDArray[np.float64]
 
 BLUR_PX = 0.7  # takes what interpolation would alias
@@ -19,7 +17,7 @@ def cosine_frequencies(shape: tuple[int, int]) -> Array:
     return length
 
 
-def fine_filtered(images: tuple[Image, Image]) -> tuple[Image, Image]:
+def fine_filtered(first: Array, second: Array) -> tuple[Array, Array]:
     """Both images through the same radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.7²).
 
     Applied to both of two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and
@@ -29,7 +27,7 @@ def fine_filtered(images: tuple[Image, Image]) -> tuple[Image, Image]:
     """
     from scipy.fft import dctn, idctn
 
-    transforms = [dctn(image.values, norm="ortho") for image in images]
+    transforms = [dctn(values, norm="ortho") for values in (first, second)]
     bins = np.arange(0.0, 0.72, max(1.0 / min(t.shape[0] for t in transforms), 1.0 / 64))
     power, count = np.zeros(bins.size + 1), np.zeros(bins.size + 1)
     where = [np.digitize(cosine_frequencies(t.shape), bins) for t in transforms]
@@ -43,10 +41,10 @@ def fine_filtered(images: tuple[Image, Image]) -> tuple[Image, Image]:
     signal[:peak] = signal[peak]
     gain = np.sqrt(2.0 * signal / (2.0 * signal + floor + 1e-300))
     out = []
-    for image, transform in zip(images, transforms, strict=True):
+    for transform in transforms:
         f = cosine_frequencies(transform.shape)
         h = np.interp(f, bins + (bins[1] - bins[0]) / 2, gain) * np.exp(-2.0 * (np.pi * f * BLUR_PX) ** 2)
-        out.append(Image(idctn(transform * h, norm="ortho"), image.known))
+        out.append(idctn(transform * h, norm="ortho"))
     return out[0], out[1]
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from afspm.drift.estimators.least_squares.prepare import Image
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -15,21 +14,25 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Spline:
-    """An image as cubic splines, evaluated at pixel coordinates (x, y) from its centre."""
+    """An image as cubic splines, evaluated at pixel coordinates (x, y) from its centre.
+
+    Attributes:
+        known: where it is more than two pixels from what is not known; None: everywhere.
+    """
 
     coefficients: Array
     known: Mask | None
 
     @classmethod
-    def of(cls, image: Image) -> Spline:
+    def of(cls, values: Array, known: Mask) -> Spline:
         """Its values are met exactly at the pixels."""
         from scipy.ndimage import binary_erosion, spline_filter
 
-        known = None if image.known.all() else binary_erosion(image.known, iterations=2, border_value=1)
-        return cls(spline_filter(image.values, mode="mirror"), known)
+        inner = None if known.all() else binary_erosion(known, iterations=2, border_value=1)
+        return cls(spline_filter(values, mode="mirror"), inner)
 
     def at(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """The values, and where they are known."""
+        """The values, and where they are known, at points."""
         from scipy.ndimage import map_coordinates
 
         ny, nx = self.coefficients.shape
@@ -37,9 +40,41 @@ class Spline:
         values = map_coordinates(self.coefficients, at, order=3, mode="mirror", prefilter=False)
         known = (np.abs(x) <= (nx - 1) / 2 + 1e-6) & (np.abs(y) <= (ny - 1) / 2 + 1e-6)
         if self.known is not None:
-            rounded = np.rint(at).astype(int)
-            known &= self.known[np.clip(rounded[0], 0, ny - 1), np.clip(rounded[1], 0, nx - 1)]
+            rows, columns = np.rint(at).astype(int)
+            known &= self.known[np.clip(rows, 0, ny - 1), np.clip(columns, 0, nx - 1)]
         return values, known
+
+    def on_grid(self, x: Array, y: Array) -> tuple[Array, Mask]:
+        """The same on a grid of one pixel, x and y its axes: row by row and column by column it is much faster."""
+        values, known = self.coefficients, np.ones((y.size, x.size), dtype=bool)
+        picked = []
+        for axis, at in enumerate((y, x)):
+            size = self.coefficients.shape[axis]
+            start = np.floor(at[0] + (size - 1) / 2)
+            index = (start + np.arange(at.size)).astype(int)
+            weights = _basis(at[0] + (size - 1) / 2 - start)
+            values = sum(
+                w * values.take(_mirrored(index + k, size), axis) for k, w in zip(range(-1, 3), weights, strict=True)
+            )
+            inside = np.abs(at) <= (size - 1) / 2 + 1e-6
+            known &= inside[:, None] if axis == 0 else inside[None, :]
+            picked.append(np.clip(np.rint(at + (size - 1) / 2).astype(int), 0, size - 1))
+        if self.known is not None:
+            known &= self.known[np.ix_(*picked)]
+        return values, known
+
+
+def _basis(t: float) -> Array:
+    """Cubic B-splines at four neighbours, t from 0 to 1 beyond the second."""
+    u = 1.0 - t
+    return np.array([u**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * u**2 + 3.0 * u**3, t**3]) / 6.0
+
+
+def _mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
+    """Reflected about the first and the last pixel."""
+    period = 2 * (size - 1)
+    folded: NDArray[np.intp] = (index % period).astype(np.intp)
+    return np.where(folded < size, folded, period - folded)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,20 +125,30 @@ class Pair:
         Both are moved by half: so both carry equal interpolation noise, the gradient of their mean is not correlated
         with the noise of their difference, and the shift is not pulled towards whole pixels.
         """
+        if theta[LINEAR].any():
+            (one, known1), (two, known2) = self._both(theta)
+        else:
+            x, y, (dx, dy) = self.box.x, self.box.y, theta[:2]
+            one, known1 = self.first.on_grid(x - dx / 2, y - dy / 2)
+            two, known2 = self.second.on_grid(x + dx / 2, y + dy / 2)
+        one, two = np.exp(theta[6] / 2) * one, np.exp(-theta[6] / 2) * two
+        return one + theta[7] / 4 * one**2, two - theta[7] / 4 * two**2, known1 & known2
+
+    def _both(self, theta: Array) -> tuple[tuple[Array, Mask], tuple[Array, Mask]]:
         cx, cy = self.box.center
         x, y = np.meshgrid(self.box.x, self.box.y)
         dx = theta[0] + theta[2] * (x - cx) + theta[3] * (y - cy)
         dy = theta[1] + theta[4] * (x - cx) + theta[5] * (y - cy)
-        one, known1 = self.first.at(x - dx / 2, y - dy / 2)
-        two, known2 = self.second.at(x + dx / 2, y + dy / 2)
-        one, two = np.exp(theta[6] / 2) * one, np.exp(-theta[6] / 2) * two
-        return one + theta[7] / 4 * one**2, two - theta[7] / 4 * two**2, known1 & known2
+        return self.first.at(x - dx / 2, y - dy / 2), self.second.at(x + dx / 2, y + dy / 2)
 
-    def columns(self, gx: Array, gy: Array, mean: Array, residual: Array) -> Array:
-        """[y, 9, x]: the derivatives of the residual by theta, given the gradient of the mean; and the residual."""
+    def columns(self, gx: Array, gy: Array, mean: Array, residual: Array, free: Iterable[int] = range(8)) -> Array:
+        """[y, column, x]: the derivatives of the residual by what is free of theta, given the gradient of the mean; and
+        the residual."""
         cx, cy = self.box.center
         x, y = self.box.x[None, :] - cx, self.box.y[:, None] - cy
-        return np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, -mean, -(mean**2) / 2, residual], axis=1)
+        by = (gx, gy, (gx, x), (gx, y), (gy, x), (gy, y), -mean, (mean, -mean / 2))
+        chosen = [column[0] * column[1] if isinstance(column, tuple) else column for column in (by[i] for i in free)]
+        return np.stack([*chosen, residual], axis=1)
 
 
 def derivative(values: Array, axis: int) -> Array:
