@@ -1,0 +1,278 @@
+"""Asylum Research, over ZeroMQ-XOP in its Igor Pro. See the README beside this."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.errors import ConfigError, Refused
+from afspm.microscopes.asylum.activity import FORCE, Activity
+from afspm.microscopes.asylum.frame import GLOBALS, NAMES, asylums, from_image, generic, on_image
+from afspm.microscopes.asylum.harvest import SCAN, Harvest
+from afspm.microscopes.asylum.link import Link
+from afspm.microscopes.asylum.session import Session
+from afspm.microscopes.in_force import POSITION
+from afspm.microscopes.microscope import ControllerLost, Microscope, action
+from afspm.microscopes.parameters import FEEDBACK_ON, Value
+from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.units import Duration
+
+ENGAGED: Final = "x-engaged"
+
+_AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC_KIND: FORCE}
+_SPOTS: Final = ("image", "scanner", "none")
+_LONGEST_NAME: Final = 17
+
+
+class Asylum(Microscope):
+    """The microscope behind Asylum Research's software.
+
+    Args:
+        address: that was given to `zeromq_server_bind`.
+        folders: beginnings of Asylum's folders as Igor writes them, "C:Users:Me:", and where those are seen from
+            here; without it: Asylum runs on this computer.
+        base_name: of the files that Asylum saves; left out: what its panel says.
+        spots: what SpotX and SpotY count from: the lower left corner of the last "image", along its axes; the middle
+            of the "scanner"; "none": the tip can't be sent anywhere.
+        move_s: the time that a move to a spot may take, which Asylum does not tell, in experiment time.
+        reply_timeout_s: how long Igor may take to answer, in real time.
+        parameters, actions, poll_period_s, result_timeout_s: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    max_pixels: ClassVar[int] = 8192 * 8192
+
+    def __init__(
+        self,
+        *,
+        address: str = "tcp://127.0.0.1:5555",
+        folders: Mapping[str, str] | None = None,
+        base_name: str = "",
+        spots: str = "image",
+        move_s: Duration = 2.0,
+        reply_timeout_s: Duration = 5.0,
+        parameters: Mapping[str, Mapping[str, Any]] | None = None,
+        actions: Mapping[str, Mapping[str, Any]] | None = None,
+        poll_period_s: Duration = 0.25,
+        result_timeout_s: Duration = 10.0,
+    ) -> None:
+        super().__init__(
+            parameters=parameters,
+            actions=actions,
+            poll_period_s=poll_period_s,
+            result_timeout_s=result_timeout_s,
+        )
+        self._address = address
+        self._folders = dict(folders or {})
+        self._base_name = _checked_name(base_name)
+        self._spots = spots
+        if spots not in _SPOTS:
+            raise ConfigError(f"{spots!r}", where="spots", hint=" or ".join(_SPOTS))
+        if spots == "none":
+            self.table = self.table.without(POSITION)
+        self._move_s = move_s
+        self._reply_timeout_s = reply_timeout_s
+        self._session: Session | None = None
+        self._told: dict[str, Value] = {}
+        self._own: dict[str, Callable[[Session], Value]] = {
+            FEEDBACK_ON: Session.feedback_on,
+            ENGAGED: lambda session: session.doing().engaged,
+            names.CONTROLLER: Session.controller,
+        }
+
+    def connect(self) -> None:
+        """A new connection, and what must be there for it to be of use."""
+        self.close()
+        self._session = session = Session(Link(self._address, self._reply_timeout_s, self.clock.monotonic_s))
+        self._kept: dict[str, Any] = self.memory.setdefault("kept", dict(_AT_FIRST))
+        self._harvest = Harvest(self.memory)
+        self._activity = Activity(session, self._harvest, self.memory, self._folders, self.clock, self.log)
+        session.doing()
+        if not session.at_once:
+            self.log.warning("Igor has not afspm.ipf: every value is asked for by itself, feedback can't be switched")
+        if self._spots != "none":
+            session.do("InitProbePos")
+        if self._base_name and session.text("GetBaseName") != self._base_name:
+            session.do("SetBaseName", self._base_name)
+            session.put("BaseSuffix", 0)
+
+    def close(self) -> None:
+        """End the connection. What was begun goes on."""
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    @property
+    def _igor(self) -> Session:
+        if self._session is None:
+            raise ControllerLost("Igor is not connected", where=self._address)
+        return self._session
+
+    def status(self) -> ScopeStatus:
+        """What Asylum is doing now."""
+        return self._activity.status()
+
+    def next_change_s(self) -> float | None:
+        """When a move is over."""
+        return self._activity.next_change_s()
+
+    # --- parameters ---
+
+    def read(self, wanted: Collection[str]) -> dict[str, Value]:
+        """What is in force: as it was set, where that is the same to Asylum's precision."""
+        found: dict[str, Value] = {name: self._kept[name] for name in wanted if name in self._kept}
+        found |= {name: self._own[name](self._igor) for name in wanted if name in self._own}
+        if not NAMES.isdisjoint(wanted):
+            found |= generic(self._igor.values(GLOBALS))
+        if not set(POSITION).isdisjoint(wanted):
+            found |= zip(POSITION, self._probe_m(), strict=True)
+        found |= self._read_table([name for name in wanted if name not in found])
+        told = self._told
+        return {
+            name: told[name] if name in told and self.table[name].same(found[name], told[name]) else found[name]
+            for name in wanted
+        }
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        """What belongs together at once, the rest one by one."""
+        left = dict(values)
+        self._kept.update({name: left.pop(name) for name in _AT_FIRST if name in left})
+        framed = {name: left.pop(name) for name in NAMES if name in left}
+        if framed:
+            self._write_frame(framed)
+        place: dict[str, Value] = {name: left.pop(name) for name in POSITION if name in left}
+        if place:
+            self._send_probe(place)
+        if FEEDBACK_ON in left and not self._igor.do("AfspmFeedback", int(bool(left.pop(FEEDBACK_ON)))):
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum could not switch the feedback")
+        super().write(left)
+        self._told.update(values)
+
+    def get(self, vendor: str) -> Value:
+        """A number or a text of Asylum's, by its name."""
+        if any(row.vendor == vendor and row.type == "text" for row in self.table.values()):
+            return self._igor.text("GS", vendor)
+        return self._igor.values([vendor])[vendor]
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        """Numbers and texts of Asylum's, by their names, one after the other."""
+        for vendor, value in values.items():
+            self._igor.put(vendor, value)
+
+    def _read_table(self, wanted: Sequence[str]) -> dict[str, Value]:
+        numbers = [name for name in wanted if self.table[name].type != "text"]
+        values = self._igor.values([self.table[name].vendor for name in numbers]) if numbers else {}
+        found = {name: self.table[name].from_vendor(values[self.table[name].vendor]) for name in numbers}
+        return found | super().read([name for name in wanted if name not in found])
+
+    def _write_frame(self, framed: Mapping[str, Value]) -> None:
+        wanted = asylums(framed, self.read(NAMES))
+        there = self._igor.values(list(wanted))
+        for name, value in wanted.items():
+            if there[name] != value:
+                self._igor.put(name, value)
+
+    def _probe_m(self) -> tuple[float, float]:
+        spot_m = (self._igor.number("GetProbePosX"), self._igor.number("GetProbePosY"))
+        return from_image(spot_m, self._activity.image) if self._spots == "image" else spot_m
+
+    def _send_probe(self, place: Mapping[str, Value]) -> None:
+        x, y = (float(place.get(name, was)) for name, was in zip(POSITION, self._probe_m(), strict=True))
+        self._put_spot((x, y))
+        if not self._igor.do("DoForceFunc", "Go"):
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum refuses to move the tip")
+        self._activity.moves(self._move_s)
+
+    def _put_spot(self, xy_m: tuple[float, float]) -> None:
+        spot_m = on_image(xy_m, self._activity.image) if self._spots == "image" else xy_m
+        self._igor.do("SetProbePosX", spot_m[0])
+        self._igor.do("SetProbePosY", spot_m[1])
+
+    # --- results ---
+
+    def results(self) -> Sequence[str]:
+        """The last files that Asylum saved."""
+        return self._harvest.results(self.clock.now_ns())
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        """Read a file."""
+        return self._harvest.load(result)
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once, in the direction of `x-scan-direction`."""
+        self._activity.saves(SCAN)
+        probe_m = self._probe_m() if self._spots == "image" else None
+        self._activity.begin(SCAN)
+        if probe_m is not None:  # it stays where it is, on another image
+            self._put_spot(probe_m)
+        up = self._kept[names.SCAN_DIRECTION] == names.UP
+        self._igor.put("LastScan", 1)
+        if not self._igor.do("DoScanFunc", "UpScan" if up else "DownScan"):
+            raise self._activity.refuse(SCAN)
+        self._igor.put("LastScan", 1)  # also where beginning to scan puts it back
+        self._activity.settle(SCAN)
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        """Break the scan off. Asylum withdraws the tip."""
+        self._igor.do("DoScanFunc", "StopScan")
+        self._activity.stopped()
+        self.log.warning("Asylum has withdrawn the tip, as it does with every scan that is stopped")
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a force curve where the tip is."""
+        if self._igor.doing().bits is None:
+            reason = "without ARGetStatus it can't be seen when a force curve has ended"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
+        self._activity.saves(FORCE)
+        x, y = self._probe_m() if self._spots != "none" else (0.0, 0.0)
+        self._activity.begin(FORCE, (x, y))
+        if self._igor.ask("DoForceFunc", "Single") == 1.0:
+            raise self._activity.refuse(FORCE)
+        self._activity.settle(FORCE)
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        """Break the force curve off."""
+        self._igor.do("DoForceFunc", "Reset")
+        self._activity.stopped()
+
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        """Stop whatever is going on, feedback too, and withdraw the tip."""
+        self._igor.do("DoScanFunc", "StopScan")
+        self._activity.stopped()
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """Bring the tip to the sample, as the button Engage does."""
+        if not self._igor.do("SimpleEngageMe", "SimpleEngageButton"):
+            raise Refused(ControlResponse.ACTION_ERROR, "Asylum refuses to engage")
+
+    def command(self, text: str) -> None:
+        """A function with its arguments as JSON: `DoScanFunc "DownScan"`, `PV "SaveImage", 2`."""
+        name, _, arguments = text.strip().partition(" ")
+        try:
+            parameters = json.loads(f"[{arguments}]")
+        except ValueError as error:
+            reason = f'{text!r}: arguments as in JSON, PV "SaveImage", 2: {error}'
+            raise Refused(ControlResponse.ACTION_ERROR, reason) from error
+        if not self._igor.do(name, *parameters):
+            raise Refused(ControlResponse.ACTION_ERROR, f"{name} gave 1, which is how Asylum's functions refuse")
+
+
+def _checked_name(name: str) -> str:
+    """What Asylum takes for a base name."""
+    fits = (
+        len(name) <= _LONGEST_NAME and name.isascii() and (not name or name[0].isalpha()) and "mask" not in name.lower()
+    )
+    if not fits:
+        hint = f'up to {_LONGEST_NAME} letters and digits, a letter first, no "Mask"'
+        raise ConfigError(f"Asylum does not take {name!r}", where="base_name", hint=hint)
+    return name

@@ -1,0 +1,149 @@
+"""What Asylum is doing, and what is awaited of it."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.clock import Clock
+from afspm.errors import ConfigError, Refused
+from afspm.microscopes.asylum.folders import local
+from afspm.microscopes.asylum.frame import GLOBALS, generic
+from afspm.microscopes.asylum.harvest import SCAN, Harvest, Target
+from afspm.microscopes.asylum.session import Session
+from afspm.microscopes.in_force import frame
+from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+
+FORCE: Final = "force"
+
+_SETTLES_S: Final = 1.0
+"""So long, in real time, what was begun may take to be seen running."""
+_SAVED_TO: Final = {SCAN: "SaveImage", FORCE: "SaveForce"}
+"""Both a number, of which 2 means that it is saved, and a text, the folder."""
+_SAVE: Final = 2.0
+
+
+class Activity:
+    """What is running at the controller, whoever began it.
+
+    Args:
+        harvest: takes what comes of it.
+        kept: JSON-able, and lasts: the frame of the image that spots are counted on.
+        folders: see `folders.local`.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        harvest: Harvest,
+        kept: dict[str, Any],
+        folders: Mapping[str, str],
+        clock: Clock,
+        log: logging.Logger,
+    ) -> None:
+        self._session = session
+        self._harvest = harvest
+        self._kept = kept
+        self._folders = folders
+        self._clock = clock
+        self._log = log
+        self._moving_until_s = -math.inf
+        self._stopping = False
+
+    def status(self) -> ScopeStatus:
+        """What it is doing now; what has ended is awaited from here on."""
+        state = self._session.doing().state
+        what = {ScopeState.SCANNING: SCAN, ScopeState.SPEC: FORCE}.get(state, "")
+        if not what:
+            self._stopping = False
+        if self._harvest.what not in ("", what):
+            self._harvest.end(self._clock.now_ns())
+        if what and not self._stopping and self._harvest.what != what:
+            self.begin(what)
+        if state is ScopeState.FREE and self._clock.now_s() < self._moving_until_s:
+            return ScopeStatus(ScopeState.MOVING)
+        if state is ScopeState.FREE and self._harvest.broken_off:
+            return ScopeStatus(ScopeState.INTERRUPTED)
+        return ScopeStatus(state)
+
+    def next_change_s(self) -> float | None:
+        """When a move is over."""
+        return self._moving_until_s if self._moving_until_s > self._clock.now_s() else None
+
+    @property
+    def image(self) -> Region:
+        """The frame of the last image, which Asylum counts spots on; that in force if nothing was scanned yet."""
+        kept = self._kept.get("image")
+        if kept is None:
+            return self._frame_in_force()
+        x, y, width, height, angle = kept
+        return Region((x, y), (width, height), angle)
+
+    def begin(self, what: str, position_m: tuple[float, float] = (math.nan, math.nan)) -> None:
+        """A measurement begins, with what is in force now."""
+        taken: dict[str, Any] = {"position": list(position_m)}
+        if what == SCAN:
+            region = self._frame_in_force()
+            taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad]}
+            self._kept["image"] = taken["frame"]
+        self._harvest.begin(what, self._target(what), taken)
+
+    def saves(self, what: str) -> None:
+        """Have it saved, and find out where.
+
+        Raises:
+            ConfigError: that is nowhere that can be seen from here.
+        """
+        name = _SAVED_TO[what]
+        if self._session.values([name])[name] != _SAVE:
+            self._log.warning("Asylum was not to save (%s): now it is", name)
+            self._session.put(name, _SAVE)
+        folder = self._target(what).folder
+        if not folder.is_dir():
+            hint = "is the drive there? see the setting folders"
+            raise ConfigError(f"Asylum's folder {folder} can't be seen from here", where="folders", hint=hint)
+
+    def settle(self, what: str) -> None:
+        """Until what was begun is seen running, or has ended already.
+
+        Raises:
+            Refused: ACTION_ERROR: Asylum does not do it, and did not say so.
+        """
+        state = ScopeState.SCANNING if what == SCAN else ScopeState.SPEC
+        until_s = self._clock.monotonic_s() + _SETTLES_S
+        while self._clock.monotonic_s() < until_s:
+            if self._session.doing().state is state or self._harvest.has_file():
+                return
+        self.forget()
+        raise Refused(ControlResponse.ACTION_ERROR, f"Asylum was told to begin a {what}, and does not")
+
+    def refuse(self, what: str) -> Refused:
+        """The refusal of what Asylum said that it does not do; nothing comes of it."""
+        self.forget()
+        return Refused(
+            ControlResponse.ACTION_ERROR, f"Asylum refuses to begin a {what}: its history window may say why"
+        )
+
+    def stopped(self) -> None:
+        """What is running was told to stop: nothing comes of it."""
+        self._stopping = True
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing comes of what was begun."""
+        self._harvest.forget()
+
+    def moves(self, lasts_s: float) -> None:
+        """The tip was sent away; it arrives, which Asylum does not tell, after so long at the latest."""
+        self._moving_until_s = self._clock.now_s() + lasts_s
+
+    def _frame_in_force(self) -> Region:
+        return frame(generic(self._session.values(GLOBALS)))[0]
+
+    def _target(self, what: str) -> Target:
+        folder: Path = local(self._session.text("GS", _SAVED_TO[what]), self._folders)
+        suffix = self._session.values(["BaseSuffix"])["BaseSuffix"]
+        return Target(folder, self._session.text("GetBaseName"), round(suffix))

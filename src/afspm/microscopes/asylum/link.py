@@ -1,0 +1,117 @@
+"""The connection to ZeroMQ-XOP: one request, then its reply. Igor never speaks unasked."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import zmq
+
+from afspm.errors import ConfigError
+from afspm.microscopes.asylum import xop
+from afspm.microscopes.microscope import ControllerLost
+
+_SILENT = "Igor is silent while a dialog waits on its screen, and dumb about texts that are not UTF-8"
+
+
+class Link:
+    """A connection. For one thread.
+
+    A DEALER, since a REQ socket is of no use any more after one lost reply. Whatever goes wrong but an error of
+    Igor's own, it is closed: a late reply must never be taken for that to the next request.
+
+    Args:
+        address: e.g. "tcp://127.0.0.1:5555".
+        timeout_s: how long a reply may take, in real time.
+        monotonic_s: real time.
+    """
+
+    def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
+        self._address = address
+        self._timeout_s = timeout_s
+        self._monotonic_s = monotonic_s
+        self._numbers = itertools.count(1)
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket: zmq.Socket[bytes] = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        # nothing waits for a peer that is not there, and is then done when nobody expects it any more
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
+        self._socket.setsockopt(zmq.SNDTIMEO, max(1, round(timeout_s * 1000)))
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self.close()
+            hint = '"tcp://host:port", as given to zeromq_server_bind'
+            raise ConfigError(f"{address!r} is no address: {error}", where="address", hint=hint) from error
+
+    def ask(self, name: str, *parameters: xop.Parameter) -> xop.Result:
+        """Call a function of Igor's that has one result. Raises: as `call`."""
+        results = self.call(name, *parameters).results
+        if len(results) != 1:
+            raise xop.BadReply(f"{name} gave {len(results)} results", where=self._address)
+        return results[0]
+
+    def call(self, name: str, *parameters: xop.Parameter) -> xop.Reply:
+        """Call a function of Igor's.
+
+        Raises:
+            XopError: it could not be done. InvalidValue: what was asked can't be sent.
+            ControllerLost, BadReply: no reply, or none to be trusted; the connection is closed.
+        """
+        message_id = str(next(self._numbers))
+        message = xop.request(name, parameters, message_id)
+        try:
+            found = self._exchange(message, message_id, name)
+        except ControllerLost:
+            self.close()
+            raise
+        except zmq.ZMQError as error:
+            self.close()
+            raise ControllerLost(f"the connection was lost at {name}: {error}", where=self._address) from error
+        if found.error is not None:
+            raise xop.XopError(*found.error, where=name)
+        return found
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._context.destroy(linger=0)
+
+    def _exchange(self, message: bytes, message_id: str, name: str) -> xop.Reply:
+        until_s = self._monotonic_s() + self._timeout_s
+        try:
+            self._socket.send_multipart([b"", message])
+        except zmq.Again as error:
+            hint = "is Igor running, with zeromq_server_bind on this address?"
+            raise ControllerLost("nobody listens", where=self._address, hint=hint) from error
+        while True:
+            left_s = until_s - self._monotonic_s()
+            if left_s <= 0.0 or not self._socket.poll(math.ceil(left_s * 1000.0)):
+                told = f"no reply to {name} within {self._timeout_s:g} s"
+                raise ControllerLost(told, where=self._address, hint=_SILENT)
+            found = xop.reply(_payload(self._socket.recv_multipart()))
+            # an error found before Igor is asked comes without the id, and can only be that of what is in flight
+            if found.message_id == message_id or (found.message_id is None and found.error is not None):
+                return found
+
+
+def _payload(frames: list[bytes]) -> bytes:
+    if len(frames) != 2 or frames[0]:
+        raise xop.BadReply(f"ZeroMQ-XOP replied with {len(frames)} frames")
+    return frames[1]
+
+
+def text(result: Any) -> str:
+    """A result that has to be a text. Raises BadReply."""
+    if isinstance(result, str):
+        return result
+    raise xop.BadReply(f"Igor gave {result!r} where a text was expected")
+
+
+def number(result: Any) -> float:
+    """A result that has to be a number, NaN too. Raises BadReply."""
+    if isinstance(result, float):
+        return result
+    raise xop.BadReply(f"Igor gave {result!r} where a number was expected")

@@ -1,0 +1,196 @@
+"""Requests to ZeroMQ-XOP and its replies: a function of Igor's is called by JSON. Pure.
+
+After the source and specification of ZeroMQ-XOP (byte physics and the Allen Institute), interface version 1.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import AfspmError, InvalidValue
+from afspm.microscopes.microscope import ControllerLost
+
+LONGEST_REQUEST: Final = 1024
+"""Bytes: what is longer makes the XOP drop the connection without a word."""
+
+MISSING: Final = 101
+"""The error of a function that Igor does not have."""
+
+_MEANINGS: Final = {
+    1: "an error that it has no name for",
+    3: "the request is no JSON to it",
+    4: "another version of the interface",
+    5: "no function in the request",
+    6: "the request is malformed",
+    7: "the request's messageID is malformed",
+    8: "Igor is out of memory",
+    100: "Igor's procedures are not compiled",
+    101: "there is no such function",
+    102: "too few arguments",
+    103: "too many arguments",
+    104: "a kind of argument that can't be passed",
+    105: "a kind of result that can't be passed",
+    106: "an argument has a value that can't be",
+    107: "the function was aborted",
+}
+_HINTS: Final = {
+    100: "a procedure window was edited: Compile",
+    101: "is afspm.ipf included in Igor's procedures (see the README of microscopes/asylum)?",
+}
+
+Parameter = bool | int | float | str
+
+
+class XopError(AfspmError):
+    """Igor could not do what it was asked for.
+
+    Attributes:
+        number: of ZeroMQ-XOP's errors.
+    """
+
+    code = "igor-error"
+
+    def __init__(self, number: int, message: str, *, where: str = "") -> None:
+        meaning = _MEANINGS.get(number, "an unknown error")
+        super().__init__(f"{meaning} ({number}: {message})", where=where, hint=_HINTS.get(number, ""))
+        self.number = number
+
+
+class BadReply(ControllerLost):
+    """What came is no reply: whoever is there can't be trusted."""
+
+    code = "igor-bad-reply"
+
+
+@dataclass(frozen=True, eq=False)
+class Wave:
+    """An array of Igor's.
+
+    Attributes:
+        values: in its shape, real or complex numbers or texts.
+        unit: of the values.
+        steps, offsets: of each dimension.
+        note: its text.
+    """
+
+    values: NDArray[Any]
+    unit: str = ""
+    steps: tuple[float, ...] = ()
+    offsets: tuple[float, ...] = ()
+    note: str = ""
+
+
+Result = float | str | Wave | None
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A reply.
+
+    Attributes:
+        message_id: that of the request; None where it could not be read.
+        error: the number and the message of an error; None: it was done.
+        results: what the function returned, one or several.
+        passed_back: its parameters that are passed by reference.
+    """
+
+    message_id: str | None
+    error: tuple[int, str] | None = None
+    results: tuple[Result, ...] = ()
+    passed_back: tuple[Result, ...] = ()
+
+
+def request(name: str, parameters: Sequence[Parameter], message_id: str) -> bytes:
+    """The bytes that call a function.
+
+    Raises:
+        InvalidValue: they can't be sent: too long, or not a number.
+    """
+    for value in parameters:
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InvalidValue(f"{name} can't be called with {value}")
+    call = {"name": name, "params": list(parameters)} if parameters else {"name": name}
+    content = {"version": 1, "messageID": message_id, "CallFunction": call}
+    try:
+        message = json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode()
+    except UnicodeEncodeError as error:
+        raise InvalidValue(f"{name} can't be called with a text that is not Unicode") from error
+    if len(message) > LONGEST_REQUEST:
+        raise InvalidValue(f"{len(message)} bytes to call {name}: ZeroMQ-XOP takes {LONGEST_REQUEST}")
+    return message
+
+
+def reply(message: bytes) -> Reply:
+    """What a reply says.
+
+    Raises:
+        BadReply: it is none.
+    """
+    try:
+        return _reply(json.loads(message.decode("utf-8")))
+    except BadReply:
+        raise
+    except RecursionError as error:
+        raise BadReply("ZeroMQ-XOP replied with JSON that is nested too deep") from error
+    except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:
+        shown = message[:80].decode("utf-8", "replace")
+        raise BadReply(f"ZeroMQ-XOP replied with what can't be read, {shown!r}: {error}") from error
+
+
+def _reply(content: Mapping[str, Any]) -> Reply:
+    message_id = content.get("messageID")
+    number = content["errorCode"]["value"]
+    if type(number) is not int or not isinstance(message_id, str | None):
+        raise ValueError("of other types")
+    if number:
+        history = str(content.get("history") or "").strip()
+        told = str(content["errorCode"].get("msg", ""))
+        return Reply(message_id, (number, f"{told} {history}".strip()))
+    found = content.get("result", [])
+    results = [_value(one) for one in (found if isinstance(found, list) else [found])]
+    return Reply(message_id, None, tuple(results), tuple(_value(one) for one in content.get("passByReference", [])))
+
+
+def _value(one: Mapping[str, Any]) -> Result:
+    kind, value = one["type"], one["value"]
+    if kind == "variable":
+        return _number(value)
+    if kind in ("string", "dfref"):
+        if not isinstance(value, str):
+            raise ValueError(f"{value!r} is no text")
+        return value
+    if kind == "wave":
+        return None if value is None else _wave(value)
+    raise ValueError(f"a result of type {kind!r}")
+
+
+def _number(value: Any) -> float:
+    """NaN and infinities come as texts."""
+    if value in ("nan", "inf", "-inf") or (isinstance(value, int | float) and not isinstance(value, bool)):
+        return float(value)
+    raise ValueError(f"{value!r} is no number")
+
+
+def _wave(content: Mapping[str, Any]) -> Wave:
+    raw, dimension = content["data"]["raw"], content["dimension"]
+    if content["type"] == "TEXT_WAVE_TYPE":
+        flat: NDArray[Any] = np.array([str(one) for one in raw])
+    elif isinstance(raw, dict):
+        flat = np.array([complex(_number(a), _number(b)) for a, b in zip(raw["real"], raw["imag"], strict=True)])
+    else:
+        flat = np.array([_number(one) for one in raw], dtype=np.float64)
+    shape = [int(size) for size in dimension["size"]]
+    return Wave(
+        flat.reshape(shape, order="F"),
+        str(content["data"].get("unit", "")),
+        tuple(_number(step) for step in dimension.get("delta", [1.0] * len(shape))),
+        tuple(_number(offset) for offset in dimension.get("offset", [0.0] * len(shape))),
+        str(content.get("note", "")),
+    )
