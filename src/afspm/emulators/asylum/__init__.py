@@ -1,0 +1,229 @@
+"""An emulated Asylum Research microscope: Igor Pro with ZeroMQ-XOP and Asylum's functions, with simulated physics."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+from afspm.emulators.asylum import wire
+from afspm.emulators.asylum.controller import FAULT_KINDS, Controller
+from afspm.emulators.asylum.functions import Dialog, Software
+from afspm.emulators.asylum.server import Queued, Server
+from afspm.emulators.asylum.values import Values
+from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
+from afspm.errors import ConfigError
+from afspm.units import Duration
+
+PROCEDURES: Final = ("afspm", "spots", "none")
+_NOT_COMPILED, _ABORTED, _UNKNOWN = 100, 107, 1
+
+
+@dataclass(frozen=True)
+class Delayed:
+    """A reply that is sent at a time."""
+
+    client: bytes
+    payload: bytes
+    at_s: float
+
+
+class AsylumEmulator(Emulator):
+    """The emulated microscope.
+
+    Args:
+        idle_s: how often Igor gets round to what was asked, in real time; one call each time. 0: at once.
+        start_s: how long the ramp to the first line takes, experiment time.
+        file_s: how long after the end a file begins to appear; the other half of it comes as much later.
+        save_path: what Igor calls the folder of the files, "C:Users:Me:Data:"; left out: what it is called here.
+        base_name: of the files.
+        procedures: what the user has included: "afspm" (afspm.ipf), "spots" (what an older afspm needs) or "none".
+        has_status: whether this release has ARGetStatus.
+        image_open: whether a window shows an image, on which spots are.
+        saves_partial: whether an image is saved that was broken off.
+        seed, faults, and all of the simulated world: as of every emulator.
+    """
+
+    vendor = "Asylum"
+    usual_port = 5555
+    fault_kinds: ClassVar[dict[str, str]] = {
+        "no-reply": "a request is carried out and not answered",
+        "late-reply": "a reply comes later, by the duration, when others may have come",
+        "wrong-id": "a reply with the messageID of another request",
+        "garbage": "a reply that is not JSON",
+        "frames": "a reply of one frame too many",
+        "not-utf8": "a text that is not UTF-8: there is no reply",
+        "busy": "Igor is busy for the duration, and does then what was asked meanwhile",
+        "dialog": "a function waits for the duration until somebody presses OK",
+        "not-compiled": "for the duration, a procedure window is being edited (error 100)",
+        "aborted": "a function is aborted (error 107)",
+        "unknown": "an unknown error (1)",
+        "nan": "GV gives nan",
+        "restart": "ZeroMQ-XOP is stopped, and bound again after the duration",
+        "crash": "Igor vanishes",
+        **FAULT_KINDS,
+    }
+
+    def __init__(
+        self,
+        *,
+        idle_s: float = 0.0,
+        start_s: Duration = 0.2,
+        file_s: Duration = 0.1,
+        save_path: str = "",
+        base_name: str = "Image",
+        procedures: str = "afspm",
+        has_status: bool = True,
+        image_open: bool = True,
+        saves_partial: bool = False,
+        **settings: Any,
+    ) -> None:
+        super().__init__(**settings)
+        if procedures not in PROCEDURES:
+            raise ConfigError(f"{procedures!r}", where="procedures", hint=" or ".join(PROCEDURES))
+        self._idle_s = idle_s
+        self._start_s = start_s
+        self._file_s = file_s
+        self._save_path = save_path
+        self._base_name = base_name
+        self._procedures = procedures
+        self._has_status = has_status
+        self._image_open = image_open
+        self._saves_partial = saves_partial
+
+    def open(self) -> str:
+        """Bind the XOP's socket."""
+        self._server = Server(self.port, self.woken, self.log)
+        # a path without a drive is one of this computer
+        path = self._save_path or "".join(f":{part}" for part in self.folder.parts[1:]) + ":"
+        texts = {"SaveImage": path, "SaveForce": path, "BaseName": self._base_name}
+        self.controller = Controller(
+            self.rig,
+            self.faults,
+            Values(texts),
+            self.folder,
+            start_s=self._start_s,
+            file_s=self._file_s,
+            saves_partial=self._saves_partial,
+            log=self.log,
+        )
+        self._functions = self.functions()
+        self._delayed: deque[Delayed] = deque()
+        self._idle_at_s = -math.inf
+        self._locked_until_s = self._bound_again_at_s = -math.inf
+        self._last_id: str | None = None
+        return f"tcp://{LOOPBACK}:{self._server.port}"
+
+    def functions(self) -> dict[str, wire.Function]:
+        """All that can be called, by names in lower case."""
+        software = Software(
+            self.controller,
+            self.clock.now_s,
+            self._procedures,
+            has_status=self._has_status,
+            image_open=self._image_open,
+        )
+        return software.table()
+
+    def serve(self, timeout_s: float) -> None:
+        """Take requests, and do one of what was asked if Igor is idle."""
+        if self._server.queue and not self._busy():
+            timeout_s = min(timeout_s, max(0.0, self._idle_at_s - self.clock.monotonic_s()))
+        self._server.poll(timeout_s, locked=self._locked())
+        while self._server.queue and not self._busy() and self.clock.monotonic_s() >= self._idle_at_s:
+            self._idle_at_s = self.clock.monotonic_s() + self._idle_s
+            self._carry_out(self._server.queue.popleft())
+            self.controller.advance(self.clock.now_s())
+
+    def tick(self, now_s: float) -> float | None:
+        """What Asylum's software does by itself, and replies that come late."""
+        while self._delayed and self._delayed[0].at_s <= now_s:
+            delayed = self._delayed.popleft()
+            self._server.send(delayed.client, delayed.payload)
+        restart = self.faults.strikes("restart", now_s)
+        if restart is not None:
+            self._server.unbind()
+            self._bound_again_at_s = now_s + restart.duration_s
+        if not self._server.listens and now_s >= self._bound_again_at_s:
+            self._server.bind()
+        times = [self.controller.advance(now_s), self._locked_until_s, self._bound_again_at_s]
+        times += [self._delayed[0].at_s] if self._delayed else []
+        return min((at_s for at_s in times if at_s is not None and at_s > now_s), default=None)
+
+    def close(self) -> None:
+        """Listen no more."""
+        if hasattr(self, "_server"):
+            self._server.close()
+
+    # --- requests ---
+
+    def _locked(self) -> bool:
+        return self.clock.now_s() < self._locked_until_s
+
+    def _busy(self) -> bool:
+        return self._locked() or self.faults.lasts("busy", self.clock.now_s())
+
+    def _carry_out(self, queued: Queued) -> None:
+        """Call the function, and reply."""
+        now_s = self.clock.now_s()
+        if self.faults.strikes("crash", now_s):
+            raise Crashed(f"at {queued.call.name}")
+        try:
+            payload = self._called(queued.call, now_s)
+        except wire.Failed as failed:
+            payload = wire.failure(failed, queued.call.message_id)
+        except UnicodeEncodeError:
+            self.log.warning("the reply to %s is not UTF-8: there is none", queued.call.name)
+            return
+        dialog = self.faults.strikes("dialog", now_s)
+        if dialog is not None:
+            self._wait_for_somebody(dialog.duration_s)
+        if self._locked():
+            self._delayed.append(Delayed(queued.client, payload, self._locked_until_s))
+        else:
+            self._reply(queued, payload, now_s)
+
+    def _called(self, call: wire.Call, now_s: float) -> bytes:
+        if self.faults.lasts("not-compiled", now_s):
+            raise wire.Failed(_NOT_COMPILED)
+        function = self._functions.get(call.name.lower())
+        arguments = wire.arguments(function, call.parameters)
+        assert function is not None
+        if self.faults.strikes("aborted", now_s):
+            raise wire.Failed(_ABORTED, "While executing a user function, the following error occurred: emulated")
+        if self.faults.strikes("unknown", now_s):
+            raise wire.Failed(_UNKNOWN)
+        try:
+            given = function.do(*arguments)
+        except Dialog as dialog:
+            self.log.warning("a dialog waits for OK: %s", dialog)
+            self._wait_for_somebody(math.inf)
+            given = dialog.result
+        if isinstance(given, str) and self.faults.strikes("not-utf8", now_s):
+            given += "\udcb0"
+        return wire.success(function, given, call.message_id)
+
+    def _wait_for_somebody(self, lasts_s: float) -> None:
+        self._locked_until_s = self.clock.now_s() + lasts_s
+
+    def _reply(self, queued: Queued, payload: bytes, now_s: float) -> None:
+        """A reply, or what goes wrong with it."""
+        before, self._last_id = self._last_id, queued.call.message_id
+        if self.faults.strikes("no-reply", now_s):
+            return
+        if self.faults.strikes("wrong-id", now_s):
+            payload = wire.failure(wire.Failed(_UNKNOWN), before or "another")
+        if self.faults.strikes("garbage", now_s):
+            payload = payload[: len(payload) // 2]
+        late = self.faults.strikes("late-reply", now_s)
+        if late is not None:
+            self._delayed.append(Delayed(queued.client, payload, now_s + late.duration_s))
+            return
+        if self.faults.strikes("frames", now_s):
+            self._server.send(queued.client, payload, b"")
+            return
+        self._server.send(queued.client, payload)
+
+
+EMULATOR = AsylumEmulator

@@ -1,0 +1,228 @@
+"""Asylum's software: what it does when its functions are called, and what goes on by itself meanwhile."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from afspm.emulators.asylum import saving
+from afspm.emulators.asylum.values import Values
+from afspm.emulators.faults import Faults
+from afspm.emulators.rig import Rig
+from afspm.model import Region
+
+FAULT_KINDS: Final = {
+    "scan-refused": "DoScan does nothing",
+    "force-refused": "a force curve is refused: DoForceFunc gives 0",
+    "keeps-scanning": "beginning to scan puts LastScan back to 0",
+    "stopped": "somebody stops a scan at the panel",
+    "status-stuck": "for the duration, ARGetStatus says that it scans",
+    "no-file": "a scan or curve is not saved",
+    "late-file": "a file comes later, by the duration",
+    "half-file": "the second half of a file comes later, by the duration",
+    "same-name": "a file is given the name of the one before",
+    "other-name": "somebody changes the base name while it measures",
+    "drive-gone": "for the duration, the drive with the data is not there",
+}
+_SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
+_INTEGRAL_GAIN: Final = 150.0
+"""What Asylum's gain of 1 is to the simulated feedback, in 1/s."""
+
+
+class Controller:
+    """The software.
+
+    Args:
+        folder: that files go to, whatever the texts call it.
+        start_s: how long the ramp to the first line takes.
+        file_s: how long after the end a file begins to appear; the other half of it comes as much later.
+        saves_partial: whether an image is saved that was broken off.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        faults: Faults,
+        values: Values,
+        folder: Path,
+        *,
+        start_s: float,
+        file_s: float,
+        saves_partial: bool,
+        log: logging.Logger,
+    ) -> None:
+        self.rig = rig
+        self.faults = faults
+        self.values = values
+        self._folder = folder
+        self._start_s = start_s
+        self._file_s = file_s
+        self._saves_partial = saves_partial
+        self._log = log
+        self._disk = saving.Disk()
+        self._starts_at_s = math.inf
+        self._curve_running = self._engages = False
+        self._image: Region | None = None
+        # the first is the middle of the frame
+        fast, slow = values.size()
+        self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
+
+    # --- what goes on ---
+
+    def advance(self, now_s: float) -> float | None:
+        """All that happens up to now; returns when to look again."""
+        if self._engages and not self.rig.busy(now_s):
+            self._engages = False
+            self.rig.engage()
+        if now_s >= self._starts_at_s and not self.rig.busy(now_s):
+            self._starts_at_s = math.inf
+            self._start()
+        if self.scanning and self.rig.scan is not None and math.isinf(self._starts_at_s):
+            if not self.rig.scan.running(now_s):
+                self._image_done(now_s)
+            elif self.faults.strikes("stopped", now_s):
+                self.stop(now_s)
+        if self._curve_running and self.rig.doing(now_s) != "spectrum":
+            self._curve_done(now_s)
+        due_s = self._disk.advance(now_s, there=not self.faults.lasts("drive-gone", now_s))
+        times = [at_s for at_s in (due_s, self._starts_at_s) if at_s is not None and at_s > now_s]
+        return min(times, default=None)
+
+    @property
+    def scanning(self) -> bool:
+        """What the panels go by."""
+        return bool(self.values.get("ScanStatus"))
+
+    def status(self, now_s: float) -> int:
+        """The bits of ARGetStatus."""
+        scanning = self.scanning or self.faults.lasts("status-stuck", now_s)
+        bits = (_SCANNING if scanning else 0) | (_ENGAGED if self.rig.engaged or self._engages else 0)
+        return bits | (_FORCE if self._curve_running else 0)
+
+    # --- scans ---
+
+    def scan(self, now_s: float, down: bool | None) -> None:
+        """Begin to scan, in a direction or in that of before; what was going on ends."""
+        if self.faults.strikes("scan-refused", now_s):
+            return
+        if self.scanning:
+            self._leave_image(now_s)
+        if down is not None:
+            self.values.put("ScanDown", float(down))
+        if self.faults.strikes("keeps-scanning", now_s):
+            self.values.put("LastScan", 0)
+        self.values.put("ScanStatus", 1)
+        self.values.settle()
+        self.rig.stop_spectrum()
+        self.rig.engaged = True
+        self._starts_at_s = now_s + self._start_s
+
+    def stop(self, now_s: float) -> None:
+        """Stop everything, the feedback too, and withdraw the tip."""
+        if self.scanning:
+            self._leave_image(now_s)
+        self.values.put("ScanStatus;FMapStatus;DelayUpdate", 0)
+        self._curve_running = self._engages = False
+        self.rig.withdraw()
+
+    def engage(self) -> None:
+        """Bring the tip to the sample, once it has finished going away."""
+        self._engages = True
+        self.rig.feedback = replace(self.rig.feedback, on=True)
+
+    def feedback_off(self) -> None:
+        """The tip stays where it is."""
+        self.rig.feedback = replace(self.rig.feedback, on=False)
+
+    def _start(self) -> None:
+        values, rig = self.values, self.rig
+        fast, slow = values.size()
+        center = (values.get("XOffset"), values.get("YOffset"))
+        rig.region = Region(center, (fast, slow), math.radians(values.get("ScanAngle")))
+        rig.shape = (round(values.get("ScanLines")), round(values.get("ScanPoints")))
+        rig.line_s = 1.0 / values.get("ScanRate")
+        rig.upwards = not values.get("ScanDown")
+        rig.bias_v = values.get("TipVoltage")
+        rig.feedback = replace(
+            rig.feedback,
+            on=True,
+            integral_gain=_INTEGRAL_GAIN * values.get("IntegralGain"),
+            setpoint=values.get("AmplitudeSetpointVolts"),
+        )
+        rig.start_scan()
+        self._image = rig.region
+
+    def _image_done(self, now_s: float) -> None:
+        scan = self.rig.scan
+        if scan is not None:
+            self._save("SaveImage", now_s, lambda name: saving.image(name, scan, self.values, now_s))
+        if not self.values.get("LastScan"):
+            self.scan(now_s, not self.values.get("ScanDown"))
+            return
+        self.values.put("ScanStatus", 0)
+        if self.values.get("LastScanWithdraw"):
+            self.stop(now_s)
+
+    def _leave_image(self, now_s: float) -> None:
+        running = self.rig.scan is not None and self.rig.scan.running(now_s)
+        self.rig.stop_scan()
+        self._starts_at_s = math.inf
+        self.values.put("ScanStatus", 0)
+        scan = self.rig.scan
+        if running and self._saves_partial and scan is not None:
+            self._save("SaveImage", now_s, lambda name: saving.image(name, scan, self.values, now_s))
+
+    # --- force curves ---
+
+    def curve(self, now_s: float) -> bool:
+        """Take a force curve where the tip is: whether it does."""
+        if self.scanning or self.rig.busy(now_s) or self.faults.strikes("force-refused", now_s):
+            return False
+        self.rig.start_spectrum("force")
+        self._curve_running = True
+        return True
+
+    def stop_curve(self) -> None:
+        """At once."""
+        self._curve_running = False
+        self.rig.stop_spectrum()
+
+    def go_to_spot(self, now_s: float) -> None:
+        """Send the tip to the spot that ForceSpotNumber says, on the last image."""
+        number = int(self.values.get("ForceSpotNumber"))
+        image = self._image
+        if image is None:
+            fast, slow = self.values.size()
+            center = (self.values.get("XOffset"), self.values.get("YOffset"))
+            image = Region(center, (fast, slow), math.radians(self.values.get("ScanAngle")))
+        x, y = (along - size / 2 for along, size in zip(self.spots_m[number], image.size_m, strict=True))
+        cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
+        self.rig.move_probe((image.center_m[0] + cos * x - sin * y, image.center_m[1] + sin * x + cos * y))
+
+    def _curve_done(self, now_s: float) -> None:
+        self._curve_running = False
+        spectrum = self.rig.spectrum
+        if spectrum is not None:
+            self._save("SaveForce", now_s, lambda name: saving.curve(name, spectrum, self.values, now_s))
+
+    # --- files ---
+
+    def _save(self, where: str, now_s: float, made: saving.Made) -> None:
+        faults = self.faults
+        if faults.strikes("other-name", now_s):
+            self.values.put_text("BaseName", "Somebody")
+        if not int(self.values.get(where)) & 2 or faults.strikes("no-file", now_s):
+            return
+        suffix = int(self.values.get("BaseSuffix"))
+        if faults.strikes("same-name", now_s):
+            suffix = max(0, suffix - 1)
+        name = f"{self.values.text('BaseName')}{suffix:04d}"
+        late = faults.strikes("late-file", now_s)
+        half = faults.strikes("half-file", now_s)
+        at_s = now_s + self._file_s + (late.duration_s if late else 0.0)
+        rest_at_s = at_s + self._file_s + (half.duration_s if half else 0.0)
+        self._disk.save(self._folder / f"{name}.ibw", made(name), at_s, rest_at_s)
+        self.values.put("BaseSuffix", suffix + 1)

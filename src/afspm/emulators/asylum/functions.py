@@ -1,0 +1,169 @@
+"""The functions that can be called: Asylum's own, and those of the procedures that a user includes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from afspm.emulators.asylum.controller import Controller
+from afspm.emulators.asylum.wire import Failed, Function
+
+ABORTED: Final = 107
+_NOTHING: Final = math.nan
+"""What a function without a return gives."""
+
+
+class Dialog(Exception):
+    """A window waits for somebody to press OK; the function gives `result` then."""
+
+    def __init__(self, text: str, result: float) -> None:
+        super().__init__(text)
+        self.result = result
+
+
+class Software:
+    """Asylum's functions.
+
+    Args:
+        procedures: what is included besides: "afspm", "spots" (only what concerns spots and names) or "none".
+        has_status: whether there is ARGetStatus.
+        image_open: whether a window shows an image, on which spots are.
+    """
+
+    def __init__(
+        self, controller: Controller, now_s: Callable[[], float], procedures: str, *, has_status: bool, image_open: bool
+    ) -> None:
+        self._controller = controller
+        self._now_s = now_s
+        self._procedures = procedures
+        self._has_status = has_status
+        self._image_open = image_open
+
+    def table(self) -> dict[str, Function]:
+        """By their names in lower case, as Igor does not tell the two apart."""
+        values = self._controller.values
+        table = {
+            "GV": Function(self._get, "s"),
+            "PV": Function(self._put, "sv"),
+            "GS": Function(values.text, "s", "s"),
+            "PS": Function(self._put_text, "ss"),
+            "DoScanFunc": Function(self._do_scan, "s"),
+            "DoForceFunc": Function(self._do_force, "s"),
+            "GoToSpot": Function(self._go_to_spot),
+            "SimpleEngageMe": Function(self._engage, "s"),
+            "ARCheckSuffix": Function(lambda: 0.0),
+        }
+        if self._has_status:
+            table["ARGetStatus"] = Function(self._status)
+        if self._procedures != "none":
+            table |= self._spots()
+        if self._procedures == "afspm":
+            table |= self._afspm()
+        return {name.lower(): function for name, function in table.items()}
+
+    def _spots(self) -> dict[str, Function]:
+        values = self._controller.values
+        return {
+            "InitProbePos": Function(self._init_spots),
+            "SetProbePosX": Function(lambda x: self._set_spot(0, x), "v"),
+            "SetProbePosY": Function(lambda y: self._set_spot(1, y), "v"),
+            "GetProbePosX": Function(lambda: self._spot()[0]),
+            "GetProbePosY": Function(lambda: self._spot()[1]),
+            "GetBaseName": Function(lambda: values.text("BaseName"), "", "s"),
+            "SetBaseName": Function(lambda name: self._put_text("BaseName", name), "s"),
+        }
+
+    def _afspm(self) -> dict[str, Function]:
+        return {
+            "AfspmLook": Function(self._look, "s", "s"),
+            "AfspmController": Function(lambda: "Igor Pro 6.37, SIMULATED", "", "s"),
+            "AfspmFeedback": Function(self._feedback, "v"),
+            "AfspmFeedbackOn": Function(self._feedback_on),
+        }
+
+    # --- values ---
+
+    def _get(self, name: str) -> float:
+        value = self._controller.values.get(name)
+        return math.nan if self._controller.faults.strikes("nan", self._now_s()) else value
+
+    def _put(self, names: str, value: float) -> float:
+        self._controller.values.put(names, value)
+        return _NOTHING
+
+    def _put_text(self, name: str, value: str) -> float:
+        self._controller.values.put_text(name, value)
+        return 0.0
+
+    def _look(self, names: str) -> str:
+        status = self._status() if self._has_status else math.nan
+        found = [status, *(self._get(name) for name in names.split(";") if name)]
+        return "".join(f"{value:.15g};" for value in found)
+
+    def _status(self) -> float:
+        return float(self._controller.status(self._now_s()))
+
+    # --- what is done ---
+
+    def _do_scan(self, button: str) -> float:
+        """The command is cut out of the name of a button."""
+        name = button[: button.rfind("_")] if "_" in button else button
+        name = name[: name.rfind("Button")] if "Button" in name else name
+        now_s = self._now_s()
+        if name in ("DoScan", "UpScan", "DownScan"):
+            self._controller.scan(now_s, {"UpScan": False, "DownScan": True}.get(name))
+        elif name in ("StopScan", "StopEngage"):
+            self._controller.stop(now_s)
+        else:
+            raise Dialog(f"Something called DoScanFunc with an invalid CtrlName {button!r}", 1.0)
+        return 0.0
+
+    def _do_force(self, button: str) -> float:
+        name = button.partition("Force")[0]
+        if name == "Single":
+            return _NOTHING if self._controller.curve(self._now_s()) else 0.0
+        if name == "Go":
+            return self._go_to_spot()
+        if name in ("Reset", "Stop"):
+            if name == "Reset":
+                self._controller.stop_curve()
+            return 0.0
+        return 1.0
+
+    def _go_to_spot(self) -> float:
+        if not self._image_open:
+            raise Dialog("there is no image with spots", 0.0)
+        self._controller.go_to_spot(self._now_s())
+        return 0.0
+
+    def _engage(self, _: str) -> float:
+        self._controller.engage()
+        return 0.0
+
+    def _feedback(self, on: float) -> float:
+        if on:
+            return self._engage("")
+        self._controller.feedback_off()
+        return 0.0
+
+    def _feedback_on(self) -> float:
+        return float(self._controller.rig.engaged and bool(self._controller.rig.feedback.on))
+
+    # --- spots ---
+
+    def _init_spots(self) -> float:
+        if len(self._controller.spots_m) < 2:
+            self._controller.spots_m.append(self._controller.spots_m[0])
+        self._controller.values.put("ForceSpotNumber", 1)
+        return 0.0
+
+    def _spot(self) -> tuple[float, float]:
+        if len(self._controller.spots_m) < 2:
+            raise Failed(ABORTED, "Index out of range for wave SpotX.")
+        return self._controller.spots_m[1]
+
+    def _set_spot(self, axis: int, value: float) -> float:
+        x, y = self._spot()
+        self._controller.spots_m[1] = (value, y) if axis == 0 else (x, value)
+        return 0.0

@@ -1,0 +1,99 @@
+"""The files of scans and force curves: made as Asylum makes them, and written late and in parts."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from afspm.emulators.asylum import ibw
+from afspm.emulators.asylum.values import Values
+from afspm.emulators.running import RunningScan, RunningSpectrum
+
+AMPLITUDE_M_PER_V = 1e-7
+
+Made = Callable[[str], bytes]
+"""The content of a file, given the name of its wave."""
+
+
+@dataclass(frozen=True)
+class Write:
+    """A part of a file, to be written at a time (experiment s)."""
+
+    at_s: float
+    path: Path
+    content: bytes
+    begins: bool = True
+
+
+class Disk:
+    """What is still to be written."""
+
+    def __init__(self) -> None:
+        self._writes: list[Write] = []
+
+    def save(self, path: Path, content: bytes, at_s: float, rest_at_s: float) -> None:
+        """Half of a file at one time, the other half at another."""
+        half = len(content) // 2
+        self._writes += [Write(at_s, path, content[:half]), Write(rest_at_s, path, content[half:], begins=False)]
+        self._writes.sort(key=lambda write: write.at_s)
+
+    def advance(self, now_s: float, *, there: bool) -> float | None:
+        """Write what is due, if the drive is `there`; returns when there is more."""
+        while self._writes and self._writes[0].at_s <= now_s:
+            write = self._writes.pop(0)
+            with contextlib.suppress(OSError):
+                if there:
+                    write.path.parent.mkdir(parents=True, exist_ok=True)
+                    with write.path.open("wb" if write.begins else "ab") as file:
+                        file.write(write.content)
+        return self._writes[0].at_s if self._writes else None
+
+
+def image(name: str, scan: RunningScan, values: Values, now_s: float) -> bytes:
+    """The file of a scan; lines that were not scanned are NaN."""
+    channels = scan.channels(scan.end_s if scan.stopped_s is not None else None)
+    layers, labels = [], []
+    for channel, (unit, found) in channels.items():
+        quantity, _, back = channel.partition(" ")
+        labels.append(f"{quantity.replace(' ', '')}{back or 'Trace'}")
+        # an amplitude is noted as a length
+        layers.append((found * AMPLITUDE_M_PER_V if (quantity, unit) == ("Amplitude", "V") else found).T)
+    rows, columns = scan.shape
+    width, height = scan.region.size_m
+    steps = [(width / (columns - 1), "m"), (height / (rows - 1), "m")]
+    return ibw.wave(name, np.stack(layers, axis=2), "m", steps, labels, _note(values, now_s), now_s)
+
+
+def curve(name: str, spectrum: RunningSpectrum, values: Values, now_s: float) -> bytes:
+    """The file of a force curve: towards the sample and back, over time."""
+    table = dict(zip(spectrum.names, spectrum.values.T, strict=True))
+    extension = table["Z"].max() - table["Z"]
+    there_and_back: Sequence[np.ndarray] = [
+        np.concatenate([extension[::-1], extension]),
+        np.concatenate([table["Deflection"][::-1], table["Deflection Retrace"]]),
+    ]
+    columns = np.column_stack([*there_and_back, there_and_back[0]])
+    step_s = (spectrum.end_s - spectrum.start_s) / len(columns)
+    place = zip(("XLVDT", "YLVDT"), spectrum.position_m, strict=True)
+    return ibw.wave(
+        name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, list(place)), now_s
+    )
+
+
+def _note(values: Values, now_s: float, more: Sequence[tuple[str, float]] = ()) -> bytes:
+    local, seconds = ibw.moment(now_s)
+    texts = {
+        "StartHeadTemp": "32.125 °C",
+        "Date": f"{local:%Y-%m-%d}",
+        "Time": f"{local:%H:%M:%S}",
+        "Seconds": f"{seconds:.3f}",
+        "SaveImage": values.text("SaveImage"),  # the second of this name, as in real notes
+        "MicroscopeModel": "afspm SIMULATED",
+        "Version": "15.09.112",
+        "BaseName": values.text("BaseName"),
+    }
+    return ibw.note([*values.noted(), *more, *texts.items()])

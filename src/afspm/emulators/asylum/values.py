@@ -1,0 +1,64 @@
+"""The numbers and texts that Asylum's software goes by, as its panels and its notes have them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+NUMBERS: Final[dict[str, float]] = {
+    "ScanSize": 1e-6, "FastScanSize": 1e-6, "SlowScanSize": 1e-6, "ScanRate": 1.0, "XOffset": 0.0, "YOffset": 0.0,
+    "PointsLines": 128, "ScanPoints": 128, "ScanLines": 128, "ScanAngle": 0.0, "InvOLS": 1.2e-7, "SpringConstant": 3.0,
+    "AmpInvOLS": 1e-7, "FastRatio": 1.0, "SlowRatio": 1.0, "TopLine": 127, "BottomLine": 0, "ScanSpeed": 2.5e-6,
+    "IntegralGain": 10.0, "ProportionalGain": 0.0, "AmplitudeSetpointVolts": 0.7, "AmplitudeSetpointMeters": 7e-8,
+    "DriveAmplitude": 0.1, "DriveFrequency": 3.7407e5, "SlowScanEnabled": 1, "DeflectionSetpointVolts": 1.0,
+    "MaxScanSize": 9e-5, "ScanStateChanged": 0, "ScanDown": 0, "XLVDTSens": 7.9727e-06, "YLVDTSens": 8.1073e-06,
+    "LastScan": 0, "LastScanWithdraw": 0, "BaseSuffix": 0, "SaveImage": 2, "SaveForce": 2, "ParmChange": 0,
+    "ScanStatus": 0, "FMapStatus": 0, "DelayUpdate": 0, "TipVoltage": 0.0, "SurfaceVoltage": 0.0, "NapMode": 0,
+    "ImagingMode": 1, "ForceSpotNumber": 0, "XScanDirection": 1, "YScanDirection": 1, "Setpoint": 0.0008,
+}  # fmt: skip
+
+
+class Values:
+    """Igor does not tell upper from lower case.
+
+    Args:
+        texts: GS and PS.
+    """
+
+    def __init__(self, texts: Mapping[str, str]) -> None:
+        self._numbers = {name.lower(): float(value) for name, value in NUMBERS.items()}
+        self._texts = {name.lower(): value for name, value in texts.items()}
+
+    def get(self, name: str) -> float:
+        """NaN for a name that is not there."""
+        return self._numbers.get(name.lower(), math.nan)
+
+    def put(self, names: str, value: float) -> None:
+        """To one name or a list "A;B;", without any check, and without what a panel would do besides."""
+        for name in names.split(";"):
+            if name.lower() in self._numbers:
+                self._numbers[name.lower()] = value
+
+    def text(self, name: str) -> str:
+        return self._texts.get(name.lower(), "")
+
+    def put_text(self, name: str, value: str) -> None:
+        if name.lower() in self._texts:
+            self._texts[name.lower()] = value
+
+    def size(self) -> tuple[float, float]:
+        """(fast, slow): ScanSize is the longer side, the ratios say how much shorter the other one is."""
+        longer, ratio = self.get("ScanSize"), self.get("SlowRatio") / self.get("FastRatio")
+        return (longer / ratio, longer) if ratio > 1.0 else (longer, longer * ratio)
+
+    def settle(self) -> None:
+        """What the software works out when it begins to scan."""
+        fast, slow = self.size()
+        self.put("FastScanSize", fast)
+        self.put("SlowScanSize", slow)
+        self.put("ScanSpeed", 2.5 * fast * self.get("ScanRate"))
+
+    def noted(self) -> Iterator[tuple[str, float]]:
+        """The numbers by the names that a note has."""
+        return ((name, self._numbers[name.lower()]) for name in NUMBERS)

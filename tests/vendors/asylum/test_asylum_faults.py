@@ -1,0 +1,228 @@
+"""What can go wrong at an Asylum microscope: each gives an error with a name, nothing hangs, and it is found again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from asylum_bench import Bench, Emulated, Peer, states
+
+from afspm.emulators.faults import Fault
+from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
+
+Make = Callable[..., Bench]
+FREE = ScopeState.FREE
+UNDEFINED = ScopeState.UNDEFINED
+SOON = {"reply_timeout_s": 0.4}
+
+
+def small(made: Bench, **settings: object) -> Peer:
+    """A translator that has found the microscope, with a frame of few pixels in force."""
+    peer = made.start(**settings)
+    peer.until(FREE)
+    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
+    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
+    peer.until(lambda one: getattr(one, "shape", None) == (8, 16))
+    peer.until(FREE)
+    return peer
+
+
+def scans(heard: list[object]) -> list[Scan]:
+    return [one for one in heard if isinstance(one, Scan)]
+
+
+def scans_again(peer: Peer) -> list[Scan]:
+    """It works."""
+    response = peer.act(names.START_SCAN)
+    assert response.ok, response.reason
+    found = scans(peer.until(FREE))
+    assert found
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("no-reply", "no reply to"),
+        ("wrong-id", "no reply to"),
+        ("late-reply", "no reply to"),
+        ("garbage", "replied with what can't be read"),
+        ("frames", "replied with 3 frames"),
+        ("not-utf8", "no reply to"),
+        ("nan", "Asylum has no value"),
+        ("aborted", "the function was aborted (107"),
+        ("unknown", "an error that it has no name for (1"),
+    ],
+)
+def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, told: str) -> None:
+    made = bench()
+    peer = small(made, **SOON)
+    # of nan the first two are of the status, where they mean that a release has no such value
+    made.strike(kind, count=6 if kind == "nan" else 1, duration_s=60.0)
+    peer.until(UNDEFINED)
+    peer.until(FREE)
+    assert told in made.said()
+    scans_again(peer)
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("dialog", "Igor is silent while a dialog waits on its screen"),
+        ("busy", "no reply to"),
+        ("not-compiled", "Igor's procedures are not compiled (100"),
+        ("restart", "nobody listens"),
+    ],
+)
+def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str, told: str) -> None:
+    made = bench(speed=1.0)
+    peer = small(made, **SOON)
+    made.strike(kind, duration_s=2.0)
+    peer.until(UNDEFINED)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "the controller can't be reached" in response.reason
+    peer.until(FREE)
+    assert told in made.said()
+
+
+def test_igor_that_vanishes_is_found_again_when_it_is_back(bench: Make, tmp_path: Path) -> None:
+    made = bench()
+    peer = small(made, **SOON)
+    made.strike("crash")
+    peer.until(UNDEFINED)
+    again = Emulated(port=int(made.address.rpartition(":")[2]), surface="steps")
+    with ExitStack() as stack:
+        stack.enter_context(again.running(tmp_path / "again", made.clock))
+        peer.until(FREE)
+        assert peer.get("x-engaged") == "true"
+
+
+def test_procedures_that_are_not_included_are_asked_for(bench: Make) -> None:
+    made = bench(procedures="none")
+    peer = made.start()
+    peer.until(UNDEFINED)
+    assert "there is no such function (101" in made.said()
+    assert "is afspm.ipf included in Igor's procedures" in made.said()
+
+
+def test_the_procedures_of_an_older_afspm_are_enough_to_scan(bench: Make) -> None:
+    made = bench(procedures="spots")
+    peer = small(made)
+    scans_again(peer)
+    assert peer.get(names.FEEDBACK_ON) == peer.get("x-engaged") == "true"
+    response = peer.set(names.FEEDBACK_ON, False)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "there is no such function (101" in response.reason
+
+
+# --- scans and curves ---
+
+
+def test_a_scan_that_does_not_begin_is_refused(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("scan-refused")
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "was told to begin a scan, and does not" in response.reason
+    scans_again(peer)
+
+
+def test_a_force_curve_that_is_refused(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("force-refused")
+    response = peer.act(names.START_SPEC)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "was told to begin a force, and does not" in response.reason
+    assert peer.act(names.START_SPEC).ok
+    assert any(isinstance(one, Spectrum) for one in peer.until(FREE))
+
+
+def test_a_force_curve_whose_end_could_not_be_seen_is_refused(bench: Make) -> None:
+    made = bench(has_status=False)
+    peer = small(made)
+    response = peer.act(names.START_SPEC)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "without ARGetStatus" in response.reason
+    scans_again(peer)
+
+
+def test_a_scan_is_one_scan_even_if_beginning_it_puts_last_scan_back(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("keeps-scanning")
+    assert {Path(scan.filename).name for scan in scans_again(peer)} == {"Image0000.ibw"}
+    assert made.emulator.controller.values.get("LastScan") == 1
+
+
+def test_saving_is_switched_on_where_it_is_off(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.at_panel(lambda emulator: emulator.controller.values.put("SaveImage", 0))
+    scans_again(peer)
+    assert "Asylum was not to save (SaveImage)" in made.said()
+
+
+@pytest.mark.parametrize("kind", ["late-file", "half-file"])
+def test_a_file_that_comes_late_or_in_parts_is_waited_for(bench: Make, kind: str) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    made.strike(kind, duration_s=6.0)
+    assert {Path(scan.filename).name for scan in scans_again(peer)} == {"Image0000.ibw"}
+
+
+@pytest.mark.parametrize(("kind", "lasts_s"), [("no-file", 1.0), ("half-file", 1e6), ("drive-gone", 20.0)])
+def test_a_scan_without_a_whole_file_is_told_and_the_next_is_not_taken_for_it(
+    bench: Make, kind: str, lasts_s: float
+) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, result_timeout_s=5.0)
+    made.strike(kind, duration_s=lasts_s)
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(heard)
+    assert "ended without a result" in made.said()
+    assert scans_again(peer)[0].values.shape == (8, 16)
+
+
+def test_a_file_of_the_same_name_is_that_of_the_new_scan(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    first = scans_again(peer)
+    made.strike("same-name")
+    second = scans_again(peer)
+    assert first[0].filename == second[0].filename
+    assert first[0].time_ns != second[0].time_ns
+    assert (first[0].values != second[0].values).any()
+
+
+def test_a_file_of_another_name_is_found(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("other-name")
+    assert {Path(scan.filename).name for scan in scans_again(peer)} == {"Somebody0000.ibw"}
+
+
+@pytest.mark.parametrize("partial", [False, True])
+def test_a_scan_that_somebody_stops_is_interrupted(bench: Make, partial: bool) -> None:
+    made = bench(speed=20.0, saves_partial=partial)
+    peer = small(made, result_timeout_s=3.0)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.strike("stopped")
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not scans(heard)
+
+
+def test_what_one_source_says_to_be_scanning_is(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    made.emulator.faults.demand(Fault("status-stuck", 0.0, 1, 20.0), made.clock.now_s())
+    heard = peer.until(ScopeState.SCANNING)
+    assert states(heard) == ["SCANNING"]

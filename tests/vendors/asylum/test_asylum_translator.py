@@ -1,0 +1,326 @@
+"""The Asylum translator against the emulated microscope: everything that a peer may ask for, as it sees it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from asylum_bench import Bench, Peer, states
+
+from afspm.files import read
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    ProbePosition,
+    Region,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    Spectrum,
+    names,
+)
+
+Make = Callable[..., Bench]
+
+FREE = ScopeState.FREE
+TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
+SHAPE = (12, 32)
+FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
+
+
+def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
+    """A small frame is in force, and all that comes of it was heard."""
+    peer.until(FREE)
+    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, ""))
+    assert response.ok, response.reason
+    peer.until(lambda one: isinstance(one, ScanParameters) and one.region == region and one.shape == shape)
+    peer.until(FREE)
+
+
+def scanned(peer: Peer) -> dict[str, Scan]:
+    response = peer.act(names.START_SCAN)
+    assert response.ok, response.reason
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    scans = [one for one in heard if isinstance(one, Scan)]
+    assert heard[-1 - len(scans) : -1] == scans, "the scans come before FREE, and nothing in between"
+    return {scan.channel: scan for scan in scans}
+
+
+def moved(peer: Peer, x_m: float, y_m: float) -> None:
+    response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m)))
+    assert response.ok, response.reason
+    heard = peer.until(FREE)
+    assert states(heard) == ["MOVING", "FREE"]
+    assert ProbePosition((x_m, y_m)) in heard
+
+
+# --- scans ---
+
+
+def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    scans = scanned(peer)
+    assert {"HeightTrace", "HeightRetrace", "AmplitudeTrace", "PhaseTrace"} <= scans.keys()
+    for scan in scans.values():
+        assert scan.region == TURNED
+        assert scan.shape == SHAPE
+        assert scan.filename == str(made.data / "Image0000.ibw")
+        assert scan.time_ns is not None
+        assert abs(scan.time_ns / 1e9 - made.clock.now_s()) < 600.0
+    assert scans["HeightTrace"].unit == "m"
+    assert scans["PhaseTrace"].unit == "deg"
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: str) -> None:
+    """Against the heights of the simulated sample at each pixel: half a frame off, or a mirrored axis, would show."""
+    made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
+    peer = made.start()
+    region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
+    ready(peer, region, (48, 32))
+    assert peer.set(names.SCAN_DIRECTION, direction).ok
+    scans = scanned(peer)
+    truth = made.emulator.rig.world.surface_m(*region.pixels_m((48, 32)))
+
+    def likeness(values: np.ndarray) -> float:
+        return float(np.corrcoef(values.ravel(), truth.ravel())[0, 1])
+
+    for channel in ("HeightTrace", "HeightRetrace"):
+        values = scans[channel].values
+        assert likeness(values) > 0.98
+        for mirrored in (values[::-1], values[:, ::-1], values[::-1, ::-1]):
+            assert likeness(mirrored) < likeness(values) - 0.1
+    assert read(scans["HeightTrace"].filename).upwards is (direction == "up")
+
+
+def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    files = [scanned(peer)["HeightTrace"].filename for _ in range(3)]
+    assert [Path(name).name for name in files] == ["Image0000.ibw", "Image0001.ibw", "Image0002.ibw"]
+
+
+def test_a_scan_that_is_stopped_gives_none_and_leaves_the_tip_withdrawn(bench: Make) -> None:
+    made = bench(speed=10.0, saves_partial=True)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.get("x-engaged") == "true"
+    assert peer.act(names.STOP_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Scan) for one in heard)
+    assert peer.get("x-engaged") == "false"
+    assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
+    assert peer.act(names.ENGAGE).ok
+    peer.until(FREE)
+    assert peer.get("x-engaged") == "true"
+
+
+def test_images_that_somebody_takes_at_the_panel_are_published_too(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer)
+
+    def press(emulator: object) -> None:
+        made.emulator.controller.values.put("LastScan", 1)
+        made.emulator.controller.scan(made.clock.now_s(), True)
+
+    made.at_panel(press)
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    assert {one.region for one in heard if isinstance(one, Scan)} == {TURNED}
+
+
+# --- parameters ---
+
+
+def test_the_frame_as_asylum_has_it(bench: Make) -> None:
+    """Its offsets are the centre, the longer side is ScanSize, and the ratios tell the other one."""
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    values = made.emulator.controller.values
+    assert values.get("XOffset") == pytest.approx(40e-9, abs=1e-20)
+    assert values.get("YOffset") == pytest.approx(-25e-9, abs=1e-20)
+    assert values.get("ScanSize") == pytest.approx(300e-9)
+    assert values.get("SlowRatio") / values.get("FastRatio") == pytest.approx(1 / 3)
+    assert values.size() == pytest.approx((300e-9, 100e-9))
+    assert values.get("ScanAngle") == pytest.approx(30.0)
+    assert (values.get("ScanPoints"), values.get("ScanLines")) == (32, 12)
+
+
+def test_the_speed_is_asylums_scan_rate_and_stays_when_the_width_changes(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    values = made.emulator.controller.values
+    assert peer.set(names.SCAN_SPEED, 3, "um/s").ok
+    assert values.get("ScanRate") == pytest.approx(3e-6 / (2.5 * 300e-9))
+    assert peer.set(names.SCAN_SIZE_X, 150, "nm").ok
+    assert float(peer.get(names.SCAN_SPEED)) == pytest.approx(3e-6)
+    assert values.get("ScanRate") == pytest.approx(3e-6 / (2.5 * 150e-9))
+    assert values.get("ScanSpeed") == pytest.approx(3e-6)
+
+
+def test_feedback_is_set_and_switched(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    peer.until(FREE)
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(False, 0.5, 20.0, 0.6)).ok
+    told = peer.until(lambda one: isinstance(one, Feedback) and one.on is False)[-1]
+    assert (told.proportional_gain, told.integral_gain) == pytest.approx((0.5, 20.0))
+    assert told.setpoint == pytest.approx(0.6)
+    assert made.emulator.controller.values.get("AmplitudeSetpointVolts") == pytest.approx(0.6)
+    assert peer.set(names.FEEDBACK_ON, True).ok
+    assert peer.get(names.FEEDBACK_ON) == "true"
+
+
+def test_a_row_of_the_table_can_name_another_value_or_a_text(bench: Make) -> None:
+    made = bench()
+    rows = {
+        "zctrl-setpoint": {"vendor": "DeflectionSetpointVolts"},
+        "x-name": {"vendor": "BaseName", "type": "text"},
+    }
+    peer = made.start(parameters=rows)
+    peer.until(FREE)
+    assert peer.set(names.ZCTRL_SETPOINT, 0.25, "V").ok
+    assert made.emulator.controller.values.get("DeflectionSetpointVolts") == 0.25
+    assert peer.set("x-name", "Graphite").ok
+    assert peer.get("x-name") == "Graphite"
+
+
+def test_a_value_that_asylum_does_not_have_is_named(bench: Make) -> None:
+    made = bench()
+    peer = made.start(parameters={"x-loss": {"vendor": "NoSuchValue", "unit": "V"}})
+    peer.until(FREE)
+    response = peer.set("x-loss", 1)
+    assert response.code == ControlResponse.PARAM_NOT_SUPPORTED
+    assert "NoSuchValue" in response.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "unit", "code"),
+    [
+        (names.SCAN_SIZE_X, "nan", None, ControlResponse.PARAM_ERROR),
+        (names.SCAN_SIZE_X, "1", "V", ControlResponse.PARAM_ERROR),
+        (names.SCAN_SIZE_X, "1", "m", ControlResponse.PARAM_ERROR),
+        (names.SCAN_DIRECTION, "sideways", None, ControlResponse.PARAM_ERROR),
+        ("x-engaged", "true", None, ControlResponse.PARAM_ERROR),
+        ("no-such", "1", None, ControlResponse.PARAM_NOT_SUPPORTED),
+    ],
+)
+def test_what_can_not_be_set_is_refused(
+    bench: Make, name: str, value: str, unit: str | None, code: ControlResponse
+) -> None:
+    made = bench()
+    peer = made.start()
+    peer.until(FREE)
+    response = peer.set(name, value, unit)
+    assert response.code == code
+    assert response.reason
+
+
+def test_while_it_scans_it_is_asked_and_not_disturbed(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert float(peer.get(names.SCAN_SIZE_X)) == pytest.approx(300e-9)
+    for response in (peer.set(names.SCAN_SIZE_X, 1e-7), peer.act(names.START_SCAN), peer.act(names.START_SPEC)):
+        assert response.code == ControlResponse.NOT_FREE
+    assert peer.act(names.RETRACT).ok, "the way out is open"
+    assert states(peer.until(FREE)) == ["INTERRUPTED", "FREE"]
+    assert peer.get("x-engaged") == "false"
+
+
+def test_the_controller_and_a_base_name_of_ones_own(bench: Make) -> None:
+    made = bench()
+    peer = made.start(base_name="Tuesday")
+    ready(peer)
+    assert peer.get(names.CONTROLLER) == "Asylum Research, Igor Pro 6.37, SIMULATED"
+    assert Path(scanned(peer)["HeightTrace"].filename).name == "Tuesday0000.ibw"
+
+
+def test_files_are_found_where_the_drive_is_mounted(bench: Make) -> None:
+    made = bench(save_path="C:Users:Asylum User:Documents:240820:")
+    peer = made.start(folders={"c:users:Asylum User:Documents": str(made.folder)})
+    ready(peer)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "240820 can't be seen from here" in response.reason
+    (made.folder / "240820").symlink_to(made.data, target_is_directory=True)
+    assert Path(scanned(peer)["HeightTrace"].filename).parent.name == "240820"
+
+
+def test_commands_of_the_experiment_file(bench: Make) -> None:
+    made = bench()
+    commands = {"x-drive": 'PV "DriveAmplitude", 0.25', "x-odd": 'DoForceFunc "Nothing"', "x-typo": 'PV "A'}
+    peer = made.start(actions={name: {"command": text} for name, text in commands.items()})
+    peer.until(FREE)
+    assert peer.act("x-drive").ok
+    assert made.emulator.controller.values.get("DriveAmplitude") == 0.25
+    assert "gave 1" in peer.act("x-odd").reason
+    assert "as in JSON" in peer.act("x-typo").reason
+
+
+# --- the probe, and force curves ---
+
+
+def test_the_probe_goes_where_it_is_sent_also_on_a_turned_image(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    scanned(peer)
+    moved(peer, 70e-9, 10e-9)
+    assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
+
+
+def test_the_probe_stays_where_it_is_when_the_image_changes(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved(peer, 70e-9, 10e-9)
+    scanned(peer)
+    assert float(peer.get(names.PROBE_POS_X)) == pytest.approx(70e-9)
+    assert float(peer.get(names.PROBE_POS_Y)) == pytest.approx(10e-9)
+
+
+def test_a_force_curve_comes_with_the_place_where_it_was_taken(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved(peer, 70e-9, 10e-9)
+    response = peer.act(names.START_SPEC)
+    assert response.ok, response.reason
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "FREE"]
+    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    assert curve.position_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
+    assert (curve.kind, curve.names) == ("force", ("Raw", "Defl", "ZSnsr", "Time"))
+    assert curve.units == ("m", "m", "m", "s")
+    raw, deflection = curve.values[:, 0], curve.values[:, 1]
+    assert raw[0] == raw[-1] == 0.0
+    assert deflection[raw.argmax()] == pytest.approx(deflection.max(), rel=0.1)
+
+
+def test_a_force_curve_that_is_stopped_gives_none(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = made.start()
+    peer.until(FREE)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    assert peer.act(names.STOP_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in heard)
