@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from afspm.cli import check, drift, emulate, graph, keys, run
+from afspm.cli import check, drift, emulate, graph, keys, run, test_translator
 
 app = typer.Typer(
     name="afspm",
@@ -19,4 +19,5 @@ app.command("check")(check.check)
 app.command("graph")(graph.graph)
 app.command("keys")(keys.keys)
 app.command("emulate")(emulate.emulate)
+app.command("test-translator")(test_translator.check_translator)
 app.add_typer(drift.app, name="drift")

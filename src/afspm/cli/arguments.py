@@ -15,3 +15,8 @@ Files = Annotated[
         show_default=False,
     ),
 ]
+
+
+def names_in(given: list[str] | None) -> tuple[str, ...]:
+    """Names given by repeating the option, by commas, or both."""
+    return tuple(name.strip() for names in given or () for name in names.split(",") if name.strip())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import Files
+from afspm.cli.arguments import Files, names_in
 
 if TYPE_CHECKING:
     from afspm.experiment import Start
@@ -62,8 +62,8 @@ def run(
         raise typer.Exit(1)
     options = running.Options(
         runs=runs,
-        only=_names(only),
-        without=_names(without),
+        only=names_in(only),
+        without=names_in(without),
         speed=speed,
         log_level=logging.DEBUG if verbose else logging.INFO,
     )
@@ -73,11 +73,6 @@ def run(
         return
     ended = running.run(experiment, options, terminal=sys.stdout)
     raise typer.Exit(ended.outcome.exit_code)
-
-
-def _names(given: list[str] | None) -> tuple[str, ...]:
-    """Names given by repeating the option, by commas, or both."""
-    return tuple(name.strip() for names in given or () for name in names.split(",") if name.strip())
 
 
 def _told(start: Start) -> str:

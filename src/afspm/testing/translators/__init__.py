@@ -1,0 +1,14 @@
+"""Whether a translator does what the wire format says: checked from outside, operation by operation.
+
+`afspm test-translator experiment.toml` starts translator and scheduler as real processes, or joins running ones, and
+asks for everything that a component could ask for. The same as pytest items, one for each check:
+`pytest -p afspm.testing.translators.plugin experiment.toml` (that plugin is loaded only where it is asked for).
+"""
+
+from __future__ import annotations
+
+from afspm.testing.translators.report import Outcome, Report, Result
+from afspm.testing.translators.runner import run
+from afspm.testing.translators.session import Options
+
+__all__ = ["Options", "Outcome", "Report", "Result", "run"]

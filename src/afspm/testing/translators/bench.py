@@ -1,0 +1,209 @@
+"""`Bench`: asks what a component could ask, through the scheduler, and hears what is published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from afspm import wire
+from afspm.clock import Clock
+from afspm.errors import NoResponse, WireError
+from afspm.model import ControlRequest, ControlResponse, Parameter, Response, ScopeState, ScopeStatus, names
+from afspm.runtime.link import Link
+from afspm.testing.translators.story import Heard, Story, told
+from afspm.testing.translators.verdicts import Failed, Lost, expect
+
+STARTED_S = 30.0
+"""Real seconds until translator and scheduler are up and the microscope has said that it is free."""
+NOTICED_S = 10.0
+"""Real seconds until what was asked for is published."""
+QUIET_S = 0.2
+"""Real seconds without anything after which nothing more is said to come."""
+MOVED_S = 60.0
+"""Experiment seconds that a move may take."""
+
+_STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
+
+
+class Bench:
+    """A component of a kind of its own: it is told everything, and hides nothing.
+
+    Args:
+        link: connected, or about to be.
+        lost: says why nothing can be asked any more (a process ended); empty while all is well.
+
+    Attributes:
+        story: what is published.
+        at_start: what of it was there before anything was asked.
+    """
+
+    def __init__(self, link: Link, lost: Callable[[], str]) -> None:
+        self._link = link
+        self._lost = lost
+        self.clock: Clock = link.clock
+        self.story = Story()
+        self.at_start: tuple[Heard, ...] = ()
+        self._stirred = True
+        link.listen(self.story.take)
+
+    # --- beginning and ending ---
+
+    def begin(self) -> None:
+        """Wait until the microscope is there, and take control.
+
+        Raises:
+            Lost: that could not be.
+        """
+        try:
+            self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, "a scheduler that answers")
+            self.wait(
+                lambda: self.story.newest(ScopeStatus) is not None, STARTED_S, "a ScopeStateMsg of the translator"
+            )
+            self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a controller that is found")
+        except Failed as failure:
+            raise Lost(str(failure)) from failure
+        response = self._link.request(ControlRequest.REQUEST_CTRL, 0)
+        if not response.ok:
+            raise Lost(f"control is not given: {answer_in_words(response)}")
+        self.quiet()
+        self.at_start = tuple(self.story.all)
+
+    def end(self) -> None:
+        """Give control back."""
+        self._link.send_only(ControlRequest.RELEASE_CTRL)
+
+    # --- asking ---
+
+    def ask(self, kind: ControlRequest, subject: Any = None) -> Response:
+        """The answer, whatever it is.
+
+        Raises:
+            Failed: there is none.
+            Lost: a process has ended, or control was taken away.
+        """
+        self._require_alive()
+        try:
+            response = self._link.request(kind, subject)
+        except NoResponse:
+            self._require_alive()
+            raise Failed(f"an answer to REQ_{kind.name}", f"none, in {self._link.request_timeout_s:g} s") from None
+        if response.code == ControlResponse.NOT_IN_CONTROL:
+            raise Lost(f"control was lost: {response.reason}")
+        self._stirred |= response.ok and not _only_asks(kind, subject)
+        return response
+
+    def asked(self, kind: ControlRequest, subject: Any, what: str) -> Response:
+        """As `ask`, where it has to be a success."""
+        response = self.ask(kind, subject)
+        expect(response.ok, f"REP_SUCCESS to {what}", answer_in_words(response))
+        return response
+
+    def act(self, action: str) -> None:
+        """Have it done; it has to be a success."""
+        self.asked(ControlRequest.ACTION, action, action)
+
+    def get(self, name: str, unit: str | None = None) -> Parameter:
+        """A parameter's value, as it is told."""
+        return value_in(self.asked(ControlRequest.PARAM, Parameter(name, None, unit), f"getting {name}"), name)
+
+    def set(self, name: str, value: str, unit: str | None = None) -> Response:
+        """Ask for a value; the answer, whatever it is."""
+        return self.ask(ControlRequest.PARAM, Parameter(name, value, unit))
+
+    # --- hearing ---
+
+    @property
+    def state(self) -> ScopeState:
+        """What the microscope has said last."""
+        newest = self.story.newest(ScopeStatus)
+        return ScopeState.UNDEFINED if newest is None else newest.state
+
+    def wait(self, done: Callable[[], bool], within_s: float, expected: str) -> None:
+        """Wait for something to be heard, real seconds.
+
+        Raises:
+            Failed: it did not come.
+        """
+        mark = self.story.mark()
+        if not self._link.wait(lambda: done() or bool(self._lost()), self._link.until(within_s)):
+            came = told(self.story.since(mark))
+            raise Failed(f"{expected} within {within_s:.3g} s", came)
+        self._require_alive()
+
+    def wait_state(self, state: ScopeState, mark: int, within_s: float = NOTICED_S) -> None:
+        """Wait until a state is heard after `mark`."""
+        if not self._link.wait(
+            lambda: self.story.has_state(state, mark) or bool(self._lost()), self._link.until(within_s)
+        ):
+            came = told(self.story.since(mark))
+            raise Failed(f"SS_{state.name} within {within_s:.3g} s", came)
+        self._require_alive()
+
+    def settled(self, mark: int, experiment_s: float = MOVED_S) -> list[Heard]:
+        """All that is published after `mark` until the microscope is free and quiet."""
+
+        self.quiet()
+        if self.state is not ScopeState.FREE:
+            self.wait(lambda: self.state is ScopeState.FREE, self.real_s(experiment_s), "SS_FREE")
+            self.quiet()
+        return self.story.since(mark)
+
+    def quiet(self) -> None:
+        """Until nothing has come for a while."""
+        self._stirred = False
+        until_s = self.clock.monotonic_s() + NOTICED_S
+        while self.clock.monotonic_s() < until_s:
+            count = len(self.story.all)
+            if not self._link.wait(
+                lambda n=count: len(self.story.all) != n or bool(self._lost()),  # type: ignore[misc]
+                self._link.until(QUIET_S),
+            ):
+                return
+            self._require_alive()
+
+    def real_s(self, experiment_s: float) -> float:
+        """How long that may last in real time: never less than it takes to be noticed."""
+        return self.clock.real_s(experiment_s) + NOTICED_S
+
+    def come_to_rest(self) -> None:
+        """Stop whatever runs; free, or Lost."""
+        if self.state is not ScopeState.FREE:
+            mark = self.story.mark()
+            if self.state in _STOPS:
+                self.ask(ControlRequest.ACTION, _STOPS[self.state])
+            try:
+                self.wait(lambda: self.state is ScopeState.FREE, self.real_s(MOVED_S), "SS_FREE")
+            except Failed as failure:
+                raise Lost(f"it does not come to rest: {failure} ({told(self.story.since(mark))})") from failure
+        if self._stirred:
+            self.quiet()
+
+    def _require_alive(self) -> None:
+        if self._lost():
+            raise Lost(self._lost())
+
+
+def _only_asks(kind: ControlRequest, subject: Any) -> bool:
+    return kind is ControlRequest.ACTION_SUPPORT or (isinstance(subject, Parameter) and subject.value is None)
+
+
+def answer_in_words(response: Response) -> str:
+    """An answer, and why."""
+    known = response.code in ControlResponse._value2member_map_
+    code = f"REP_{ControlResponse(response.code).name}" if known else f"response {response.code}"
+    return f"{code} ({response.reason})" if response.reason else code
+
+
+def value_in(response: Response, name: str) -> Parameter:
+    """The parameter that comes with a success.
+
+    Raises:
+        Failed: none, or another.
+    """
+    try:
+        found = wire.decode_parameter(response.payload)
+    except WireError as error:
+        raise Failed(f"REP_SUCCESS with a ParameterMsg of {name}", f"one that can't be read: {error}") from error
+    expect(found.name == name, f"the value of {name}", f"that of {found.name!r}")
+    expect(found.value is not None, f"REP_SUCCESS with the value of {name} in force", "no value")
+    return found

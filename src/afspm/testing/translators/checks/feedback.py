@@ -1,0 +1,93 @@
+"""The z feedback: gains, setpoint, on and off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from afspm.model import ControlRequest, Feedback, names
+from afspm.testing.translators.registry import check
+from afspm.testing.translators.story import told
+from afspm.testing.translators.taking import Taking, number
+from afspm.testing.translators.verdicts import Failed, Skipped, expect, near
+
+_NUMBERS = {
+    "proportional_gain": names.ZCTRL_PGAIN,
+    "integral_gain": names.ZCTRL_IGAIN,
+    "setpoint": names.ZCTRL_SETPOINT,
+}
+_STEP = 1.02
+"""A tip that is not engaged does not mind, and neither would one that is."""
+
+
+def in_force(kit: Taking) -> Feedback:
+    """What was published last."""
+    feedback = kit.bench.story.newest(Feedback)
+    if feedback is None:
+        raise Failed("ZCtrlParameters at the start", told(kit.bench.story.all[:10]))
+    return feedback
+
+
+def set_and_require(kit: Taking, wanted: Feedback) -> None:
+    """Set what is given of it; the rest must stay as it is."""
+    kit.bench.come_to_rest()
+    before, mark = in_force(kit), kit.bench.story.mark()
+    given = {name: value for name, value in vars(wanted).items() if value is not None}
+    kit.bench.asked(ControlRequest.SET_ZCTRL_PARAMS, wanted, f"setting {', '.join(given)} of the feedback")
+    heard = kit.bench.settled(mark)
+    after = in_force(kit)
+    count = sum(isinstance(one.thing, Feedback) for one in heard)
+    expect(count == 1, "the new ZCtrlParameters once", told(heard))
+    require_same(replace(before, **given), after)
+
+
+def require_same(wanted: Feedback, came: Feedback) -> None:
+    """That both are the same, to a float32."""
+    for name, value in vars(wanted).items():
+        other = getattr(came, name)
+        if value is None or other is None or isinstance(value, bool):
+            expect(value == other, f"ZCtrlParameters with {name} = {value}", f"{other}")
+        else:
+            expect(near(value, other), f"ZCtrlParameters with {name} = {value:.6g}", f"{other:.6g}")
+
+
+def _stepped(kit: Taking, fields: Iterable[str]) -> Feedback:
+    now = in_force(kit)
+    values = {name: getattr(now, name) for name in fields if kit.support.has(_NUMBERS[name])}
+    values = {name: value * _STEP for name, value in values.items() if value}
+    if not values:
+        raise Skipped("they are not supported, or are 0, which can't be changed by a little")
+    return Feedback(**values)
+
+
+@check("feedback/numbers", "gains and setpoint are set and published")
+def numbers(kit: Taking) -> None:
+    set_and_require(kit, _stepped(kit, _NUMBERS))
+
+
+@check("feedback/one", "only the fields that are present are set: the integral gain", needs=(names.ZCTRL_IGAIN,))
+def one(kit: Taking) -> None:
+    set_and_require(kit, _stepped(kit, ["integral_gain"]))
+
+
+@check("feedback/as-parameters", "what is set of the feedback is what its parameters then say")
+def as_parameters(kit: Taking) -> None:
+    wanted = _stepped(kit, _NUMBERS)
+    set_and_require(kit, wanted)
+    for field, name in _NUMBERS.items():
+        value = getattr(wanted, field)
+        if value is not None:
+            came = number(kit.bench.get(name))
+            expect(near(came, value), f"{name} = {value:.6g}", f"{came:.6g}")
+
+
+@check("feedback/on-off", "the feedback is switched off and on, and published")
+def on_off(kit: Taking) -> None:
+    before = in_force(kit).on
+    if before is None:
+        raise Skipped("the microscope does not say whether its feedback is on")
+    for on in (not before, before):
+        set_and_require(kit, Feedback(on=on))
+        if kit.support.has(names.FEEDBACK_ON):
+            value = str(kit.bench.get(names.FEEDBACK_ON).value).lower()
+            expect(value == str(on).lower(), f"{names.FEEDBACK_ON} = {str(on).lower()}", value)

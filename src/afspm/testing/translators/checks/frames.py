@@ -1,0 +1,115 @@
+"""Setting where to scan."""
+
+from __future__ import annotations
+
+import math
+
+from afspm.model import (
+    ControlRequest,
+    Region,
+    RegionChange,
+    ScanParameters,
+    ScopeState,
+    ShapeChange,
+    names,
+)
+from afspm.testing.translators.checks.cancelling import states
+from afspm.testing.translators.frames import Frame, difference
+from afspm.testing.translators.registry import check
+from afspm.testing.translators.story import Heard, told
+from afspm.testing.translators.taking import Taking, number
+from afspm.testing.translators.verdicts import Failed, Skipped, expect, near
+
+_SIZES = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
+
+
+def ask_for(kit: Taking, wanted: ScanParameters) -> list[Heard]:
+    """Set what is wanted; what is published of it."""
+    kit.bench.come_to_rest()
+    mark = kit.bench.story.mark()
+    kit.bench.asked(ControlRequest.SET_SCAN_PARAMS, wanted, "setting a frame")
+    return kit.bench.settled(mark)
+
+
+def in_force(kit: Taking) -> Frame:
+    """The frame that was published last."""
+    newest = kit.bench.story.newest(ScanParameters)
+    if newest is None or not isinstance(newest.region, Region) or not isinstance(newest.shape, tuple):
+        raise Failed("ScanParameters2d with region and shape", str(newest))
+    return Frame(newest.region, newest.shape)
+
+
+def require_in_force(kit: Taking, frame: Frame) -> None:
+    """The frame that was published last is this."""
+    published = in_force(kit)
+    wrong = difference(frame.region, published.region)
+    if wrong:
+        raise Failed("ScanParameters2d of the frame that was set", wrong)
+    expect(published.shape == frame.shape, f"ScanParameters2d of {frame.shape} pixels", f"{published.shape}")
+
+
+def require_told_once(heard: list[Heard], kind: type, named: str) -> None:
+    """SS_MOVING, the new setting once, SS_FREE."""
+    right = f"SS_MOVING, {named} once, SS_FREE"
+    expect(states(heard) == ["SS_MOVING", "SS_FREE"], right, told(heard))
+    at = [i for i, one in enumerate(heard) if isinstance(one.thing, kind)]
+    free_at = max(i for i, one in enumerate(heard) if one.state is ScopeState.FREE)
+    expect(len(at) == 1 and at[0] < free_at, right, told(heard))
+
+
+@check("frame/set", "a frame that is set: SS_MOVING, ScanParameters2d as set, once, SS_FREE", needs=_SIZES)
+def set_whole(kit: Taking) -> None:
+    ask_for(kit, kit.frames.plain.request(kit.support))
+    heard = ask_for(kit, kit.frames.wide.request(kit.support))
+    require_told_once(heard, ScanParameters, "ScanParameters2d")
+    require_in_force(kit, kit.frames.wide)
+
+
+@check("frame/position-only", "only the fields that are present are set: the corner", needs=(names.SCAN_TOP_LEFT_X,))
+def position_only(kit: Taking) -> None:
+    ask_for(kit, kit.frames.wide.request(kit.support))
+    left, low = kit.frames.wide.region.top_left_m
+    moved_m = 0.05 * kit.frames.wide.region.size_m[0]
+    ask_for(kit, ScanParameters(RegionChange(left_m=left - moved_m, low_m=low + moved_m)))
+    center = kit.frames.wide.region.center_m
+    wanted = kit.frames.wide.region.moved_to((center[0] - moved_m, center[1] + moved_m))
+    require_in_force(kit, Frame(wanted, kit.frames.wide.shape))
+
+
+@check("frame/shape-only", "only the fields that are present are set: the pixels", needs=(names.SCAN_RESOLUTION_X,))
+def shape_only(kit: Taking) -> None:
+    ask_for(kit, kit.frames.wide.request(kit.support))
+    ask_for(kit, ScanParameters(shape=ShapeChange(rows=48)))
+    require_in_force(kit, Frame(kit.frames.wide.region, (48, kit.frames.wide.shape[1])))
+
+
+@check("frame/turned", "an angle is set as it was asked for, about the centre", needs=(names.SCAN_ANGLE,))
+def turned(kit: Taking) -> None:
+    ask_for(kit, kit.frames.turned.request(kit.support))
+    require_in_force(kit, kit.frames.turned)
+    straight = Region(kit.frames.turned.region.center_m, kit.frames.turned.region.size_m, 0.0)
+    ask_for(kit, ScanParameters(RegionChange(angle_rad=0.0)))
+    require_in_force(kit, Frame(straight, kit.frames.turned.shape))
+
+
+@check("frame/parameters", "a frame that is set is what its parameters then say", needs=_SIZES)
+def parameters(kit: Taking) -> None:
+    ask_for(kit, kit.frames.turned.request(kit.support))
+    region, (rows, columns) = kit.frames.turned.region, kit.frames.turned.shape
+    (left, low), (width, height) = region.top_left_m, region.size_m
+    wanted = {
+        names.SCAN_TOP_LEFT_X: (left, "m"),
+        names.SCAN_TOP_LEFT_Y: (low, "m"),
+        names.SCAN_SIZE_X: (width, "m"),
+        names.SCAN_SIZE_Y: (height, "m"),
+        names.SCAN_ANGLE: (math.degrees(region.angle_rad), "deg"),
+        names.SCAN_RESOLUTION_X: (columns, ""),
+        names.SCAN_RESOLUTION_Y: (rows, ""),
+    }
+    known = {name: value for name, value in wanted.items() if kit.support.has(name)}
+    if not known:
+        raise Skipped("the microscope has none of the frame's parameters")
+    for name, (value, unit) in known.items():
+        came = number(kit.bench.get(name), unit)
+        alike = near(came, value, absolute=1e-3 * width if unit == "m" else 0.1 if unit == "deg" else 0.0)
+        expect(alike, f"{name} = {value:.6g} {unit}".rstrip(), f"{came:.6g} {unit}".rstrip())

@@ -1,0 +1,47 @@
+"""Moving the probe."""
+
+from __future__ import annotations
+
+import math
+
+from afspm.model import ControlRequest, ProbePosition, names
+from afspm.testing.translators.checks.frames import require_told_once
+from afspm.testing.translators.frames import NEAR, in_words
+from afspm.testing.translators.registry import check
+from afspm.testing.translators.taking import Taking, number
+from afspm.testing.translators.verdicts import Failed, expect
+from afspm.wire.generated import spectroscopy_pb2
+
+_NEEDS = (names.PROBE_POS_X, names.PROBE_POS_Y)
+
+
+def require_place(kit: Taking, xy_m: tuple[float, float]) -> None:
+    """The probe is said to be there: as published, and by its parameters."""
+    newest = kit.bench.story.newest(ProbePosition)
+    if newest is None:
+        raise Failed("a ProbePosition", "none")
+    within_m = NEAR * min(kit.frames.whole.size_m)
+    expect(math.dist(newest.xy_m, xy_m) <= within_m, f"ProbePosition {in_words(xy_m)}", in_words(newest.xy_m))
+    x_m, y_m = (number(kit.bench.get(name), "m") for name in _NEEDS)
+    expect(math.dist((x_m, y_m), xy_m) <= within_m, f"probe-pos-x, -y {in_words(xy_m)}", in_words((x_m, y_m)))
+
+
+@check("probe/move", "the probe is moved: SS_MOVING, ProbePosition as set, once, SS_FREE", needs=_NEEDS)
+def move(kit: Taking) -> None:
+    kit.move_probe(kit.frames.plain.region.center_m)
+    heard = kit.move_probe(kit.frames.other.region.center_m)
+    require_told_once(heard, ProbePosition, "ProbePosition")
+    require_place(kit, kit.frames.other.region.center_m)
+
+
+@check("probe/one-axis", "only the coordinate that is present is set", needs=_NEEDS)
+def one_axis(kit: Taking) -> None:
+    kit.move_probe(kit.frames.other.region.center_m)
+    x_m, y_m = kit.frames.other.region.center_m
+    y_m += 0.1 * min(kit.frames.whole.size_m)
+    message = spectroscopy_pb2.ProbePosition(units="nm")
+    message.point.y = y_m * 1e9
+    mark = kit.bench.story.mark()
+    kit.bench.asked(ControlRequest.SET_PROBE_POS, message, "moving the probe in y, given in nm")
+    kit.bench.settled(mark)
+    require_place(kit, (x_m, y_m))

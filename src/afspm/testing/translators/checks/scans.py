@@ -1,0 +1,150 @@
+"""A scan that is taken to its end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
+from afspm.testing.translators.checks.cancelling import states
+from afspm.testing.translators.frames import difference
+from afspm.testing.translators.registry import check
+from afspm.testing.translators.story import told
+from afspm.testing.translators.taking import SCAN_S, Taken, Taking
+from afspm.testing.translators.verdicts import Failed, Skipped, expect
+
+_NEEDS = (names.START_SCAN,)
+CLOCK_S = 2.0
+"""Files have their times in whole seconds, and who wrote them may have done it a moment after the end."""
+_SLOWER, _EDGES_S = 5.0, 30.0
+
+
+@check("scan/order", "start-scan: SS_SCANNING, the Scan2d of every channel once, and only then SS_FREE", needs=_NEEDS)
+def order(kit: Taking) -> None:
+    require_order(kit.scan("plain").heard, ScopeState.SCANNING, Scan)
+
+
+def require_order(heard: list, begun: ScopeState, kind: type) -> None:  # type: ignore[type-arg]
+    """SS_<begun>, then results of a kind, then SS_FREE, and nothing else."""
+    results = [i for i, one in enumerate(heard) if isinstance(one.thing, kind)]
+    named = "Scan2d" if kind is Scan else "Spec1d"
+    right = f"SS_{begun.name}, {named} …, SS_FREE"
+    expect(states(heard) == [f"SS_{begun.name}", "SS_FREE"], right, told(heard))
+    first = next(i for i, one in enumerate(heard) if one.state is begun)
+    last = next(i for i, one in enumerate(heard) if one.state is ScopeState.FREE)
+    expect(all(first < i < last for i in results), right, told(heard))
+    again = [i for i, one in enumerate(heard) if isinstance(one.thing, ScopeStatus)]
+    expect(len(again) == 2, f"each state once: {right}", told(heard))
+
+
+@check("scan/channels", "every channel has a name of its own, and values everywhere", needs=_NEEDS)
+def channels(kit: Taking) -> None:
+    taken = kit.scan("plain")
+    found = [scan.channel for scan in taken.scans]
+    expect(len(set(found)) == len(found), "each channel once", ", ".join(found))
+    for scan in taken.scans:
+        expect(scan.channel.strip(), "a channel with a name", "one without")
+        missing = int(np.size(scan.values) - np.isfinite(scan.values).sum())
+        expect(missing == 0, f"values in all pixels of {scan.channel!r}", f"{missing} that are not finite")
+
+
+@check("scan/frame", "a scan says the frame that was set, and is of that many pixels", needs=_NEEDS)
+def frame(kit: Taking) -> None:
+    require_frame(kit.scan("plain"))
+
+
+def require_frame(taken: Taken) -> None:
+    """The scans are of the frame that was set."""
+    assert taken.frame is not None
+    for scan in taken.scans:
+        wrong = difference(taken.frame.region, scan.region)
+        if wrong:
+            raise Failed(f"a scan {scan.channel!r} of the frame that was set", wrong)
+        (rows, columns), (ny, nx) = taken.frame.shape, scan.shape
+        expect((ny, nx) == (rows, columns), f"{scan.channel!r} of {rows} rows and {columns} columns", f"{ny} and {nx}")
+
+
+@check("scan/in-force", "a scan's parameters are the ScanParameters2d that were in force", needs=_NEEDS)
+def as_published(kit: Taking) -> None:
+    taken = kit.scan("plain")
+    before = [one for one in kit.bench.story.all if isinstance(one.thing, ScanParameters)]
+    begun = taken.time_s(ScopeState.SCANNING)
+    in_force = [one.thing for one in before if one.time_ns is not None and one.time_ns <= begun * 1e9]
+    if not in_force:
+        raise Skipped("no ScanParameters2d was published before the scan")
+    wrong = difference(in_force[-1].region, taken.scans[0].region)
+    if wrong:
+        raise Failed("the region of the ScanParameters2d before it", wrong)
+
+
+@check("scan/time", "a scan says when it was finished", needs=_NEEDS)
+def time(kit: Taking) -> None:
+    taken = kit.scan("plain")
+    for scan in taken.scans:
+        require_time(scan.time_ns, taken, ScopeState.SCANNING, f"scan {scan.channel!r}")
+
+
+def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str) -> None:
+    """That it is of its end: not before, of its start, or on another clock."""
+    if time_ns is None:
+        raise Skipped(f"the {what} does not say when it was taken")
+    begin_s, end_s = taken.time_s(begun), taken.time_s(ScopeState.FREE)
+    lasted_s, before_end_s = end_s - begin_s, end_s - time_ns / 1e9
+    allowed_s = max(CLOCK_S, 0.4 * lasted_s)
+    if abs(before_end_s) <= allowed_s:
+        return
+    came = f"{before_end_s:.3g} s before it ended, {before_end_s - lasted_s:+.3g} s before it began"
+    if abs(before_end_s) > 600.0:
+        came += ": another time zone, or the controller's clock is wrong"
+    raise Failed(f"the time at which the {what} ended, which lasted {lasted_s:.3g} s", came)
+
+
+@check(
+    "scan/duration",
+    "a scan lasts about as long as its frame and scan-speed say",
+    needs=(names.START_SCAN, names.SCAN_SPEED),
+)
+def duration(kit: Taking) -> None:
+    taken = kit.scan("plain")
+    if taken.expected_s is None or taken.expected_s < SCAN_S / 2:
+        raise Skipped("the speed could not be set so low that it would be seen")
+    lasted_s = taken.time_s(ScopeState.FREE) - taken.time_s(ScopeState.SCANNING)
+    least_s, most_s = taken.expected_s / _SLOWER, taken.expected_s * _SLOWER + _EDGES_S
+    expect(
+        least_s <= lasted_s <= most_s,
+        f"a duration of about {taken.expected_s:.3g} s, as scan-speed says (is its unit right?)",
+        f"{lasted_s:.3g} s",
+    )
+
+
+@check("scan/again", "the same frame again is another scan, later than the first", needs=_NEEDS)
+def again(kit: Taking) -> None:
+    first = kit.scan("plain")
+    second = kit.take_scan(kit.frames.plain)
+    require_order(second.heard, ScopeState.SCANNING, Scan)
+    before, after = ({scan.channel for scan in taken.scans} for taken in (first, second))
+    expect(before == after, f"the channels {sorted(before)} again", f"{sorted(after)}")
+    for scan in second.scans:
+        if scan.time_ns is not None:
+            require_time(scan.time_ns, second, ScopeState.SCANNING, f"second scan {scan.channel!r}")
+        old = next(one for one in first.scans if one.channel == scan.channel)
+        if scan.filename:
+            expect(scan.filename != old.filename, f"a new file for {scan.channel!r}", f"{old.filename} again")
+        # a detector that is off gives the same zeros for ever
+        if np.ptp(old.values) > 0:
+            alike = old.values.shape == scan.values.shape and np.array_equal(old.values, scan.values)
+            same = alike and old.time_ns == scan.time_ns
+            expect(not same, f"new values for {scan.channel!r}", "those of the scan before, at the same time")
+
+
+@check("scan/not-square", "a frame wider than high, of other pixels, comes out as it was set", needs=_NEEDS)
+def not_square(kit: Taking) -> None:
+    require_frame(kit.scan("wide"))
+
+
+@check(
+    "scan/turned",
+    "a frame that is turned comes out as it was set, counter-clockwise",
+    needs=(names.START_SCAN, names.SCAN_ANGLE),
+)
+def turned(kit: Taking) -> None:
+    require_frame(kit.scan("turned"))

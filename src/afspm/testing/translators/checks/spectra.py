@@ -1,0 +1,85 @@
+"""A spectrum: broken off, and taken to its end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from afspm.model import ProbePosition, ScopeState, Spectrum, names
+from afspm.testing.translators.checks.cancelling import broken_off, states
+from afspm.testing.translators.checks.scans import CLOCK_S, require_order
+from afspm.testing.translators.frames import NEAR, in_words
+from afspm.testing.translators.registry import check
+from afspm.testing.translators.story import spectra, told
+from afspm.testing.translators.taking import Taking
+from afspm.testing.translators.verdicts import Failed, Skipped, expect
+
+_NEEDS = (names.START_SPEC,)
+
+
+@check(
+    "spectrum/cancel",
+    "stop-spec breaks a spectrum off: SS_INTERRUPTED, SS_FREE, and no spectrum",
+    needs=(names.START_SPEC, names.STOP_SPEC),
+)
+def cancel(kit: Taking) -> None:
+    mark = kit.begin_spectrum()
+    if kit.bench.state is not ScopeState.SPEC:
+        raise Skipped("a spectrum is over sooner than it could be stopped")
+    heard = broken_off(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
+    expect(not spectra(heard), "no Spec1d of a spectrum that was stopped", told(heard))
+
+
+@check("spectrum/stop-nothing", "stop-spec while nothing runs is a success, and changes nothing", (names.STOP_SPEC,))
+def stop_nothing(kit: Taking) -> None:
+    kit.bench.come_to_rest()
+    mark = kit.bench.story.mark()
+    kit.bench.act(names.STOP_SPEC)
+    heard = kit.bench.settled(mark)
+    expect(not states(heard), "no state after stopping nothing", told(heard))
+
+
+@check("spectrum/order", "start-spec: SS_SPEC, the Spec1d, and only then SS_FREE", needs=_NEEDS)
+def order(kit: Taking) -> None:
+    taken = kit.spectrum()
+    require_order(taken.heard, ScopeState.SPEC, Spectrum)
+
+
+@check("spectrum/values", "a spectrum has a kind, variables of different names, and values", needs=_NEEDS)
+def values(kit: Taking) -> None:
+    for spectrum in kit.spectrum().spectra:
+        expect(spectrum.kind.strip(), "a spectrum that says its type", "an empty type")
+        expect(len(set(spectrum.names)) == len(spectrum.names) >= 2, "two variables or more, of different names",
+               ", ".join(spectrum.names) or "none")  # fmt: skip
+        expect(len(spectrum.values) >= 2, "two points or more", f"{len(spectrum.values)}")
+        for name, column in zip(spectrum.names, spectrum.values.T, strict=True):
+            expect(bool(np.isfinite(column).any()), f"values of {name!r}", "none that is finite")
+
+
+@check("spectrum/position", "a spectrum says where the probe was", needs=(*_NEEDS, names.PROBE_POS_X))
+def position(kit: Taking) -> None:
+    wanted = kit.frames.other.region.center_m
+    for spectrum in kit.spectrum().spectra:
+        if spectrum.position_m is None:
+            raise Failed(f"a spectrum at {in_words(wanted)}", "one without a position")
+        apart_m = math.dist(spectrum.position_m, wanted)
+        within_m = NEAR * min(kit.frames.whole.size_m)
+        expect(apart_m <= within_m, f"a spectrum at {in_words(wanted)}", in_words(spectrum.position_m))
+    where = kit.bench.story.newest(ProbePosition)
+    expect(where is not None, "a ProbePosition", "none")
+
+
+@check("spectrum/time", "a spectrum says when it was taken", needs=_NEEDS)
+def time(kit: Taking) -> None:
+    taken = kit.spectrum()
+    begin_s, end_s = taken.time_s(ScopeState.SPEC), taken.time_s(ScopeState.FREE)
+    for spectrum in taken.spectra:
+        if spectrum.time_ns is None:
+            raise Skipped("the spectrum does not say when it was taken")
+        at_s = spectrum.time_ns / 1e9
+        expect(
+            begin_s - CLOCK_S <= at_s <= end_s + CLOCK_S,
+            f"a time between the spectrum's begin and its end {end_s - begin_s:.3g} s later",
+            f"{at_s - begin_s:+.6g} s from its begin",
+        )

@@ -1,0 +1,110 @@
+"""A pytest plugin: an experiment file that is given to pytest by name becomes a test for each check.
+
+    pytest -p afspm.testing.translators.plugin experiment.toml [--overlay FILE] [--without-process NAME]
+
+Nothing loads it by itself: who has afspm installed and runs tests of their own is not disturbed by it. In the tests of
+a translator's package: `addopts = ["-p", "afspm.testing.translators.plugin"]` and `testpaths = ["tests",
+"experiment.toml"]`. The tip is taken to be withdrawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.testing.translators import runner, session
+from afspm.testing.translators.registry import Check, all_checks
+from afspm.testing.translators.report import Outcome, Report, Result
+from afspm.testing.translators.taking import Taking
+from afspm.testing.translators.verdicts import Lost
+
+_REPORTS = pytest.StashKey[list[Report]]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("afspm translators")
+    group.addoption("--overlay", action="append", default=[], metavar="FILE", help="laid over the experiment file")
+    group.addoption("--without-process", action="append", default=[], metavar="NAME", help="runs already: is joined")
+    group.addoption("--runs", default="runs", metavar="DIR", help="where to make the run's folder")
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """An experiment file that was named, and not any that lies about."""
+    if file_path.suffix == ".toml" and parent.session.isinitpath(file_path):
+        return Experiment.from_parent(parent, path=file_path)
+    return None
+
+
+class Experiment(pytest.File):
+    """The checks of one experiment file; they share one pass of its processes."""
+
+    def collect(self) -> Iterable[pytest.Item]:
+        for check in all_checks():
+            yield CheckItem.from_parent(self, name=check.name, check=check)
+
+    def setup(self) -> None:
+        option = self.config.option
+        self._stack = ExitStack()
+        self.report = Report()
+        self.config.stash.setdefault(_REPORTS, []).append(self.report)
+        options = session.Options((self.path, *map(Path, option.overlay)), option.without_process, Path(option.runs))
+        try:
+            opened = self._stack.enter_context(session.opened(options))
+        except Lost as lost:
+            self.report.lost = str(lost)
+            pytest.fail(str(lost), pytrace=False)
+        vars(self.report).update(vars(runner.begin_report(opened)))
+        self.kit: Taking = self._stack.enter_context(runner.restored(opened, self.report))
+
+    def teardown(self) -> None:
+        self._stack.close()
+        if self.report.folder:
+            file = Path(self.report.folder) / runner.REPORT_FILE
+            file.write_text(self.report.to_json(), encoding="utf-8")
+        if self.report.unrestored:
+            pytest.fail("not restored: " + "; ".join(self.report.unrestored), pytrace=False)
+
+
+class CheckItem(pytest.Item):
+    """One check."""
+
+    def __init__(self, *, check: Check, **given: Any) -> None:
+        super().__init__(**given)
+        self._check = check
+
+    def runtest(self) -> None:
+        assert isinstance(self.parent, Experiment)
+        report = self.parent.report
+        if report.lost:
+            pytest.fail(report.lost, pytrace=False)
+        try:
+            result: Result = runner.do(self._check, self.parent.kit)
+        except Lost as lost:
+            report.lost = str(lost)
+            pytest.fail(report.lost, pytrace=False)
+        report.results.append(result)
+        if result.outcome is Outcome.SKIPPED:
+            pytest.skip(result.line)
+        if result.outcome is Outcome.FAILED:
+            pytest.fail(result.line, pytrace=False)
+
+    def reportinfo(self) -> tuple[Path, None, str]:
+        return self.path, None, f"{self._check.name}: {self._check.title}"
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """What is supported and what is not."""
+    from rich.console import Console
+
+    from afspm.testing.translators.showing import show_end
+
+    for report in config.stash.get(_REPORTS, []):
+        console = Console(width=120, highlight=False)
+        with console.capture() as capture:
+            show_end(report, console)
+        terminalreporter.section(report.translator or "translator")
+        terminalreporter.write(capture.get())

@@ -1,0 +1,77 @@
+"""Translator, scheduler and emulated controller as real processes: started once, never again, and ended for certain."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from queue import Empty, SimpleQueue
+
+from afspm.clock import Clock
+from afspm.experiment import Start
+from afspm.supervisor.log import LineReader, RunLog
+from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed, describe_exit
+from afspm.supervisor.task import from_start
+
+ASKED_S, KILLED_S = 5.0, 3.0
+
+
+class Processes:
+    """Running processes of which none may end by itself.
+
+    Args:
+        log: gets what they print.
+        woken: called, from any thread, when one of them has ended.
+    """
+
+    def __init__(self, starts: Sequence[Start], log: RunLog, clock: Clock, woken: Callable[[], None]) -> None:
+        self._log, self._clock, self._woken = log, clock, woken
+        self._readers = {start.launch.name: LineReader() for start in starts}
+        self._exits: SimpleQueue[Exited] = SimpleQueue()
+        self._writing = threading.Lock()
+        self._ended: dict[str, str] = {}
+        self._running: dict[str, ChildProcess] = {}
+        for start in starts:
+            task = from_start(start)
+            self._running[task.name] = ChildProcess(
+                task.name, task.command, task.launch.to_json(), self._tell, task.environment, task.folder
+            )
+
+    @property
+    def ended(self) -> str:
+        """Which of them have ended, and how; empty while all run."""
+        return "; ".join(f"the process {name} {how}" for name, how in self._ended.items())
+
+    def close(self) -> None:
+        """End all that still run: they are asked first, and killed if that does not help."""
+        for process in self._running.values():
+            process.close_stdin()
+        self._await(ASKED_S)
+        for name, process in self._running.items():
+            if name not in self._ended:
+                self._write(name, logging.WARNING, "does not end: killed")
+                process.kill()
+        self._await(KILLED_S)
+
+    def _await(self, within_s: float) -> None:
+        until_s = self._clock.monotonic_s() + within_s
+        while len(self._ended) < len(self._running) and (left_s := until_s - self._clock.monotonic_s()) > 0.0:
+            with contextlib.suppress(Empty):
+                self._exits.get(timeout=left_s)
+
+    def _tell(self, event: ChildEvent) -> None:
+        """Called in the threads of the processes."""
+        match event:
+            case Printed():
+                level, text = self._readers[event.name].read(event.stream, event.line)
+                self._write(event.name, level, text)
+            case Exited():
+                said = self._readers[event.name].last_error
+                self._ended[event.name] = f"{describe_exit(event.code)}{f' ({said})' if said else ''}"
+                self._exits.put(event)
+                self._woken()
+
+    def _write(self, name: str, level: int, text: str) -> None:
+        with self._writing:
+            self._log.write(name, level, text)

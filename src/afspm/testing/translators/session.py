@@ -1,0 +1,198 @@
+"""Translator and scheduler of an experiment file, started or joined, and a connection to them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+from afspm.clock import ExperimentClock
+from afspm.errors import ConfigError
+from afspm.experiment import Experiment, Role, Start, load
+from afspm.experiment.parts import EMULATED
+from afspm.runtime.component import Component
+from afspm.runtime.launch import Launch
+from afspm.runtime.link import Link
+from afspm.supervisor import common_clock, run_folder
+from afspm.supervisor.log import SUPERVISOR, RunLog
+from afspm.supervisor.ports import FreePorts
+from afspm.testing.translators.bench import Bench
+from afspm.testing.translators.processes import Processes
+from afspm.testing.translators.support import Support, find_out
+from afspm.transport.launching import open_port
+
+NAME = "translator_test"
+SPEED = 20.0
+"""Experiment seconds in a real second where the microscope is simulated: quick, and slow enough to stop a scan."""
+_OVERLAY = f"""
+[{NAME}]
+component = true
+class = "{__name__}.Tester"
+"""
+_SCHEDULER = """
+[scheduler]
+component = true
+class = "Scheduler"
+"""
+
+
+class Tester(Component):
+    """Whom the checks are in the experiment. It is wired like any other component, and not started as one."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to check.
+
+    Attributes:
+        files: the experiment file, and those laid over it.
+        without: processes that run already, at the addresses that the file gives, and are joined.
+        runs: the folder of run folders.
+        speed: of the clock of a simulated microscope; experiment seconds in a real second.
+        only: parts of the names of the checks to do; empty: all.
+    """
+
+    files: Sequence[Path]
+    without: Collection[str] = ()
+    runs: Path = Path("runs")
+    speed: float = SPEED
+    only: Collection[str] = ()
+
+
+@dataclass
+class Session:
+    """What is there to check.
+
+    Attributes:
+        support: what the microscope has.
+        translator: its class or command.
+        folder: of this run.
+    """
+
+    bench: Bench
+    support: Support
+    translator: str
+    simulated: bool
+    folder: Path
+
+
+def prepare(options: Options) -> Experiment:
+    """The experiment with the tester in it, and a scheduler if it had none.
+
+    Raises:
+        ConfigError: it can't be run, has no translator, or is in sample coordinates.
+    """
+    own = load(*options.files)
+    overlay = _OVERLAY if own.resolved.with_role(Role.SCHEDULER) else _OVERLAY + _SCHEDULER
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "tester.toml"
+        file.write_text(overlay, encoding="utf-8")
+        experiment = load(*options.files, file)
+        experiment.require_valid()
+    translators = experiment.resolved.with_role(Role.TRANSLATOR)
+    if len(translators) != 1:
+        raise ConfigError(f"there are {len(translators)} translators, not one", where=str(options.files[0]))
+    return experiment
+
+
+@contextmanager
+def opened(options: Options) -> Iterator[Session]:
+    """Start, or join, what is to be checked; in control of the microscope while in the block.
+
+    Raises:
+        ConfigError: the experiment file or the options are wrong; nothing was started.
+        Lost: it did not start.
+    """
+    experiment = prepare(options)
+    resolved = experiment.resolved
+    (translator,) = resolved.with_role(Role.TRANSLATOR)
+    clock = _clock(experiment, options)
+    folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
+    own, starts = _starts(experiment, options, clock, folder)
+    log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
+    run_folder.write_experiment(folder, experiment.expanded())
+    port = open_port(own, clock)
+    processes = Processes(starts, log, clock, port.wake_up)
+    try:
+        link = Link(
+            port,
+            NAME,
+            source=own.sockets.subscribe[0],
+            session=os.urandom(4).hex(),
+            request_timeout_s=own.request_timeout_s,
+            request_retries=own.request_retries,
+            log=_logger(log),
+        )
+        bench = Bench(link, lambda: processes.ended)
+        bench.begin()
+        abilities = resolved.abilities(translator)
+        actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
+        support = find_out(bench, sorted(actions), sorted(parameters))
+        named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
+        yield Session(bench, support, named, resolved.simulated, folder)
+        bench.end()
+    finally:
+        port.close()
+        processes.close()
+        log.close()
+
+
+_NOTHING = logging.CRITICAL + 1
+
+
+def _starts(
+    experiment: Experiment, options: Options, clock: ExperimentClock, folder: Path
+) -> tuple[Launch, list[Start]]:
+    """The tester's own launch line, and what is to be started."""
+    resolved = experiment.resolved
+    wanted = {part.name for role in (Role.TRANSLATOR, Role.SCHEDULER) for part in resolved.with_role(role)}
+    wanted |= {name for name, found in resolved.classes.items() if getattr(found, EMULATED, False) is True}
+    starts = experiment.launches(
+        take_address=FreePorts().address,
+        without=[name for name in experiment.component_names if name not in {*wanted, NAME} or name in options.without],
+        clock=clock.as_dict(),
+        run_dir=str(folder),
+        state_dir=str(folder / run_folder.STATE_DIR),
+        log_level="DEBUG",
+    )
+    own = next(start.launch for start in starts if start.launch.name == NAME)
+    if own.sample_coordinates:
+        raise ConfigError(
+            "a translator is checked in tip coordinates, and this scheduler has the sample's",
+            where=str(options.files[0]),
+            hint='lay a file over it with [scheduler] class = "Scheduler"',
+        )
+    return own, [start for start in starts if start.launch.name != NAME]
+
+
+def _clock(experiment: Experiment, options: Options) -> ExperimentClock:
+    """The scheduler's, where that runs already; else our own."""
+    if not experiment.resolved.simulated:
+        return ExperimentClock.real()
+    schedulers = {part.name for part in experiment.resolved.with_role(Role.SCHEDULER)}
+    if schedulers <= set(options.without):
+        launch = experiment.asking([NAME])
+        if launch is not None:
+            return common_clock.of_scheduler(launch, logging.getLogger(__name__).warning)
+    return replace(experiment.clock(), speed=options.speed)
+
+
+def _now() -> datetime:
+    return datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone()
+
+
+def _logger(log: RunLog) -> logging.Logger:
+    """What the connection itself has to say goes into the run's log, too."""
+    logger = logging.Logger("afspm.translator_test")
+
+    class Writing(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            log.write(SUPERVISOR, record.levelno, record.getMessage())
+
+    logger.addHandler(Writing())
+    return logger

@@ -1,0 +1,80 @@
+"""What a microscope has of the generic actions and parameters, asked over the wire."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from afspm.model import ControlRequest, ControlResponse, Parameter, names
+from afspm.testing.translators.bench import Bench, answer_in_words, value_in
+from afspm.testing.translators.verdicts import Failed
+
+ACTIONS = names.BASE_ACTIONS + names.EXTENSION_ACTIONS
+PARAMETERS = (*names.BASE_PARAMETERS, *names.EXTENSION_PARAMETERS, names.DRIFT_RATE_X, names.DRIFT_RATE_Y)
+
+
+@dataclass
+class Support:
+    """What there is, by generic name.
+
+    Attributes:
+        actions: whether it is supported; None if the microscope does not say.
+        parameters: the value in force at the beginning; None if it is not supported.
+        errors: what was wrong with the answers.
+        settable: what the checks have found out; None: not tried.
+    """
+
+    actions: dict[str, bool | None] = field(default_factory=dict)
+    parameters: dict[str, Parameter | None] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+    settable: dict[str, bool | None] = field(default_factory=dict)
+
+    def missing(self, needs: Iterable[str]) -> list[str]:
+        """Those of `needs` that the microscope does not have."""
+        known = {**self.parameters, **{name: has or has is None for name, has in self.actions.items()}}
+        return [name for name in needs if not known.get(name)]
+
+    def has(self, *wanted: str) -> bool:
+        """Whether it has all of these."""
+        return not self.missing(wanted)
+
+    @property
+    def controller(self) -> str:
+        """The controller's name and version, as it says."""
+        told = self.parameters.get(names.CONTROLLER)
+        return "" if told is None else str(told.value)
+
+
+def find_out(bench: Bench, actions: Iterable[str] = (), parameters: Iterable[str] = ()) -> Support:
+    """Ask for all generic names, and those of the microscope's own."""
+    found = Support()
+    for name in dict.fromkeys((*ACTIONS, *actions)):
+        found.actions[name] = _has_action(bench, name, found.errors)
+    for name in dict.fromkeys((*PARAMETERS, *parameters)):
+        found.parameters[name] = _value(bench, name, found.errors)
+        found.settable[name] = None
+    return found
+
+
+def _has_action(bench: Bench, name: str, errors: list[str]) -> bool | None:
+    response = bench.ask(ControlRequest.ACTION_SUPPORT, name)
+    if response.code == ControlResponse.CMD_NOT_SUPPORTED:
+        return None
+    if not response.ok and response.code != ControlResponse.ACTION_NOT_SUPPORTED:
+        expected = f"REP_SUCCESS or REP_ACTION_NOT_SUPPORTED to asking for {name}"
+        errors.append(str(Failed(expected, answer_in_words(response))))
+    return response.ok
+
+
+def _value(bench: Bench, name: str, errors: list[str]) -> Parameter | None:
+    response = bench.ask(ControlRequest.PARAM, Parameter(name))
+    if response.code in (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED):
+        return None
+    try:
+        if not response.ok:
+            expected = f"REP_SUCCESS or REP_PARAM_NOT_SUPPORTED to getting {name}"
+            raise Failed(expected, answer_in_words(response))
+        return value_in(response, name)
+    except Failed as failure:
+        errors.append(str(failure))
+        return None
