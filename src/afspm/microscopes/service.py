@@ -13,7 +13,7 @@ from afspm.errors import ConfigError, Refused
 from afspm.microscopes.changes import asked_for, wanted_values
 from afspm.microscopes.in_force import FRAME, MOVES, check_together, of_message
 from afspm.microscopes.microscope import LOST, Action, Microscope
-from afspm.microscopes.parameters import Value, refuse_value
+from afspm.microscopes.parameters import ParameterTable, Value, refuse_value
 from afspm.microscopes.sequence import Sequence, Step
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState
 from afspm.wire import encode
@@ -57,11 +57,15 @@ class Service:
         log: logging.Logger,
     ) -> None:
         self._microscope = microscope
-        self._table = microscope.table
         self._sequence = sequence
         self._about_to_act = about_to_act
         self._log = log
         self.actions = microscope.own_actions() | self._added_actions(microscope.added_actions)
+
+    @property
+    def _table(self) -> ParameterTable:
+        """What the microscope has may only be known once it is connected."""
+        return self._microscope.table
 
     def answer(self, request: Request) -> Answer:
         """The answer to a request, whatever is wrong with it or with the controller."""
