@@ -1,0 +1,258 @@
+"""GXSM, versions 3 and 4: over Gxsm4's shared memory, or a script in the console. See the README beside this."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.errors import ConfigError, Refused
+from afspm.microscopes.gxsm.activity import Activity
+from afspm.microscopes.gxsm.frame import REFNAMES, Frame, number, send, user_unit_m
+from afspm.microscopes.gxsm.hardware import APPROACH, AUTOSAVE_OFF, Hardware, available, execute, recognised
+from afspm.microscopes.gxsm.harvest import Harvest
+from afspm.microscopes.gxsm.link import Address, Asking, open_link
+from afspm.microscopes.in_force import POSITION
+from afspm.microscopes.microscope import ControllerLost, Microscope, action
+from afspm.microscopes.parameters import FEEDBACK_ON, Value
+from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.units import Duration
+
+_OWN: Final = (*Frame.names, *POSITION, FEEDBACK_ON, names.SPEC_KIND, names.CONTROLLER)
+"""What no single one of GXSM's parameters stands for."""
+_SAVERS: Final = ("afspm", "gxsm")
+
+
+class Gxsm(Microscope):
+    """The microscope behind GXSM.
+
+    Args:
+        address: "HOST:PORT" of `bridge.py` in GXSM's console; "shm" for the shared memory of a Gxsm4 on this computer,
+            "shm:BLOCK@PROCESS" if that or its process is not called as usual.
+        saving: "afspm": GXSM's Auto Save is switched off, and it is told to save once after each scan; "gxsm": its
+            Auto Save is left on, and its files are waited for.
+        hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
+        scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
+        reply_timeout_s: how long an answer may take, in real time.
+        parameters, actions, poll_period_s, result_timeout_s: as for every microscope.
+    """
+
+    parameters_file = Path(__file__).with_name("parameters.toml")
+    max_pixels: ClassVar[int] = 8192 * 8192
+
+    def __init__(
+        self,
+        *,
+        address: str = "127.0.0.1:65431",
+        saving: str = "afspm",
+        hardware: str | None = None,
+        scan_dir: str | None = None,
+        probe_dir: str | None = None,
+        reply_timeout_s: Duration = 5.0,
+        parameters: Mapping[str, Mapping[str, Any]] | None = None,
+        actions: Mapping[str, Mapping[str, Any]] | None = None,
+        poll_period_s: Duration = 0.1,
+        result_timeout_s: Duration = 10.0,
+    ) -> None:
+        super().__init__(
+            parameters=parameters, actions=actions, poll_period_s=poll_period_s, result_timeout_s=result_timeout_s
+        )
+        kinds = [kind.value for kind in Hardware]
+        if hardware is not None and hardware not in kinds:
+            raise ConfigError(f"there is no {hardware!r}", where="hardware", hint=f"there are {', '.join(kinds)}")
+        if saving not in _SAVERS:
+            raise ConfigError(f"{saving!r} saves nothing", where="saving", hint=f"{' or '.join(_SAVERS)}")
+        self._address = Address.parse(address)
+        self._saves = saving == "afspm"
+        self._given_hardware = hardware
+        self._scan_dir, self._probe_dir = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
+        self._reply_timeout_s = reply_timeout_s
+        self._whole_table = self.table
+        self._refs: dict[str, str] = {}
+        self._set: dict[str, Value] = {}
+        self._asking: Asking | None = None
+
+    def connect(self) -> None:
+        """The link; what this GXSM has, in which unit it has it, and how it saves."""
+        self.close()
+        ask = self._asking = Asking(open_link(self._address, self._reply_timeout_s, self.clock.monotonic_s))
+        self._refnames, self._actions = ask.names("list_refnames"), ask.names("list_actions")
+        missing = [ref for ref in REFNAMES if ref not in self._refnames]
+        if missing:
+            raise ControllerLost(f"this GXSM has no {', '.join(missing)}", where="list_refnames")
+        found = recognised(self._refnames, self._actions)
+        self._hardware = Hardware(self._given_hardware) if self._given_hardware else found
+        self._find_parameters()
+        self._frame = Frame(ask, user_unit_m(ask))
+        if self._saves and AUTOSAVE_OFF in self._actions:
+            ask.call("action", AUTOSAVE_OFF)
+        self._kept: dict[str, Any] = self.memory.setdefault("kept", {names.SPEC_KIND: "IV", "probe": None})
+        self._harvest = Harvest(self.memory, self.result_timeout_s / 2, self.log, rewritten=not self._saves)
+        self._activity = Activity(
+            ask,
+            self._hardware,
+            self._frame,
+            self._harvest,
+            self.clock,
+            self.log,
+            saves=self._saves,
+            scan_dir=self._scan_dir,
+            probe_dir=self._probe_dir,
+        )
+
+    def _find_parameters(self) -> None:
+        vendors = {name: spec.vendor for name, spec in self._whole_table.items() if name not in _OWN}
+        self._refs = available(vendors, self._refnames)
+        lacking = sorted(vendors.keys() - self._refs.keys())
+        self.table = self._whole_table.without(lacking)
+        self.log.info("GXSM with the hardware %s; unsupported: %s", self._hardware.value, ", ".join(lacking) or "none")
+
+    def close(self) -> None:
+        """Let go of the link. What was begun goes on."""
+        if self._asking is not None:
+            self._asking.close()
+            self._asking = None
+
+    @property
+    def _ask(self) -> Asking:
+        if self._asking is None:
+            raise ControllerLost("GXSM is not connected")
+        return self._asking
+
+    def status(self) -> ScopeStatus:
+        """What GXSM is doing now."""
+        return self._activity.status()
+
+    def next_change_s(self) -> float | None:
+        """When a move or the wait for files is over."""
+        return self._activity.next_change_s()
+
+    # --- parameters ---
+
+    def read(self, wanted: Collection[str]) -> dict[str, Value]:
+        """What is in force: as it was set, where GXSM has the same to its precision."""
+        found: dict[str, Value] = {}
+        if not set(Frame.names).isdisjoint(wanted):
+            found.update(self._frame.read())
+        if not set(POSITION).isdisjoint(wanted):
+            found.update(zip(POSITION, self._probe_m(), strict=True))
+        if FEEDBACK_ON in wanted:
+            found[FEEDBACK_ON] = self._activity.doing().feedback_on
+        found[names.SPEC_KIND] = str(self._kept[names.SPEC_KIND])
+        found[names.CONTROLLER] = f"GXSM ({self._hardware.value})"
+        found.update(super().read([name for name in wanted if name not in found]))
+        return {name: self._as_set(name, found[name]) for name in wanted}
+
+    def _as_set(self, name: str, value: Value) -> Value:
+        known = self._set.get(name, value)
+        return known if self.table[name].same(value, known) else value
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        """The frame first, which the tip's place depends on."""
+        framed = {name: value for name, value in values.items() if name in Frame.names}
+        if framed:
+            self._frame.write(framed)
+        position = {name: float(value) for name, value in values.items() if name in POSITION}
+        if position:
+            x, y = (position.get(name, before) for name, before in zip(POSITION, self._probe_m(), strict=True))
+            self._send_probe((x, y))
+        if names.SPEC_KIND in values:
+            self._kept[names.SPEC_KIND] = values[names.SPEC_KIND]
+        own = {*framed, *position, names.SPEC_KIND}
+        super().write({name: value for name, value in values.items() if name not in own})
+        self._set.update(values)
+
+    def get(self, vendor: str) -> Value:
+        """By GXSM's name."""
+        return number(self._ask, self._there(vendor))
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        """By GXSM's names, one after the other."""
+        for vendor, value in values.items():
+            send(self._ask, self._there(vendor), float(value))
+
+    def _there(self, vendor: str) -> str:
+        """Of the names that a parameter may have, the one that this GXSM has: it does not say of others that it has
+        them not."""
+        there = available({"": vendor}, self._refnames)
+        if not there:
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"this GXSM has no parameter {vendor!r}")
+        return there[""]
+
+    def _probe_m(self) -> tuple[float, float]:
+        """Where the tip was sent; GXSM's files of spectra do not tell."""
+        kept = self._kept["probe"]
+        return self._frame.tip() if kept is None else (float(kept[0]), float(kept[1]))
+
+    def _send_probe(self, xy_m: tuple[float, float]) -> None:
+        way_s = self._way_s(xy_m)
+        self._frame.move_tip(xy_m)
+        self._kept["probe"] = list(xy_m)
+        self._activity.sets_out(way_s)
+
+    def _way_s(self, xy_m: tuple[float, float]) -> float:
+        """How long the tip may take from where it was sent last; none if GXSM does not tell its speed."""
+        if names.MOVE_SPEED not in self._refs:
+            return 0.0
+        speed_m_s = float(super().read([names.MOVE_SPEED])[names.MOVE_SPEED])
+        return math.dist(self._probe_m(), xy_m) / speed_m_s if speed_m_s > 0.0 else 0.0
+
+    # --- results ---
+
+    def results(self) -> Sequence[str]:
+        """The last scans and spectra that GXSM saved."""
+        return self._harvest.results(self.clock.now_s())
+
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        """Read the files of one."""
+        return self._harvest.load(result)
+
+    # --- actions ---
+
+    @action(names.START_SCAN)
+    def start_scan(self) -> None:
+        """Scan the frame once, with the channels and the direction of GXSM's panel."""
+        self._activity.start_scan()
+
+    @action(names.STOP_SCAN)
+    def stop_scan(self) -> None:
+        """Break the scan off."""
+        self._activity.stop_scan()
+
+    @action(names.START_SPEC)
+    def start_spec(self) -> None:
+        """Take a spectrum of the kind `x-spec-kind` where the probe was sent to last: it is sent there again, since a
+        scan has moved it."""
+        kind = str(self._kept[names.SPEC_KIND])
+        self._refuse_missing(execute(kind))
+        position_m = self._probe_m()
+        region = self._frame.region()
+        reach_m = math.hypot(*region.size_m)
+        speed_m_s = float(super().read([names.MOVE_SPEED])[names.MOVE_SPEED]) if names.MOVE_SPEED in self._refs else 0.0
+        self._activity.start_curve(kind, position_m, reach_m / speed_m_s if speed_m_s > 0.0 else 0.0)
+
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        """Break the spectrum off."""
+        self._activity.stop_curve(self._actions)
+
+    @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
+    def engage(self) -> None:
+        """The auto approach."""
+        self._refuse_missing(APPROACH)
+        self._ask.call("action", APPROACH)
+
+    def command(self, text: str) -> None:
+        """One of GXSM's actions, e.g. "DSP_CMD_STOPALL"."""
+        self._refuse_missing(text)
+        self._ask.call("action", text)
+
+    def _refuse_missing(self, name: str) -> None:
+        """GXSM says 0 to actions that it does not have."""
+        if name not in self._actions:
+            reason = f"this GXSM has no action {name!r} with its hardware ({self._hardware.value})"
+            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
+
+
+__all__ = ["AfspmError", "Gxsm", "GxsmError"]

@@ -1,0 +1,188 @@
+"""What GXSM is doing. It never says that something began or ended: that is seen by looking."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Final
+
+from afspm.clock import Clock
+from afspm.errors import Refused
+from afspm.microscopes.gxsm.errors import GxsmError
+from afspm.microscopes.gxsm.frame import Frame
+from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
+from afspm.microscopes.gxsm.harvest import SCAN, Harvest
+from afspm.microscopes.gxsm.link import Asking
+from afspm.model import ControlResponse, ScopeState, ScopeStatus
+
+_SHOWS_S: Final = 1.0
+"""So long, in experiment time, what was begun may take to be seen running; 0.3 s were measured."""
+_CHANNELS: Final = 40
+_NO_CHANNEL: Final = "EE:"
+
+
+class Activity:
+    """See the module.
+
+    Args:
+        ask: GXSM.
+        frame: of the next scan.
+        saves: whether GXSM is told to save a scan at its end; if not, it does so by itself.
+        scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
+    """
+
+    def __init__(
+        self,
+        ask: Asking,
+        hardware: Hardware,
+        frame: Frame,
+        harvest: Harvest,
+        clock: Clock,
+        log: logging.Logger,
+        *,
+        saves: bool,
+        scan_dir: Path | None,
+        probe_dir: Path | None,
+    ) -> None:
+        self._ask = ask
+        self._hardware = hardware
+        self._frame = frame
+        self._harvest = harvest
+        self._clock = clock
+        self._log = log
+        self._saves = saves
+        self._scan_dir, self._probe_dir = scan_dir, probe_dir
+        self._stopping = False
+        self._execute = ""
+        self._shows_until_s = self._arrives_s = 0.0
+
+    # --- what is begun ---
+
+    def start_scan(self) -> None:
+        """Scan the frame."""
+        self._begin_scan(self._clock.now_ns())
+        self._shows_until_s = self._clock.now_s() + _SHOWS_S
+        self._ask.call("startscan")
+
+    def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
+        """Send the tip to where a spectrum is to be taken, and take it when it is there.
+
+        Args:
+            way_s: how long it may be on its way, in experiment time.
+
+        Raises:
+            Refused: the position is out of the tip's reach.
+        """
+        self._frame.move_tip(position_m)
+        self.sets_out(way_s)
+        self._begin_curve(kind, position_m)
+        self._execute = execute(kind)
+
+    def stop_scan(self) -> None:
+        """Break the scan off."""
+        self._ask.call("stopscan")
+        self._stop()
+
+    def stop_curve(self, actions: frozenset[str]) -> None:
+        """Break the spectrum off.
+
+        Raises:
+            Refused: ACTION_NOT_SUPPORTED: this hardware can't.
+        """
+        if not self._execute:
+            if ABORT not in actions:
+                reason = f"GXSM has no action to break a spectrum off with this hardware ({self._hardware.value})"
+                raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
+            self._ask.call("action", ABORT)
+        self._stop()
+
+    def sets_out(self, way_s: float) -> None:
+        """The tip was sent away, and arrives after so long, experiment time."""
+        self._arrives_s = self._clock.now_s() + way_s
+
+    def next_change_s(self) -> float | None:
+        """When the tip has arrived, what was begun must show, or files must be there."""
+        now_s = self._clock.now_s()
+        times = (self._arrives_s, self._shows_until_s, self._harvest.next_s() or 0.0)
+        return min((at_s for at_s in times if at_s > now_s), default=None)
+
+    # --- what goes on ---
+
+    def doing(self) -> Doing:
+        """What GXSM says."""
+        return decoded(self._hardware, self._ask.numbers("rtquery", STATUS))
+
+    def status(self) -> ScopeStatus:
+        """What GXSM is doing now; what has ended is awaited from here on."""
+        doing, now_s = self.doing(), self._clock.now_s()
+        if self._execute:
+            if not doing.moving and now_s >= self._arrives_s:
+                self._take_curve(now_s)
+            return ScopeStatus(ScopeState.SPEC)
+        if doing.measuring:
+            return self._measuring(doing)
+        self._stopping = False
+        what = self._harvest.what
+        if what and now_s < self._shows_until_s:
+            return ScopeStatus(ScopeState.SCANNING if what == SCAN else ScopeState.SPEC)
+        if what:
+            self._end(what)
+        if doing.approaching:
+            return ScopeStatus(ScopeState.COARSE_MOTOR)
+        if doing.moving or now_s < self._arrives_s:
+            return ScopeStatus(ScopeState.MOVING)
+        return ScopeStatus(ScopeState.INTERRUPTED if self._harvest.broken_off else ScopeState.FREE)
+
+    def _measuring(self, doing: Doing) -> ScopeStatus:
+        self._shows_until_s = 0.0
+        if not self._harvest.what and not self._stopping:  # somebody began it at the panel
+            if doing.scanning:
+                self._begin_scan(0)
+            else:
+                self._begin_curve("VP", self._frame.tip())
+        curve = doing.probing and (self._harvest.what not in ("", SCAN) or not doing.scanning)
+        return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
+
+    def _take_curve(self, now_s: float) -> None:
+        action, self._execute = self._execute, ""
+        self._shows_until_s = now_s + _SHOWS_S
+        self._ask.call("action", action)
+
+    def _begin_scan(self, begun_ns: int) -> None:
+        self._stopping = False
+        region = self._frame.region()
+        taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad]}
+        self._harvest.begin(SCAN, self._folder(), begun_ns, taken)
+
+    def _begin_curve(self, kind: str, position_m: tuple[float, float]) -> None:
+        self._stopping = False
+        folder = self._probe_dir or self._folder()
+        self._harvest.begin(kind, folder, 0, {"position": list(position_m)})
+
+    def _stop(self) -> None:
+        self._stopping = True
+        self._execute, self._shows_until_s = "", 0.0
+        self._harvest.forget()
+
+    def _end(self, what: str) -> None:
+        channels = self._channels() if what == SCAN else []
+        self._harvest.end(self._clock.now_ns(), channels)
+        if what == SCAN and self._saves:
+            try:
+                self._ask.call("autosave")
+            except GxsmError as error:
+                self._log.error("the scan can't be saved: %s", error)
+
+    def _folder(self) -> Path:
+        channels = [] if self._scan_dir else self._channels(1)
+        return self._scan_dir or (Path(channels[0]).parent if channels else Path())
+
+    def _channels(self, most: int = _CHANNELS) -> list[str]:
+        """Where GXSM would save each channel."""
+        found: list[str] = []
+        for channel in range(most):
+            path = self._ask.text("chfname", channel)
+            if path.startswith(_NO_CHANNEL):
+                break
+            found.append(path)
+        return found

@@ -1,0 +1,224 @@
+"""What comes of a measurement: GXSM's files, which come late, one for each channel, one after the other.
+
+Everything that must outlive the process is in `kept`: which measurement is running, which has ended and whose files
+are awaited, and which results there are.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from afspm.clock import NS_PER_S
+from afspm.errors import AfspmError, FileError
+from afspm.files import read
+from afspm.files.content import FileContent
+from afspm.model import Region, Scan, Spectrum
+
+SCAN: Final = "scan"
+_LISTED: Final = 16
+_NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
+_STORED: Final = 1e-5
+"""Relative: what is lost of a length in a file."""
+_CLOCK_NS: Final = 2 * NS_PER_S
+"""Files tell the second in which a scan began."""
+
+
+class Harvest:
+    """The measurement that is running or has just ended, and the results.
+
+    Args:
+        kept: JSON-able, and lasts.
+        patience_s: how long all files may take, in experiment time.
+        rewritten: files may be there before the scan is over, and be written again.
+    """
+
+    def __init__(self, kept: dict[str, Any], patience_s: float, log: logging.Logger, *, rewritten: bool) -> None:
+        self._kept = kept
+        self._patience_s = patience_s
+        self._rewritten = rewritten
+        self._log = log
+        self._sizes: dict[Path, tuple[int, int]] = {}
+        self._whole: dict[Path, FileContent] = {}
+        self._broken_off = False
+        for key, empty in (("running", None), ("ended", None), ("results", []), ("absent", [])):
+            kept.setdefault(key, empty)
+
+    @property
+    def what(self) -> str:
+        """Which measurement is running: `SCAN`, the kind of a spectrum, or nothing."""
+        running = self._kept["running"]
+        return running["what"] if running else ""
+
+    @property
+    def broken_off(self) -> bool:
+        """Whether nothing came of what has ended; until `results` is called."""
+        return self._broken_off
+
+    def begin(self, what: str, folder: Path, begun_ns: int, taken: Mapping[str, Any]) -> None:
+        """A measurement begins.
+
+        Args:
+            folder: where its files will be.
+            begun_ns: not before this; 0: it was found running.
+            taken: "frame" (x, y, width, height, angle) of a scan, "position" of a spectrum.
+        """
+        newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
+        self._kept["running"] = {
+            "what": what,
+            "folder": str(folder),
+            "newest_ns": newest,
+            "begun_ns": begun_ns,
+            **taken,
+        }
+        self._kept["ended"] = None
+
+    def forget(self) -> None:
+        """What is running or has ended was broken off: nothing comes of it."""
+        self._kept["running"] = self._kept["ended"] = None
+
+    def end(self, now_ns: int, channels: Iterable[str]) -> None:
+        """It has ended.
+
+        Args:
+            channels: where GXSM says that it saves each channel of a scan.
+        """
+        named = (_NUMBERED.search(Path(path).name) for path in channels)
+        ended = {
+            **self._kept["running"],
+            "end_ns": now_ns,
+            "until_s": now_ns / NS_PER_S + self._patience_s,
+            "channels": [match[1] for match in named if match],
+        }
+        self._kept["running"], self._kept["ended"] = None, ended
+        self._sizes, self._whole = {}, {}
+
+    def next_s(self) -> float | None:
+        """When to look again at the latest."""
+        ended = self._kept["ended"]
+        return None if ended is None else float(ended["until_s"])
+
+    def results(self, now_s: float) -> list[str]:
+        """The last results, oldest first: each by one of its files and when it ended."""
+        self._broken_off = False
+        ended = self._kept["ended"]
+        if ended is not None:
+            files = self._new(ended)
+            over = now_s >= ended["until_s"]
+            gaps = [file for file, content in files.items() if _gaps(content)]
+            if gaps and (over or not self._rewritten):
+                self._give_up(f"was stopped: {gaps[0]} lacks lines")
+            elif files and not gaps and (over or self._all(ended, files)):
+                self._add(ended, files)
+            elif over:
+                self._give_up(self._missing(ended))
+        return [_name(entry) for entry in self._kept["results"]]
+
+    def load(self, result: str) -> list[Scan | Spectrum]:
+        """Read one of the results, with the parameters that it was taken with.
+
+        Raises:
+            FileError: it is no result any more, or a file has gone.
+        """
+        entry = next((entry for entry in self._kept["results"] if _name(entry) == result), None)
+        if entry is None:
+            raise FileError("is not among the last results", where=result)
+        contents = [self._whole.get(Path(file)) or read(file) for file in entry["files"]]
+        return [_as_taken(one, entry) for content in contents for one in content]
+
+    def _new(self, ended: Mapping[str, Any]) -> dict[Path, FileContent]:
+        """The files of what has ended that are whole: they have stopped growing, and can be read."""
+        found = {}
+        for file in sorted(_files(Path(ended["folder"]), ended["what"])):
+            stat = file.stat()
+            if stat.st_mtime_ns <= ended["newest_ns"]:
+                continue
+            size = (stat.st_size, stat.st_mtime_ns)
+            if self._sizes.get(file) != size:
+                self._sizes[file] = size
+                self._whole.pop(file, None)
+            elif file not in self._whole:
+                try:
+                    self._whole[file] = read(file)
+                except (AfspmError, OSError):
+                    continue  # not yet
+            content = self._whole.get(file)
+            if content is not None and not _older(content, ended["begun_ns"]):
+                found[file] = content
+        if ended["what"] != SCAN:  # the newest alone: there is one for each spectrum
+            found = dict(sorted(found.items(), key=lambda item: item[0].stat().st_mtime_ns)[-1:])
+        return found
+
+    def _all(self, ended: Mapping[str, Any], files: Iterable[Path]) -> bool:
+        """Whether no file is missing; those that did not come with the scans before are not waited for."""
+        there = {match[1] for match in (_NUMBERED.search(file.name) for file in files) if match}
+        return set(ended["channels"]) - set(self._kept["absent"]) <= there
+
+    def _missing(self, ended: Mapping[str, Any]) -> str:
+        folder = Path(ended["folder"])
+        if not folder.is_dir():
+            return f"its folder {folder} can't be seen from here (scan_dir, probe_dir)"
+        if ended["what"] == SCAN:
+            return f"no new file in {folder} is of it: did it begin at all, is a channel set, and saved (AS)?"
+        return f"no new .vpdata in {folder}: is probe Auto Save on at GXSM's panel, and this its folder (probe_dir)?"
+
+    def _give_up(self, why: str) -> None:
+        self._log.error("nothing comes of the %s: %s", self._kept["ended"]["what"], why)
+        self._kept["ended"] = None
+        self._broken_off = True
+
+    def _add(self, ended: Mapping[str, Any], files: Mapping[Path, FileContent]) -> None:
+        if ended["what"] == SCAN:
+            there = {match[1] for match in (_NUMBERED.search(file.name) for file in files) if match}
+            absent = sorted(set(ended["channels"]) - there)
+            if set(absent) - set(self._kept["absent"]):
+                self._log.warning("GXSM did not save %s: from now on that is not waited for", ", ".join(absent))
+            self._kept["absent"] = absent
+        entry = {
+            "files": [str(file) for file in files],
+            **{key: ended[key] for key in ("what", "frame", "position", "end_ns") if key in ended},
+        }
+        self._kept["results"] = [*self._kept["results"], entry][-_LISTED:]
+        self._kept["ended"] = None
+
+
+def _name(entry: Mapping[str, Any]) -> str:
+    """Of a result: files of spectra may be overwritten."""
+    return f"{entry['files'][0]} ({entry['end_ns']})"
+
+
+def _files(folder: Path, what: str) -> list[Path]:
+    return list(folder.glob("*.nc" if what == SCAN else "*.vpdata")) if folder.is_dir() else []
+
+
+def _older(content: FileContent, begun_ns: int) -> bool:
+    """A scan of before, saved again. Its own clock is that of this computer, as GXSM runs on it."""
+    return content.start_ns is not None and content.start_ns < begun_ns - _CLOCK_NS
+
+
+def _gaps(content: FileContent) -> bool:
+    """Whether lines were not scanned."""
+    return any(np.isnan(scan.values).all(axis=1).any() for scan in content.scans)
+
+
+def _as_taken(one: Scan | Spectrum, entry: Mapping[str, Any]) -> Scan | Spectrum:
+    """With the frame that was set, where the file has the same, or the position that the tip was sent to; our time."""
+    if isinstance(one, Scan):
+        x, y, width, height, angle = entry["frame"]
+        region = Region((x, y), (width, height), angle)
+        return replace(one, region=region if _same(region, one.region) else one.region, time_ns=entry["end_ns"])
+    x, y = entry["position"]
+    return replace(one, kind=entry["what"], position_m=(x, y), time_ns=entry["end_ns"])
+
+
+def _same(a: Region, b: Region) -> bool:
+    scale = _STORED * max(*map(abs, a.center_m), *a.size_m)
+    close = np.allclose([*a.center_m, *a.size_m], [*b.center_m, *b.size_m], rtol=0.0, atol=scale)
+    return bool(close and abs(math.remainder(a.angle_rad - b.angle_rad, math.tau)) <= 1e-6)

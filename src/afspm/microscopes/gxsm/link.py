@@ -1,0 +1,122 @@
+"""How GXSM is called: one small protocol, whichever way it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from afspm.errors import ConfigError
+from afspm.microscopes.gxsm.errors import BadReply, GxsmError
+from afspm.microscopes.microscope import ControllerLost
+
+BLOCK = "gxsm4_py_shm_data_block"
+PROCESS = "gxsm4"
+BRIDGE_PORT = 65431
+HINT = 'address = "127.0.0.1:65431", or "shm" for Gxsm4 without the bridge'
+
+
+class Link(Protocol):
+    """Calls of the functions of GXSM's own module `gxsm`."""
+
+    def call(self, method: str, *arguments: str | int | float) -> Any:
+        """Call one.
+
+        Raises:
+            GxsmError: it could not be done; the link is as before.
+            ControllerLost: no answer, or none to be believed; the link is of no more use.
+        """
+
+    def close(self) -> None:
+        """Let go of it."""
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where GXSM is.
+
+    Attributes:
+        host, port: of the bridge; or
+        block, process: of the shared memory, and the name or number of the process that has it.
+    """
+
+    host: str = ""
+    port: int = 0
+    block: str = ""
+    process: str = ""
+
+    @classmethod
+    def parse(cls, text: str) -> Address:
+        """From "HOST:PORT", or "shm[:BLOCK[@PROCESS]]".
+
+        Raises:
+            ConfigError: neither.
+        """
+        kind, _, rest = text.partition(":")
+        if kind == "shm":
+            block, _, process = rest.partition("@")
+            if "/" in block:
+                raise ConfigError(f"{block!r} is no name of shared memory", where="address", hint=HINT)
+            return cls(block=block or BLOCK, process=process or PROCESS)
+        host, _, port = text.rpartition(":")
+        if not host or not port.isdigit():
+            raise ConfigError(f"{text!r} is no address", where="address", hint=HINT)
+        return cls(host=host, port=int(port))
+
+
+def open_link(address: Address, timeout_s: float, monotonic_s: Callable[[], float]) -> Link:
+    """A link to GXSM.
+
+    Args:
+        timeout_s: how long an answer may take, in real time.
+        monotonic_s: real time.
+
+    Raises:
+        ControllerLost: it is not there. ConfigError: not on this computer.
+    """
+    if address.block:
+        from afspm.microscopes.gxsm.shared_memory import SharedMemoryLink
+
+        return SharedMemoryLink(address.block, address.process, timeout_s, monotonic_s)
+    from afspm.microscopes.gxsm.bridge_client import BridgeLink
+
+    return BridgeLink((address.host, address.port), timeout_s, monotonic_s)
+
+
+class Asking:
+    """A link whose answers are of the kind that they should be."""
+
+    def __init__(self, link: Link) -> None:
+        self.call = link.call
+        self.close = link.close
+
+    def number(self, method: str, *arguments: str | int | float) -> float:
+        """A number. Raises BadReply: another thing. As `Link.call`."""
+        value = self.call(method, *arguments)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is no number")
+        return float(value)
+
+    def text(self, method: str, *arguments: str | int | float) -> str:
+        """A text. Raises BadReply: another thing. As `Link.call`."""
+        value = self.call(method, *arguments)
+        if not isinstance(value, str):
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is no text")
+        return value
+
+    def numbers(self, method: str, *arguments: str | int | float) -> list[float]:
+        """Several numbers. Raises BadReply: another thing. As `Link.call`."""
+        value = self.call(method, *arguments)
+        if not isinstance(value, tuple | list) or not all(isinstance(one, int | float) for one in value):
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which are no numbers")
+        return [float(one) for one in value]
+
+    def names(self, method: str) -> frozenset[str]:
+        """A list of names. Raises BadReply: another thing. As `Link.call`."""
+        value = self.call(method)
+        if not isinstance(value, tuple | list) or not all(isinstance(one, str) for one in value):
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}, which are no names")
+        return frozenset(value)
+
+
+__all__ = ["Address", "Asking", "BadReply", "ControllerLost", "GxsmError", "Link", "open_link"]

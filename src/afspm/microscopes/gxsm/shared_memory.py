@@ -1,0 +1,156 @@
+"""The link to Gxsm4 by way of the shared memory that it serves to other programs of the same user (Linux).
+
+A call is written into the block and announced by a signal; the answer appears in the block. Whoever calls holds the
+lock that GXSM's own tools take, too: two callers at once would get each other's answers.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import struct
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event
+from typing import Any, Final
+
+from afspm.errors import ConfigError
+from afspm.microscopes.gxsm import pickles
+from afspm.microscopes.gxsm.errors import BadReply, GxsmError
+from afspm.microscopes.gxsm.processes import Process, find
+from afspm.microscopes.microscope import ControllerLost
+
+_FOLDER: Final = Path("/dev/shm")
+_BYTES: Final = 16_777_344
+_NAME_BYTES: Final = 64
+_STATUS, _LENGTH, _CONTENT = 100, 128, 136
+_REQUEST: Final = 1
+_FAILURES: Final = {
+    -1: "its result, or an error, can't be passed on",
+    -2: "GXSM has no Python",
+    -3: "wrong flags",
+    -4: "GXSM has no such function",
+}
+_LOCK: Final = "gxsm4_pyshm_transaction.lock"
+_SOON_S, _LATER_S = 0.0001, 0.001
+_LOOKS_SOON: Final = 20
+
+
+class SharedMemoryLink:
+    """The block of a running Gxsm4. For one thread.
+
+    Args:
+        block: the name of the shared memory.
+        process: the name of GXSM's process, or its number.
+        timeout_s: how long an answer may take, in real time.
+        monotonic_s: real time.
+
+    Raises:
+        ControllerLost: no block, or no process that serves it. ConfigError: this computer runs no Linux.
+    """
+
+    def __init__(self, block: str, process: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
+        if not sys.platform.startswith("linux"):
+            hint = "run bridge.py in GXSM's console, and give its address"
+            raise ConfigError("Gxsm4's shared memory is there on Linux alone", where="address", hint=hint)
+        import mmap
+
+        self._timeout_s = timeout_s
+        self._monotonic_s = monotonic_s
+        self._where = f"shm:{block}"
+        # what waits for the memory to change has nothing to be woken by but the end
+        self._closed = Event()
+        self._process: Process = find(process)
+        path = _FOLDER / block
+        try:
+            with path.open("r+b") as file:
+                if os.fstat(file.fileno()).st_size < _BYTES:
+                    raise ControllerLost(f"{path} is not Gxsm4's shared memory: it is too small")
+                self._memory = mmap.mmap(file.fileno(), _BYTES)
+        except OSError as error:
+            hint = "is Gxsm4 running on this computer, by the same user, and without -s?"
+            raise ControllerLost(f"no shared memory: {error}", where=self._where, hint=hint) from error
+
+    def call(self, method: str, *arguments: str | int | float) -> Any:
+        """Call a function of GXSM (see `Link`)."""
+        if self._closed.is_set():
+            raise ControllerLost("the link was closed", where=self._where)
+        try:
+            with self._alone():
+                return self._transaction(method, arguments)
+        except ControllerLost:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the block."""
+        if not self._closed.is_set():
+            self._closed.set()
+            self._memory.close()
+
+    def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> Any:
+        until_s = self._monotonic_s() + self._timeout_s
+        if self._status() == _REQUEST:  # of somebody who has given up waiting: its answer would be taken for ours
+            before = self._memory[:_NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
+            self._wait(until_s, f"GXSM is busy with an earlier call of {before!r} for more than {self._timeout_s:g} s")
+        content = pickle.dumps(arguments, 4)
+        name = method.encode()
+        if len(name) >= _NAME_BYTES or len(content) > _BYTES - _CONTENT:
+            raise GxsmError("can't be passed to GXSM: too long", where=method[:_NAME_BYTES])
+        self._memory[:_NAME_BYTES] = name.ljust(_NAME_BYTES, b"\0")
+        self._memory[_CONTENT : _CONTENT + len(content)] = content
+        struct.pack_into("<Q", self._memory, _LENGTH, len(content))
+        struct.pack_into("<q", self._memory, _STATUS, _REQUEST)
+        self._process.signal(signal.SIGUSR1)
+        self._wait(until_s, f"no answer to {method} within {self._timeout_s:g} s")
+        return self._answer(method)
+
+    def _answer(self, method: str) -> Any:
+        status = self._status()
+        if status in _FAILURES:
+            raise GxsmError(_FAILURES[status], where=method)
+        length = struct.unpack_from("<I", self._memory, _LENGTH)[0]  # GXSM itself takes 32 bits of it
+        if status != 0 or length > _BYTES - _CONTENT:
+            raise BadReply(f"GXSM replied {length} bytes, with the status {status}, to {method}", where=self._where)
+        return pickles.loads(self._memory[_CONTENT : _CONTENT + length])
+
+    def _status(self) -> int:
+        return int(struct.unpack_from("<q", self._memory, _STATUS)[0])
+
+    def _wait(self, until_s: float, complaint: str) -> None:
+        """Until the status is no request any more. Raises ControllerLost."""
+        looks = 0
+        while self._status() == _REQUEST:
+            looks += 1
+            if not self._process.lives():
+                raise ControllerLost("Gxsm4 has ended", where=self._where)
+            if self._monotonic_s() >= until_s:
+                hint = "a call that blocks silences GXSM until it is started anew; started with -s it never answers"
+                raise ControllerLost(complaint, where=self._where, hint=hint)
+            self._closed.wait(_SOON_S if looks < _LOOKS_SOON else _LATER_S)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """While nobody else calls GXSM. Raises ControllerLost: somebody does not stop to."""
+        import fcntl
+
+        path = Path(tempfile.gettempdir()) / _LOCK
+        until_s = self._monotonic_s() + self._timeout_s
+        try:
+            file = path.open("a")
+        except OSError as error:
+            raise ControllerLost(f"the lock of GXSM's callers can't be had: {error}", where=str(path)) from error
+        with file:
+            while True:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if self._monotonic_s() >= until_s:
+                        raise ControllerLost("another program does not let go of GXSM", where=str(path)) from None
+                    self._closed.wait(_LATER_S)
+            yield
