@@ -1,0 +1,174 @@
+"""An emulated GXSM, version 3 or 4: the module `gxsm` that scripts and programs call it by, and its files, with
+simulated physics behind them."""
+
+from __future__ import annotations
+
+import select
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from afspm.emulators.emulator import Crashed, Emulator
+from afspm.emulators.gxsm import block, calls, files, program, saving
+from afspm.emulators.gxsm.block import Block
+from afspm.emulators.gxsm.calls import Calls, Silence
+from afspm.emulators.gxsm.console import SCRIPT, Call, Console
+from afspm.emulators.gxsm.entries import USER_UNITS
+from afspm.emulators.gxsm.program import Program
+from afspm.errors import ConfigError
+from afspm.units import Length
+
+BLOCK: Final = "gxsm4_py_shm_data_block"
+PROCESS: Final = "gxsm4"
+_TRANSPORTS: Final = ("bridge", "shm")
+
+
+class GxsmEmulator(Emulator):
+    """The emulated GXSM.
+
+    Args:
+        version: 3 or 4.
+        card: what its hardware is: "SRanger", "RPSPMC" or GXSM's own "simulator".
+        transport: "bridge": a script runs in its console; "shm": the shared memory of Gxsm4, on Linux.
+        script: that runs in its console; left out: afspm's own.
+        block, process: what the shared memory and its process are called.
+        user_unit: of lengths on its panel: "Å", "nm" or "µm".
+        decimal_comma: it runs where 12,5 is written.
+        auto_save, probe_auto_save: what its panel has on.
+        reach_m: of the scanner in x and y, from the centre.
+        seed, faults, and all of the simulated world: as of every emulator.
+    """
+
+    vendor = "GXSM"
+    usual_port = 65431
+    fault_kinds: ClassVar[Mapping[str, str]] = {
+        "wedge": "nothing is answered for the duration",
+        "crash": "GXSM vanishes",
+        "script-stopped": "script-control is set to 0: the script in the console ends",
+        **calls.FAULT_KINDS,
+        **program.FAULT_KINDS,
+        **saving.FAULT_KINDS,
+        **block.FAULT_KINDS,
+    }
+
+    def __init__(
+        self,
+        *,
+        version: int = 4,
+        card: str = "SRanger",
+        transport: str = "bridge",
+        script: str = "",
+        block: str = BLOCK,
+        process: str = PROCESS,
+        user_unit: str = "Å",
+        decimal_comma: bool = False,
+        auto_save: bool = True,
+        probe_auto_save: bool = True,
+        reach_m: Length = 2e-6,
+        **settings: Any,
+    ) -> None:
+        super().__init__(**settings)
+        for name, value, known in (
+            ("version", version, (3, 4)),
+            ("card", card, program.CARDS),
+            ("transport", transport, _TRANSPORTS if version == 4 else _TRANSPORTS[:1]),
+            ("user_unit", user_unit, USER_UNITS),
+        ):
+            if value not in known:
+                raise ConfigError(f"{value!r}", where=name, hint=f"there are {', '.join(map(str, known))}")
+        self._version, self._card, self._transport = version, card, transport
+        self._script = Path(script) if script else SCRIPT
+        self._block_name, self._process = block, process
+        self._user_unit, self._decimal_comma = user_unit, decimal_comma
+        self._auto_save, self._probe_auto_save = auto_save, probe_auto_save
+        self._reach_m = reach_m
+        self._waiting: deque[Call] = deque()
+        self._silent = False
+        self._console: Console | None = None
+        self._block: Block | None = None
+
+    def open(self) -> str:
+        """Run the script in the console, or open the shared memory."""
+        files.prepare(self._version)
+        self._silent = False
+        self._waiting.clear()
+        self.program = Program(
+            self.rig,
+            self.faults,
+            self.clock,
+            self.folder,
+            version=self._version,
+            card=self._card,
+            user_unit=self._user_unit,
+            decimal_comma=self._decimal_comma,
+            reach_m=self._reach_m,
+        )
+        self.program.auto_save, self.program.probe_auto_save = self._auto_save, self._probe_auto_save
+        self._calls = Calls(self.program)
+        if self._transport == "shm":
+            self._block = Block(self._block_name, self._process, self.faults, self.clock.now_s, self._waiting.append)
+            return f"shm:{self._block_name}@{self._block.pid}"
+        return self.run_script()
+
+    def run_script(self) -> str:
+        """Run the script in the console, as a user does. Returns where it listens."""
+        if self._console is not None:
+            self._console.end()
+            self._waiting.clear()
+        self._console = Console(self._script, self.port, self._post)
+        while (address := self._console.poll()) is None:
+            self.serve(1.0)
+        self.port = int(address.rpartition(":")[2])
+        return address
+
+    def serve(self, timeout_s: float) -> None:
+        """Answer what has come."""
+        watched: list[Any] = [self.woken] if self._block is None else [self.woken, self._block]
+        ready = select.select(watched, [], [], timeout_s)[0]
+        if self._block is not None and self._block in ready:
+            self._block.take()
+        self.woken.take()
+        self._answer_all()
+
+    def tick(self, now_s: float) -> float | None:
+        """Scans end, files are written, and what has waited is answered."""
+        if self.faults.strikes("crash", now_s):
+            raise Crashed("as it was told to")
+        if self._block is not None and self.faults.strikes("stale-block", now_s):
+            self._block.end(remains=True)
+            self._block = None
+            raise Crashed("its shared memory stays")
+        if self.faults.strikes("script-stopped", now_s):
+            self.program.entries.put("script-control", 0.0)
+        next_s = self.program.advance(now_s)
+        self._answer_all()
+        return next_s
+
+    def close(self) -> None:
+        """GXSM is closed."""
+        if self._console is not None:
+            self._console.end()
+            self._console = None
+        if self._block is not None:
+            self._block.end()
+            self._block = None
+
+    def _post(self, call: Call) -> None:
+        self._waiting.append(call)
+        self.woken.post()
+
+    def _answer_all(self) -> None:
+        while self._waiting and not self._silent and not self.faults.lasts("wedge", self.clock.now_s()):
+            call = self._waiting.popleft()
+            try:
+                found = self._calls.answer(call.method, call.arguments)
+            except Silence:
+                self._silent = True
+                return
+            except Exception as error:  # what a script of the user's is to see
+                found = error
+            call.answered(found)
+
+
+EMULATOR = GxsmEmulator

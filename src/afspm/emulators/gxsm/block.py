@@ -1,0 +1,136 @@
+"""The other end of Gxsm4's shared memory: what programs of its users write there reaches the emulator."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import pickle
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.emulators.faults import Faults
+from afspm.emulators.gxsm.console import Call
+from afspm.errors import ConfigError
+
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    "bad-pickle": "shared memory: the result is no pickle",
+    "evil-pickle": "shared memory: the result would run a program if it were unpickled",
+    "code": "shared memory: the status says that the result can't be passed on",
+    "huge": "shared memory: a result that is longer than the memory",
+    "stale-block": "shared memory: GXSM ends, and its memory stays",
+}
+NAME_BYTES: Final = 64
+_NO_SUCH_FUNCTION, _NOT_PASSED_ON = -4, -1
+
+
+class Block:
+    """The shared memory and the process that has it.
+
+    Args:
+        name: of the memory.
+        process: what the process calls itself.
+        post: takes the calls; `take` must be called when `fileno` is readable.
+    """
+
+    def __init__(
+        self, name: str, process: str, faults: Faults, now_s: Callable[[], float], post: Callable[[Call], None]
+    ) -> None:
+        if not sys.platform.startswith("linux"):
+            raise ConfigError("Gxsm4's shared memory is there on Linux alone", where="transport", hint='"bridge"')
+        self._name, self._faults, self._now_s, self._post = name, faults, now_s, post
+        command = [sys.executable, "-I", "-S", str(Path(__file__).with_name("signalled.py")), name, process]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._frame()  # it is ready
+
+    @property
+    def pid(self) -> int:
+        """Of the process that is signalled."""
+        return self._process.pid
+
+    def fileno(self) -> int:
+        assert self._process.stdout is not None
+        return self._process.stdout.fileno()
+
+    def take(self) -> None:
+        """One call that has come."""
+        frame = self._frame()
+        if not frame:
+            return
+        method = frame[:NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
+        try:
+            arguments = tuple(_Arguments(io.BytesIO(frame[NAME_BYTES:])).load())
+        except Exception as error:  # whatever a client writes there
+            self._answer(error)
+            return
+        self._post(Call(method, arguments, self._answer))
+
+    def end(self, *, remains: bool = False) -> None:
+        """GXSM is closed.
+
+        Args:
+            remains: the memory stays, as it does when the real one has ended.
+        """
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+        if not remains:
+            Path("/dev/shm", self._name).unlink(missing_ok=True)
+
+    def _frame(self) -> bytes:
+        assert self._process.stdout is not None
+        head = self._process.stdout.read(4)
+        if len(head) < 4:
+            return b""
+        return self._process.stdout.read(struct.unpack(">I", head)[0])
+
+    def _answer(self, found: Any) -> None:
+        now_s = self._now_s()
+        status, content = 0, b""
+        if isinstance(found, NameError):
+            status = _NO_SUCH_FUNCTION
+        elif isinstance(found, BaseException):
+            status = _NOT_PASSED_ON
+        else:
+            try:
+                content = pickle.dumps(found, 4)
+            except Exception:
+                status = _NOT_PASSED_ON
+        length = len(content)
+        if self._faults.strikes("code", now_s):
+            status = _NOT_PASSED_ON
+        if self._faults.strikes("bad-pickle", now_s):
+            content = bytes(range(255, 255 - length, -1)) if length < 255 else content[: length // 2]
+        if self._faults.strikes("evil-pickle", now_s):
+            content = pickle.dumps(_Evil(), 4)
+            length = len(content)
+        if self._faults.strikes("huge", now_s):
+            length = 1 << 31
+        self._write(struct.pack("<qQ", status, length) + content)
+
+    def _write(self, answer: bytes) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):  # it was killed
+            self._process.stdin.write(struct.pack(">I", len(answer)) + answer)
+            self._process.stdin.flush()
+
+
+class _Arguments(pickle.Unpickler):
+    """Plain values alone."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        raise pickle.UnpicklingError(f"{module}.{name}")
+
+
+class _Evil:
+    """Makes a folder called `evil` where it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, ("evil",)

@@ -1,0 +1,223 @@
+"""The functions of the module `gxsm`, by which programs of its users call GXSM: what each does and answers."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from afspm.emulators.gxsm.program import ANGSTROM_M, SHOWS_S, Program
+from afspm.emulators.rig import RigBusy
+
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    "error": "a call raises an error",
+    "garbage": "what GXSM is doing is told from memory that nobody has written",
+    "wrong-type": "a call is answered with a text",
+    "nan": "a value is not a number",
+}
+_NEVER_WRITTEN: Final = 6.9e-310
+_MODES: Final = {
+    "SRanger": ("IV", "FZ", "PL", "LP", "SP", "TS", "GVP", "TK", "AC", "AX", "ABORT"),
+    "RPSPMC": ("IV", "VP"),
+    "simulator": (),
+}
+_KINDS: Final = {"FZ": "force"}
+_NOBODY: Final = 4294967295.0
+
+
+class Silence(Exception):
+    """There is no answer, to this call or any other, until GXSM is started anew."""
+
+
+class Uninitialised:
+    """What must not be looked at."""
+
+
+class Calls:
+    """The functions. For one thread."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._faults = program.faults
+
+    def answer(self, method: str, arguments: tuple[Any, ...]) -> Any:
+        """Call one.
+
+        Raises:
+            Silence. NameError: there is none. Whatever else a user's script would get.
+        """
+        function: Callable[..., Any] | None = getattr(self, f"_{method}", None)
+        if method.startswith("_") or function is None or method == "answer":
+            raise NameError(method)
+        now_s = self._program.clock.now_s()
+        if self._faults.strikes("error", now_s):
+            raise SystemError("an emulated error")
+        try:
+            inspect.signature(function).bind(*arguments)
+            found = function(*arguments)
+        except RigBusy as busy:
+            raise SystemError(str(busy)) from busy
+        if self._faults.strikes("wrong-type", now_s):
+            return "\x04"
+        return found
+
+    # --- parameters ---
+
+    def _list_refnames(self) -> tuple[str, ...]:
+        return self._program.entries.names()
+
+    def _list_actions(self) -> tuple[str, ...]:
+        program = self._program
+        found = ["CHECK-MainAutoSave", "UNCHECK-MainAutoSave", "CHECK-SCAN-REPEAT", "UNCHECK-SCAN-REPEAT"]
+        modes = _MODES[program.card]
+        found += [f"DSP_VP_{mode}_EXECUTE" for mode in modes]
+        if program.version == 3:
+            found += [f"CHECK-{mode}" for mode in modes]
+        if program.card == "SRanger":
+            found += ["DSP_CMD_AUTOAPP", "DSP_CMD_STOPALL", "DSP_CMD_MOV-XP_XY"]
+        if program.card == "RPSPMC":
+            found += ["GVP_CMD_UP_Z0", "GVP_CMD_DN_Z0"]
+        return tuple(found)
+
+    def _set(self, ref: str, value: str) -> int:
+        if not isinstance(value, str) or not isinstance(ref, str):
+            raise SystemError("<built-in function set> returned a result with an exception set")
+        if self._faults.strikes("refused", self._program.clock.now_s()):
+            self._program.dialogs.append(f"Valid Range of {ref}")
+            return 0
+        return self._program.entries.set(ref, value)
+
+    def _get(self, ref: str) -> float:
+        if self._faults.strikes("nan", self._program.clock.now_s()):
+            return math.nan
+        return self._program.entries.get(ref)
+
+    def _gets(self, ref: str) -> str:
+        return self._program.entries.gets(ref)
+
+    def _action(self, name: str) -> Any:
+        program = self._program
+        state = {"CHECK-MainAutoSave": True, "UNCHECK-MainAutoSave": False}.get(name)
+        if state is not None:
+            program.auto_save = state
+        elif name == "GETCHECK-MainAutoSave" and program.version == 4:
+            return "TRUE" if program.auto_save else "FALSE"
+        elif name in self._list_actions():
+            self._do(name)
+        return Uninitialised() if program.version == 3 else 0
+
+    def _do(self, name: str) -> None:
+        program, rig = self._program, self._program.rig
+        if name.startswith("CHECK-") and name.removeprefix("CHECK-") in _MODES[program.card]:
+            program.probe_auto_save = True
+        elif name == "DSP_VP_ABORT_EXECUTE":
+            rig.stop_spectrum()
+            program.curve = None
+        elif name.startswith("DSP_VP_"):
+            mode = name.split("_")[2]
+            program.take_curve(_KINDS.get(mode, "IV"))
+        elif name == "DSP_CMD_AUTOAPP":
+            rig.engage()
+        elif name == "DSP_CMD_STOPALL":
+            rig.stop_scan()
+
+    # --- what goes on ---
+
+    def _rtquery(self, code: str) -> tuple[float, float, float]:
+        program = self._program
+        now_s = program.clock.now_s()
+        if self._faults.strikes("garbage", now_s):
+            return (_NEVER_WRITTEN, 1.4e-45, -2.7e209)
+        if code == "s":
+            return (float(self._bits(now_s)), _NEVER_WRITTEN, _NEVER_WRITTEN)
+        if code == "R":
+            return (0.0, program.entries["ScanX"], program.entries["ScanY"])
+        if code == "z":
+            x_m, y_m = program.rig.probe_at(now_s)
+            volts = 532.0 * ANGSTROM_M
+            return (0.0, x_m / volts, y_m / volts)
+        return (_NEVER_WRITTEN, _NEVER_WRITTEN, _NEVER_WRITTEN)
+
+    def _bits(self, now_s: float) -> int:
+        program = self._program
+        doing, scan = program.rig.doing(now_s), program.rig.scan
+        scanning = doing == "scan" and scan is not None and now_s >= scan.start_s + SHOWS_S
+        paused, probing = scanning and scan is not None and scan.paused, doing == "spectrum"
+        feedback = bool(program.rig.feedback.on)
+        if program.card == "RPSPMC":
+            ended = not (scanning or probing) and scan is not None
+            return feedback + 2 * (scanning or probing) + 4 * paused + 16 * ended
+        bits = feedback + 2 * scanning
+        if program.card == "SRanger":
+            bits += 4 * paused + 8 * probing + 16 * (doing == "move") + 128 * (doing == "approach")
+        return bits
+
+    def _y_current(self) -> int:
+        program = self._program
+        scan = program.last
+        if scan is None:
+            return 0
+        return min(scan.lines_done(program.clock.now_s()), scan.shape[0] - 1)
+
+    def _startscan(self) -> int:
+        self._program.start_scan()
+        return 0
+
+    def _stopscan(self) -> int:
+        self._program.rig.stop_scan()
+        return 0
+
+    def _waitscan(self, *how: int) -> int:
+        program = self._program
+        if program.version == 4 and program.card == "simulator":
+            raise Silence("waitscan")
+        return -1 if not program.rig.busy(program.clock.now_s()) else self._y_current()
+
+    def _autosave(self) -> int:
+        self._program.save(self._program.clock.now_s())
+        return self._y_current()
+
+    def _chfname(self, channel: int) -> str:
+        names = self._program.names(self._program.clock.now_s())
+        if not 0 <= channel % 100 < len(names):
+            return "EE: invalid channel"
+        return str(names[channel % 100])
+
+    def _moveto_scan_xy(self, x: float, y: float) -> float:
+        return self._program.move_tip(float(x), float(y))
+
+    # --- data ---
+
+    def _get_geometry(self, channel: int) -> tuple[float, ...]:
+        x, y, width, height, angle_deg = self._program.last_frame
+        return (width, height, x, y, angle_deg)
+
+    def _get_dimensions(self, channel: int) -> tuple[float, ...]:
+        scan = self._program.last
+        return (_NOBODY,) * 4 if scan is None else (float(scan.shape[1]), float(scan.shape[0]), 1.0, 1.0)
+
+    def _get_differentials(self, channel: int) -> tuple[float, ...]:
+        _, _, width, height, _ = self._program.last_frame
+        columns, rows, _, _ = self._get_dimensions(channel)
+        return (width / (columns - 1), height / (rows - 1), self._program.channels[channel].dz, 1.0)
+
+    def _get_slice(self, channel: int, value: int, time: int, first: int, count: int) -> Any:
+        program = self._program
+        if program.last is None or not 0 <= channel < len(program.channels):
+            return -1
+        one = program.channels[channel]
+        return program.image(one)[first : first + count].astype(np.float64) * one.dz
+
+    def _get_probe_event(self, channel: int, nth: int) -> Any:
+        program = self._program
+        curve = program.rig.spectrum
+        if curve is None or curve is program.curve:
+            return 0
+        columns = program.columns(curve)
+        labels = [label.rpartition(" (")[0] for label in columns]
+        units = [label.rpartition(" (")[2].rstrip(")") for label in columns]
+        where = (program.entries["ScanX"], program.entries["ScanY"], 0.0, 0.0)
+        return np.array([*columns.values()]), labels, units, where

@@ -1,0 +1,54 @@
+"""Which channels of the simulated instrument GXSM records, and what it calls them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel.
+
+    Attributes:
+        source: what the instrument calls it.
+        label: what GXSM does.
+        direction: "Xp" forward, "Xm" backward.
+        unit: as stored ("AA" of lengths), and as shown.
+        scale: of the instrument's values to this unit.
+        dz: stored values times this are in this unit.
+    """
+
+    source: str
+    label: str
+    direction: str
+    unit: tuple[str, str]
+    scale: float
+    dz: float
+
+    def ending(self, *, master: bool) -> str:
+        """Of its files' names, after the number."""
+        return f"{'M-' if master else ''}{self.direction}-{self.label.replace('-', 'm')}.nc"
+
+    def raw(self, values: np.ndarray) -> np.ndarray:
+        """What is stored of an image [y, x] with y ascending: rows from the top, 0 where nothing was scanned."""
+        return np.nan_to_num(values[::-1] * (self.scale / self.dz)).astype(np.float32)
+
+
+_ANGSTROM: Final = (("AA", "Å"), 1e10)
+CHANNELS: Final = {
+    3: (
+        Channel("Height", "Topo", "Xp", *_ANGSTROM, 0.117506942891),
+        Channel("Height Retrace", "Topo", "Xm", *_ANGSTROM, 0.117506942891),
+        Channel("Amplitude", "ADC1", "Xp", ("V", "V"), 1.0, 0.000305185),
+    ),
+    4: (
+        Channel("Height", "ZS-Topo", "Xp", *_ANGSTROM, 1.0),
+        Channel("Height Retrace", "ZS-Topo", "Xm", *_ANGSTROM, 1.0),
+        Channel("Current", "I-Tunnel", "Xp", ("nA", "nA"), 1e9, 1.0),
+        Channel("Phase", "dFreq", "Xp", ("Hz", "Hz"), 1.0, 1.0),
+    ),
+}
+"""By the version of GXSM."""

@@ -1,0 +1,112 @@
+"""GXSM's Python console: it runs a script of its user in a thread, whose calls of `gxsm` GXSM answers one by one."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+SCRIPT: Final = Path(__file__).parents[2] / "microscopes" / "gxsm" / "bridge.py"
+"""What is run if nothing else is said: the file that a user runs, not a module of ours."""
+_LISTENS: Final = re.compile(r"listening at (\S+):(\d+)")
+
+
+class Gone(BaseException):
+    """GXSM is no more, nor is what runs in it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """A call of a function of GXSM.
+
+    Attributes:
+        answered: told what it returned, or the exception that it raised.
+    """
+
+    method: str
+    arguments: tuple[Any, ...]
+    answered: Callable[[Any], None]
+
+
+class Module:
+    """The module `gxsm`, as a script sees it."""
+
+    def __init__(self, post: Callable[[Call], None]) -> None:
+        self._post = post
+        self._waiting: set[Future[Any]] = set()
+        self._gone = False
+
+    def __getattr__(self, method: str) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            answer: Future[Any] = Future()
+            self._waiting.add(answer)
+            if self._gone:
+                raise Gone
+            self._post(Call(method, arguments, answer.set_result))
+            found = answer.result()
+            self._waiting.discard(answer)
+            if isinstance(found, BaseException):
+                raise found
+            return found
+
+        return call
+
+    def end(self) -> None:
+        """Whoever waits for an answer, or asks again, ends."""
+        self._gone = True
+        for answer in list(self._waiting):
+            if not answer.done():
+                answer.set_result(Gone())
+
+
+class Console:
+    """A console in which a script runs.
+
+    Args:
+        script: that listens at a port, and says so.
+        post: takes its calls, from its own thread.
+    """
+
+    def __init__(self, script: Path, port: int, post: Callable[[Call], None]) -> None:
+        self._module = Module(post)
+        self._said: Future[str] = Future()
+        self._script, self._port = script, port
+        self._thread = threading.Thread(target=self._run, daemon=True, name="GXSM's console")
+        self._thread.start()
+
+    def poll(self) -> str | None:
+        """Where its script listens, once it does.
+
+        Raises:
+            whatever ended it before.
+        """
+        return self._said.result() if self._said.done() else None
+
+    @property
+    def runs(self) -> bool:
+        """Whether the script has not ended."""
+        return self._thread.is_alive()
+
+    def end(self) -> None:
+        """GXSM is closed."""
+        self._module.end()
+        self._thread.join()
+
+    def _run(self) -> None:
+        def print_(*values: object) -> None:
+            found = _LISTENS.search(" ".join(map(str, values)))
+            if found and not self._said.done():
+                self._said.set_result(f"{found[1]}:{found[2]}")
+
+        scope = {"__name__": "__main__", "gxsm": self._module, "PORT": self._port, "print": print_}
+        try:
+            exec(compile(self._script.read_text(encoding="utf-8"), str(self._script), "exec"), scope)
+        except Gone:
+            pass
+        except BaseException as error:
+            if not self._said.done():
+                self._said.set_exception(error)

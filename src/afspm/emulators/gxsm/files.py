@@ -1,0 +1,220 @@
+"""The files that GXSM saves: NetCDF-3 and NetCDF-4 of scans, text of spectra, with the headers that real ones have."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Final
+
+import numpy as np
+
+_USER: Final = "Nobody"
+_VERSIONS: Final = {3: ("gxsm3", "3.54.0"), 4: ("gxsm4", "4.4.1")}
+_ANGSTROM: Final = {"label": "L", "var_unit": "Ang", "unit": "AA"}
+
+
+@dataclass(frozen=True)
+class SavedScan:
+    """One channel of a scan.
+
+    Attributes:
+        raw: what is stored, rows from the top; times `dz` it is in `unit`.
+        unit: as stored ("AA" of lengths), and as shown.
+        frame: x, y, width, height in ångström, angle clockwise in degrees.
+    """
+
+    path: str
+    label: str
+    raw: np.ndarray
+    dz: float
+    unit: tuple[str, str]
+    frame: tuple[float, float, float, float, float]
+    start_s: float
+    end_s: float
+    card: str
+    bias_v: float
+
+    def numbers(self) -> dict[str, float]:
+        """The variables of one value."""
+        x, y, width, height, angle_deg = self.frame
+        rows, columns = self.raw.shape
+        return {
+            "rangex": width,
+            "rangey": height,
+            "rangez": 1000.0,
+            "dx": width / (columns - 1),
+            "dy": height / (rows - 1),
+            "dz": self.dz,
+            "opt_xpiezo_av": 532.0,
+            "opt_ypiezo_av": 532.0,
+            "opt_zpiezo_av": 74.0,
+            "offsetx": x,
+            "offsety": y,
+            "alpha": angle_deg,
+            "contrast": 1.0,
+            "bright": 1.0,
+            "vrange_z": 1.0,
+            "voffset_z": 0.0,
+        }
+
+    def times(self) -> dict[str, int]:
+        """The whole seconds."""
+        return {"t_start": int(self.start_s), "t_end": int(self.end_s), "viewmode": 2}
+
+    def texts(self) -> dict[str, str]:
+        """The variables of characters."""
+        begun = time.ctime(self.start_s)
+        return {
+            "reftime": f"{begun}\n",
+            "comment": f"{_USER}@vm\nSession Date: {begun}\n",
+            "title": "title not set",
+            "type": "not set",
+            "username": _USER,
+            "dateofscan": f"{begun} ",
+            "basename": self.path,
+            "spm_scancontrol": "TopDown ",
+            "extra_scan_info": "Extra Scan Info: N/A",
+        }
+
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Relative to the centre: x ascending, y from the top."""
+        _, _, width, height, _ = self.frame
+        rows, columns = self.raw.shape
+        return np.linspace(-width / 2, width / 2, columns), np.linspace(height / 2, -height / 2, rows)
+
+    def about(self, version: int) -> dict[str, str]:
+        """The attributes of the whole."""
+        creator, number = _VERSIONS[version]
+        return {
+            "Creator": creator,
+            "Version": number,
+            "HardwareCtrlType": self.card,
+            "HardwareConnectionDev": "/dev/sranger_mk2_0",
+            "InstrumentType": "STM",
+            "InstrumentName": "Quantum",
+        }
+
+
+def prepare(version: int) -> None:
+    """Import what writes the files now: the first scan's are not to be later than others."""
+    import_module("scipy.io" if version == 3 else "h5py")
+
+
+def netcdf3(scan: SavedScan) -> bytes:
+    """The file that Gxsm3 saves."""
+    from scipy.io import netcdf_file
+
+    made = io.BytesIO()
+    file: Any = netcdf_file(made, "w", version=1)
+    for name, value in scan.about(3).items():
+        setattr(file, name, value.encode())
+    rows, columns = scan.raw.shape
+    for name, size in (("time", 1), ("value", 1), ("dimy", rows), ("dimx", columns)):
+        file.createDimension(name, size)
+    x, y = scan.axes()
+    field = _variable(file, "FloatField", "f4", ("time", "value", "dimy", "dimx"), scan.raw[None, None])
+    field.long_name = b"FLOAT: single precision floating point data field"
+    field.ZLabel = b"Z" if scan.unit[0] == "AA" else scan.label.encode()
+    field.unit, field.ZSrcUnit = (unit.encode() for unit in reversed(scan.unit))
+    _variable(file, "time", "f8", ("time",), [scan.end_s - scan.start_s])
+    _variable(file, "value", "f8", ("value",), [scan.bias_v])
+    _variable(file, "dimx", "f4", ("dimx",), x)
+    _variable(file, "dimy", "f4", ("dimy",), y)
+    for name, text in scan.texts().items():
+        content = text.encode() + b"\0"
+        file.createDimension(f"{name}_dim", len(content))
+        _variable(file, name, "c", (f"{name}_dim",), np.frombuffer(content, "S1"))
+    for name, number in (scan.numbers() | {key: float(value) for key, value in scan.times().items()}).items():
+        _variable(file, name, "f8", (), number)
+    file.flush()
+    return made.getvalue()
+
+
+def _variable(file: Any, name: str, kind: str, dimensions: tuple[str, ...], values: Any) -> Any:
+    made = file.createVariable(name, kind, dimensions)
+    made[...] = values
+    return made
+
+
+def netcdf4(scan: SavedScan) -> bytes:
+    """The file that Gxsm4 saves."""
+    import h5py
+
+    made = io.BytesIO()
+    with h5py.File(made, "w") as file:
+        for name, value in scan.about(4).items():
+            file.attrs[name] = np.bytes_(value)
+        field = file.create_dataset("FloatField", data=scan.raw[None, None].astype("<f4"))
+        _describe(field, label=scan.label, var_unit=scan.unit[1], unit=scan.unit[0])
+        _describe(field, ZLabel=scan.label, unit_x_dz=scan.unit[1], ZSrcUnit=scan.unit[0])
+        x, y = scan.axes()
+        for name, values, unit in (
+            ("time", [scan.end_s - scan.start_s], "s"),
+            ("value", [scan.bias_v], "V"),
+            ("dimy", y, "AA"),
+            ("dimx", x, "AA"),
+        ):
+            axis = file.create_dataset(name, data=np.asarray(values, "<f8" if name == "time" else "<f4"))
+            axis.make_scale(name)
+            _describe(axis, unit=unit)
+            field.dims[("time", "value", "dimy", "dimx").index(name)].attach_scale(axis)
+        for name, text in scan.texts().items():
+            content = text.encode() + (b"" if name.startswith(("spm_", "extra_")) else b"\0")
+            file.create_dataset(name, data=np.frombuffer(content, "S1"))
+        for name, number in scan.numbers().items():
+            _describe(file.create_dataset(name, data=number), **(_ANGSTROM if name[:3] in ("ran", "off") else {}))
+        for name, seconds in scan.times().items():
+            file.create_dataset(name, data=np.int64(seconds))
+    return made.getvalue()
+
+
+def _describe(node: Any, **attributes: str) -> None:
+    for name, value in attributes.items():
+        node.attrs[name] = np.bytes_(value.encode())
+
+
+@dataclass(frozen=True)
+class SavedCurve:
+    """A spectrum.
+
+    Attributes:
+        columns: label with its unit -> values; the first is what is swept.
+        offset: of the scan frame, in ångström, which is not where it was taken.
+    """
+
+    path: str
+    columns: Mapping[str, np.ndarray]
+    end_s: float
+    offset: tuple[float, float]
+    bias_v: float
+    version: str
+
+
+def vpdata(curve: SavedCurve) -> bytes:
+    """The file of a spectrum."""
+    labels, values = list(curve.columns), [*curve.columns.values()]
+    count = len(values[0])
+    x, y = curve.offset
+    lines = [
+        f"# view via: xmgrace -block {curve.path} -bxy 2:4 ...",
+        f"# GXSM Vector Probe Data :: VPVersion={curve.version} vdate=20070227",
+        f"# Date                   :: date={time.ctime(curve.end_s)}",
+        "#",
+        f"# FileName               :: name={curve.path}",
+        f"# GXSM-Main-Offset       :: X0={x:g} Ang  Y0={y:g} Ang, iX0=0 Pix iX0=0 Pix",
+        f"# GXSM-DSP-Control-FB    :: Bias={curve.bias_v:g} V, Current=0 nA",
+        f'# GXSM-Main-Comment      :: comment="{_USER}@vm"',
+        f"# Probe Data Number      :: N={count}",
+        "#C ",
+        "#C Data Table             :: data=",
+        # what is swept comes a second time
+        "\t".join(["#C Index", *(f'"{label}"' for label in [labels[0], *labels]), "Block-Start-Index"]),
+    ]
+    for i in range(count):
+        row = [f"{column[i]:.12e}" for column in [values[0], *values]]
+        lines.append("\t".join([str(i), *row, "0.000000000000e+00"]))
+    lines += ["#C ", "#C END.", "#C START OF HEADER LIST APPENDIX", "#C END OF HEADER LIST APPENDIX.", ""]
+    return "\n".join(lines).encode()

@@ -1,0 +1,262 @@
+"""GXSM itself: what it has set and is doing, with the simulated instrument behind it, and the files that it saves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from afspm.clock import Clock
+from afspm.emulators.faults import Faults
+from afspm.emulators.gxsm import files
+from afspm.emulators.gxsm.channels import CHANNELS, Channel
+from afspm.emulators.gxsm.entries import Entries, Entry, lengths
+from afspm.emulators.gxsm.saving import Saving
+from afspm.emulators.rig import Rig
+from afspm.emulators.running import RunningScan, RunningSpectrum
+from afspm.model import Region
+
+CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    "refused": "a value is not taken, as one out of range: a dialog opens on the screen",
+    "no-start": "a scan does not begin, and nobody is told",
+    "panel-stop": "somebody stops the scan at the panel",
+}
+ANGSTROM_M: Final = 1e-10
+SHOWS_S: Final = 0.15
+"""A scan is seen running so long after it was begun."""
+NAMED_S: Final = 0.04
+"""Until so long after its begin the names of the scan before are told."""
+IGAIN: Final = 10.0
+"""The simulated integral gain for one of GXSM's, which go to 200."""
+_COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
+
+
+class Program:
+    """GXSM.
+
+    Args:
+        version: 3 or 4.
+        card: of `CARDS`: what the hardware is.
+        reach_m: of the scanner, from its centre.
+
+    Attributes:
+        auto_save: of scans; probe_auto_save of spectra.
+        channels: that a scan records.
+        dialogs: what dialogs on the screen say.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        faults: Faults,
+        clock: Clock,
+        folder: Path,
+        *,
+        version: int,
+        card: str,
+        user_unit: str,
+        decimal_comma: bool,
+        reach_m: float,
+    ) -> None:
+        self.rig, self.faults, self.clock, self.folder = rig, faults, clock, folder
+        self.version, self.card = version, card
+        self.dialogs: list[str] = []
+        self.entries = Entries(version, user_unit, decimal_comma=decimal_comma, dialogs=self.dialogs.append)
+        self.auto_save, self.probe_auto_save = True, True
+        self.channels: list[Channel] = [one for one in CHANNELS[version] if one.source in rig.channels]
+        self.saving = Saving(folder, faults)
+        self.last: RunningScan | None = None
+        self.last_frame = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self.curve: RunningSpectrum | None = None
+        self._scanning = self._saved = False
+        self._before: list[Path] = []
+        self._own: list[Path] = []
+        self._curves = 0
+        for ref, entry in lengths(reach_m / ANGSTROM_M, self._told).items():
+            self.entries.add(ref, entry)
+        for ref, entry in self._of_hardware().items():
+            self.entries.add(ref, entry)
+
+    def _told(self, ref: str) -> Callable[[float], None]:
+        """What follows from setting a length: the tip goes along."""
+        if ref in ("ScanX", "ScanY", "OffsetX", "OffsetY"):
+            return lambda _: self._move()
+        return lambda _: None
+
+    def _of_hardware(self) -> dict[str, Entry]:
+        rig, loop = self.rig, self.rig.feedback
+        bias = Entry(rig.bias_v, -10.0, 10.0, "V", told=lambda value: setattr(rig, "bias_v", value))
+        if self.card == "simulator":
+            return {"sim-stm-speed": Entry(1.0, 0.0, 4000.0), "sim-stm-bias": bias}
+
+        def fed_back(name: str, factor: float = 1.0) -> Callable[[float], None]:
+            def told(value: float) -> None:
+                changed: dict[str, Any] = {name: value * factor}
+                rig.feedback = replace(rig.feedback, **changed)
+
+            return told
+
+        def sloped(axis: int) -> Callable[[float], None]:
+            return lambda value: setattr(rig, "slope", (*rig.slope[:axis], value, *rig.slope[axis + 1 :]))
+
+        speed = Entry(2e4, 1e-3, 1e7, told=lambda value: setattr(rig, "move_speed_m_s", value * ANGSTROM_M))
+        found = {
+            "dsp-fbs-bias": bias,
+            "dsp-fbs-mx0-current-set": Entry(loop.setpoint or 0.0, -100.0, 100.0, "nA", told=fed_back("setpoint")),
+            "dsp-fbs-mx0-current-level": Entry(0.0, -100.0, 100.0, "nA"),
+            "dsp-fbs-cp": Entry(loop.proportional_gain or 0.0, -100.0, 200.0, told=fed_back("proportional_gain")),
+            "dsp-fbs-ci": Entry((loop.integral_gain or 0) / IGAIN, -100, 200, told=fed_back("integral_gain", IGAIN)),
+            "dsp-fbs-scan-speed-scan": Entry(1e4, 1e-3, 1e7),
+            "dsp-fbs-scan-speed-move": speed,
+            "dsp-adv-scan-slope-x": Entry(0.0, -0.2, 0.2, told=sloped(0)),
+            "dsp-adv-scan-slope-y": Entry(0.0, -0.2, 0.2, told=sloped(1)),
+            "dsp-gvp-du00": Entry(0.0, -10.0, 10.0, "V"),
+        }
+        if self.card == "RPSPMC":
+            return {**found, "dsp-GVP-VPJR": Entry(0.0)}
+        return {**found, "dsp-fbs-motor": Entry(0.0, -10.0, 10.0), "dsp-Z-start": Entry(0.0, -1e4, 1e4)}
+
+    # --- what happens by itself ---
+
+    def advance(self, now_s: float) -> float | None:
+        """Up to now; returns when a file is to be written."""
+        if self._scanning and self.faults.strikes("panel-stop", now_s):
+            self.rig.stop_scan()
+        if self._scanning and self.last is not None and not self.last.running(now_s):
+            self._scanning = False
+            if self.auto_save:
+                self.save(now_s)
+        if self.curve is not None and not self.curve.running(now_s):
+            curve, self.curve = self.curve, None
+            if self.probe_auto_save:
+                self._save_curve(curve, now_s)
+        return self.saving.advance(now_s)
+
+    # --- scans ---
+
+    def start_scan(self) -> None:
+        """If it can; nobody is told whether."""
+        now_s = self.clock.now_s()
+        self.rig.stop_move()
+        if self.rig.busy(now_s) or not self.channels or self.faults.strikes("no-start", now_s):
+            return
+        entries, columns, rows = self.entries, int(self.entries["PointsX"]), int(self.entries["PointsY"])
+        self.rig.region, self.rig.shape, self.rig.upwards = self.frame(), (rows, columns), False
+        if "sim-stm-speed" in entries:
+            self.rig.line_s = 2.0 * columns / max(entries["sim-stm-speed"], 1e-3)
+        else:
+            self.rig.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
+        self._before, self._own = self.names(now_s), []
+        self.last = self.rig.start_scan()
+        self.last_frame = tuple(entries[ref] for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY", "Rotation"))  # type: ignore[assignment]
+        self._scanning, self._saved = True, False
+
+    def frame(self) -> Region:
+        """Of the next scan."""
+        x, y, width, height = (self.entries[ref] * ANGSTROM_M for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY"))
+        return Region((x, y), (width, height), -math.radians(self.entries["Rotation"]))
+
+    def names(self, now_s: float) -> list[Path]:
+        """Where each channel is to be saved, whatever is there already; or was."""
+        if self._before and self.last is not None and now_s < self.last.start_s + NAMED_S:
+            return self._before
+        if self._own:
+            return self._own
+        return [self.saving.named(ending, self.saving.counter) for ending in self._endings()]
+
+    def image(self, channel: Channel) -> np.ndarray:
+        """What there is of a channel of the last scan, as it is stored."""
+        if self.last is None:
+            return np.zeros((0, 0), np.float32)
+        now_s = self.clock.now_s()
+        until_s = now_s if self._scanning else self.last.stopped_s
+        drawn = self.last.channels(until_s)
+        return channel.raw(drawn[channel.source][1])
+
+    def save(self, now_s: float) -> None:
+        """The last scan, if there is one: again, if it was saved."""
+        if self.last is None:
+            return
+        if self._saved:
+            self._own = []
+        own = [self.saving.free(ending) for ending in self._endings()]
+        contents = [(path, self._file(one, path)) for path, one in zip(own, self.channels, strict=True)]
+        self.saving.write(contents, now_s)
+        self.saving.counted(own)
+        self._own, self._saved = own, True
+
+    def _endings(self) -> list[str]:
+        return [channel.ending(master=number == 0) for number, channel in enumerate(self.channels)]
+
+    def _file(self, channel: Channel, path: Path) -> bytes:
+        scan = self.last
+        assert scan is not None
+        saved = files.SavedScan(
+            str(path),
+            channel.label,
+            self.image(channel),
+            channel.dz,
+            channel.unit,
+            self.last_frame,
+            scan.start_s,
+            scan.end_s,
+            CARDS[self.card],
+            scan.bias_v,
+        )
+        return files.netcdf3(saved) if self.version == 3 else files.netcdf4(saved)
+
+    # --- the tip ---
+
+    def move_tip(self, x: float, y: float) -> float:
+        """Within the frame, in ångström from its centre: 0, or -1 if that is outside."""
+        if abs(x) > self.entries["RangeX"] / 2 * (1 + 1e-9) or abs(y) > self.entries["RangeY"] / 2 * (1 + 1e-9):
+            return -1
+        self.entries.put("ScanX", x)
+        self.entries.put("ScanY", y)
+        self._move()
+        return 0
+
+    def _move(self) -> None:
+        if self.rig.doing(self.clock.now_s()) in ("", "move"):
+            self.rig.move_probe(self.tip_m())
+
+    def tip_m(self) -> tuple[float, float]:
+        """Where it was sent."""
+        angle, (cx, cy) = -math.radians(self.entries["Rotation"]), self.frame().center_m
+        u, v = (self.entries[ref] * ANGSTROM_M for ref in ("ScanX", "ScanY"))
+        return cx + math.cos(angle) * u - math.sin(angle) * v, cy + math.sin(angle) * u + math.cos(angle) * v
+
+    # --- spectra ---
+
+    def take_curve(self, kind: str) -> None:
+        """If it can; nobody is told whether."""
+        if not self.rig.busy(self.clock.now_s()):
+            self.curve = self.rig.start_spectrum(kind)
+
+    def columns(self, curve: RunningSpectrum) -> dict[str, np.ndarray]:
+        """As GXSM labels them."""
+        blanks = "    " if self.card == "RPSPMC" else ""
+        found = {}
+        for name, unit, values in zip(curve.names, curve.units, curve.values.T, strict=True):
+            scale, shown = {"m": (1e10, "Å"), "A": (1e9, "nA")}.get(unit, (1.0, unit))
+            found[f"{blanks}{_COLUMNS.get(name, name)} ({shown})"] = values * scale
+        return found
+
+    def _save_curve(self, curve: RunningSpectrum, now_s: float) -> None:
+        self._curves += 1
+        path = self._curve_path()
+        while self.card == "RPSPMC" and path.exists():  # others overwrite
+            self._curves += 1
+            path = self._curve_path()
+        offset = self.entries["OffsetX"], self.entries["OffsetY"]
+        version = "00.03" if self.card == "RPSPMC" else "00.02"
+        saved = files.SavedCurve(str(path), self.columns(curve), now_s, offset, self.rig.bias_v, version)
+        self.saving.write([(path, files.vpdata(saved))], now_s)
+
+    def _curve_path(self) -> Path:
+        return self.folder / f"scan{self.saving.counter:03d}-VP{self._curves:03d}-VP.vpdata"

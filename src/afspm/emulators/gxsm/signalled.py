@@ -1,0 +1,72 @@
+"""The process that Gxsm4's shared memory belongs to, and that is signalled: it passes calls on to the emulator.
+
+Run by `block.py` as a script of its own, with the name of the block and of the process; frames of a length and
+content go out to standard output (a call: the function's name, 64 bytes, and the pickled arguments), and come in from
+standard input (a status of 8 bytes, and the pickled result). It ends when that does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import select
+import signal
+import struct
+import sys
+from pathlib import Path
+
+SIZE = 16_777_344
+STATUS, LENGTH, CONTENT = 100, 128, 136
+
+
+def read(count: int) -> bytes:
+    content = b""
+    while len(content) < count:
+        part = os.read(0, count - len(content))
+        if not part:
+            raise EOFError
+        content += part
+    return content
+
+
+def passed_on(memory: mmap.mmap) -> None:
+    """What is asked, if anything."""
+    if struct.unpack_from("<q", memory, STATUS)[0] == 1:
+        length = struct.unpack_from("<I", memory, LENGTH)[0]
+        call = memory[:64] + memory[CONTENT : CONTENT + min(length, SIZE - CONTENT)]
+        sys.stdout.buffer.write(struct.pack(">I", len(call)) + call)
+        sys.stdout.buffer.flush()
+
+
+def answered(memory: mmap.mmap) -> None:
+    """The answer, its status last."""
+    answer = read(struct.unpack(">I", read(4))[0])
+    memory[CONTENT : CONTENT + len(answer) - 16] = answer[16:]
+    memory[LENGTH : LENGTH + 8] = answer[8:16]
+    memory[STATUS : STATUS + 8] = answer[:8]
+
+
+def run(block: str, name: str) -> None:
+    woken, wakes = os.pipe2(os.O_NONBLOCK)
+    signal.signal(signal.SIGUSR1, lambda *_: None)
+    signal.set_wakeup_fd(wakes)
+    Path("/proc/self/comm").write_text(name)
+    descriptor = os.open(f"/dev/shm/{block}", os.O_RDWR | os.O_CREAT, 0o644)
+    os.ftruncate(descriptor, SIZE)
+    memory = mmap.mmap(descriptor, SIZE)
+    memory[STATUS : STATUS + 8] = bytes(8)
+    sys.stdout.buffer.write(struct.pack(">I", 0))
+    sys.stdout.buffer.flush()
+    while True:
+        ready = select.select([0, woken], [], [])[0]
+        if woken in ready:
+            os.read(woken, 4096)
+            passed_on(memory)
+        if 0 in ready:
+            answered(memory)
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(EOFError, OSError):
+        run(*sys.argv[1:])
