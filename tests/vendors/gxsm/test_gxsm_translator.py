@@ -1,0 +1,396 @@
+"""The GXSM translator against the emulated program: everything that a peer may ask for, as it sees it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from gxsm_bench import Bench, Peer, scans, states
+
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    ProbePosition,
+    Region,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    Spectrum,
+    names,
+)
+
+Make = Callable[..., Bench]
+
+FREE = ScopeState.FREE
+TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
+SHAPE = (12, 32)
+FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
+KINDS: list[dict[str, Any]] = [
+    {"version": 3},
+    {"version": 4},
+    {"version": 4, "transport": "shm"},
+    {"version": 4, "card": "RPSPMC", "user_unit": "nm"},
+]
+KIND_IDS = ["gxsm3", "gxsm4", "gxsm4-shm", "rpspmc-nm"]
+
+
+def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
+    """A small frame is in force, and all that comes of it was heard."""
+    peer.until(FREE)
+    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, ""))
+    assert response.ok, response.reason
+    peer.until(lambda one: isinstance(one, ScanParameters) and one.region == region and one.shape == shape)
+    peer.until(FREE)
+
+
+def scanned(peer: Peer) -> dict[str, Scan]:
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    found = scans(heard)
+    assert heard[-1 - len(found) : -1] == found, "the scans come before FREE, and nothing in between"
+    return {scan.channel: scan for scan in found}
+
+
+def moved(peer: Peer, x_m: float, y_m: float) -> None:
+    response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m)))
+    assert response.ok, response.reason
+    assert states(peer.until(FREE)) == ["MOVING", "FREE"]
+
+
+# --- scans ---
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make, kind: dict[str, Any]) -> None:
+    made = bench(**kind)
+    peer = made.start()
+    ready(peer)
+    found = scanned(peer)
+    expected = {"Topo", "Topo Backward", "ADC1"}
+    if kind["version"] == 4:
+        expected = {"ZS-Topo", "ZS-Topo Backward", "I-Tunnel", "dFreq"}
+    assert found.keys() == expected
+    for scan in found.values():
+        assert scan.region == TURNED
+        assert scan.shape == SHAPE
+        assert scan.filename.startswith(str(made.files / "scan001-"))
+        assert scan.time_ns is not None
+        assert abs(scan.time_ns / 1e9 - made.clock.now_s()) < 600.0
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, kind: dict[str, Any]) -> None:
+    """Against the heights of the simulated sample at each pixel: half a frame off, or a mirrored axis, would show."""
+    made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT, **kind)
+    peer = made.start()
+    region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
+    ready(peer, region, (48, 32))
+    found = scanned(peer)
+    x, y = region.pixels_m((48, 32))
+    truth = made.emulator.rig.world.surface_m(x, y)
+
+    def likeness(values: np.ndarray) -> float:
+        return float(np.corrcoef(values.ravel(), truth.ravel())[0, 1])
+
+    topography = "Topo" if kind["version"] == 3 else "ZS-Topo"
+    for channel in (topography, f"{topography} Backward"):
+        assert found[channel].unit == "m"
+        values = found[channel].values
+        assert likeness(values) > 0.98
+        assert float(np.ptp(values)) == pytest.approx(float(np.ptp(truth)), rel=0.3)
+        for mirrored in (values[::-1], values[:, ::-1], values[::-1, ::-1]):
+            assert likeness(mirrored) < likeness(values) - 0.1
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+def test_a_scan_that_is_stopped_gives_none(bench: Make, kind: dict[str, Any]) -> None:
+    made = bench(speed=20.0, **kind)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
+    assert peer.act(names.STOP_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not scans(heard)
+    assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
+
+
+def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    found = [scanned(peer)["ZS-Topo"] for _ in range(3)]
+    assert [scan.filename[-19:] for scan in found] == [f"00{n}-M-Xp-ZSmTopo.nc" for n in (1, 2, 3)]
+    assert not np.array_equal(found[0].values, found[1].values)
+    assert len(list(made.files.glob("*.nc"))) == 12, "none was saved twice"
+
+
+def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
+    """GXSM begins at 001 with each start: it names what is there already, and then counts each channel by itself."""
+    made = bench()
+    (made.files / "scan001-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
+    (made.files / "scan002-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
+    (made.files / "scan001-Xp-dFreq.nc").write_bytes(b"of last year")
+    peer = made.start()
+    ready(peer)
+    found = scanned(peer)
+    assert found["ZS-Topo"].filename.endswith("scan003-M-Xp-ZSmTopo.nc")
+    assert found["dFreq"].filename.endswith("scan002-Xp-dFreq.nc")
+    assert found["I-Tunnel"].filename.endswith("scan001-Xp-ImTunnel.nc")
+
+
+def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
+    made = bench()
+    peer = made.start(saving="gxsm")
+    ready(peer)
+    found = [scanned(peer)["ZS-Topo"] for _ in range(2)]
+    assert [scan.filename[-19:-16] for scan in found] == ["001", "002"]
+    assert made.emulator.program.auto_save
+    assert len(list(made.files.glob("*.nc"))) == 8
+
+
+# --- parameters ---
+
+
+@pytest.mark.parametrize("user_unit", ["Å", "nm", "µm"])
+def test_lengths_are_right_whatever_unit_the_panel_has(bench: Make, user_unit: str) -> None:
+    made = bench(user_unit=user_unit)
+    peer = made.start()
+    ready(peer)
+    entries = made.emulator.program.entries
+    shown = [entries[ref] for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY", "Rotation", "PointsX", "PointsY")]
+    assert shown == pytest.approx([400.0, -250.0, 3000.0, 1000.0, -30.0, 32.0, 12.0], rel=1e-12)
+    moved(peer, 50e-9, -20e-9)
+    assert made.emulator.rig.probe_m == pytest.approx((50e-9, -20e-9), rel=1e-9)
+
+
+def test_the_size_in_x_alone_leaves_that_in_y_as_it_is(bench: Make) -> None:
+    """Setting RangeX, GXSM changes RangeY, too."""
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    assert peer.set(names.SCAN_SIZE_X, "200", "nm").ok
+    assert float(peer.get(names.SCAN_SIZE_Y)) == pytest.approx(100e-9, rel=1e-12)
+    assert peer.set(names.SCAN_RESOLUTION_X, 40).ok
+    assert peer.get(names.SCAN_RESOLUTION_Y) == "12"
+    assert float(peer.get(names.SCAN_TOP_LEFT_X)) == pytest.approx(TURNED.top_left_m[0], abs=1e-15)
+
+
+def test_what_is_set_is_told_to_the_last_digit(bench: Make) -> None:
+    peer = bench(user_unit="nm").start()
+    peer.until(FREE)
+    for name, value in {
+        names.TIP_BIAS_VOLTAGE: 0.123456789,
+        names.SCAN_SPEED: 1.23456789e-7,
+        names.MOVE_SPEED: 2.3456789e-7,
+        names.ZCTRL_PGAIN: 0.123456789,
+        names.ZCTRL_IGAIN: 123.456789,
+        names.ZCTRL_SETPOINT: 0.66666666666,
+        names.SCAN_TOP_LEFT_X: 1.23456789012e-8,
+        names.SCAN_SIZE_Y: 3.33333333333e-7,
+        names.SCAN_ANGLE: -12.3456789012,
+        names.SAMPLE_SLOPE_X: 0.0123456789,
+    }.items():
+        response = peer.set(name, value)
+        assert response.ok, (name, response.reason)
+        assert float(peer.get(name)) == pytest.approx(value, rel=1e-13), name
+
+
+def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(proportional_gain=0.25, setpoint=0.5)).ok
+    heard = peer.until(lambda one: isinstance(one, Feedback))
+    assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (True, 0.25, 0.5)
+    assert made.emulator.rig.feedback.proportional_gain == 0.25
+    assert made.emulator.rig.feedback.integral_gain == pytest.approx(1500.0), "as it was"
+    assert peer.get("x-feedback-on") == "true"
+    response = peer.set("x-feedback-on", False)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "can be asked for, not set" in response.reason
+
+
+def test_what_this_hardware_lacks_is_not_supported(bench: Make) -> None:
+    """GXSM answers -inf, or worse, for parameters that it does not have: it is not asked for them."""
+    made = bench(card="simulator")
+    peer = made.start()
+    peer.until(FREE)
+    for name in (names.SCAN_SPEED, names.ZCTRL_SETPOINT, names.SAMPLE_SLOPE_X):
+        assert peer.get_response(name).code == ControlResponse.PARAM_NOT_SUPPORTED, name
+        assert peer.set(name, 1).code == ControlResponse.PARAM_NOT_SUPPORTED, name
+    assert peer.set(names.TIP_BIAS_VOLTAGE, 0.5).ok
+    assert peer.set("x-pixel-rate", 4000).ok
+    assert peer.act(names.START_SPEC).code == ControlResponse.ACTION_NOT_SUPPORTED
+    assert "unsupported: move-speed, sample-slope-x" in made.said()
+    assert peer.get("x-controller") == "GXSM (simulator)"
+
+
+def test_gxsms_own_simulator_scans(bench: Make) -> None:
+    peer = bench(card="simulator").start()
+    ready(peer)
+    assert peer.set("x-pixel-rate", 400).ok
+    assert scanned(peer)["ZS-Topo"].region == TURNED
+
+
+def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make) -> None:
+    made = bench(reach_m=0.5e-6)
+    peer = made.start()
+    ready(peer)
+    far = Region((0.8e-6, 0.0), (300e-9, 100e-9))
+    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(far, SHAPE, ""))
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "nothing was changed" in response.reason
+    assert float(peer.get(names.SCAN_TOP_LEFT_X)) == pytest.approx(TURNED.top_left_m[0], rel=1e-9)
+    assert any(dialog.startswith("Valid Range of OffsetX") for dialog in made.emulator.program.dialogs)
+
+
+def test_other_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
+    made = bench()
+    peer = made.start(
+        parameters={
+            "x-motor": {"vendor": "dsp-fbs-motor"},
+            "x-wrong": {"vendor": "dsp-nonsense"},
+        },
+        actions={"x-stop-all": {"command": "DSP_CMD_STOPALL"}, "x-nonsense": {"command": "DSP_CMD_NONSENSE"}},
+    )
+    peer.until(FREE)
+    assert peer.set("x-motor", 1.5).ok
+    assert made.emulator.program.entries["dsp-fbs-motor"] == 1.5
+    assert peer.get_response("x-wrong").code == ControlResponse.PARAM_NOT_SUPPORTED
+    assert peer.act("x-stop-all").ok
+    response = peer.act("x-nonsense")
+    assert response.code == ControlResponse.ACTION_NOT_SUPPORTED
+    assert "DSP_CMD_NONSENSE" in response.reason
+
+
+# --- the probe, and spectra ---
+
+
+def test_the_probe_is_sent_into_the_frame_and_nowhere_else(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved(peer, 100e-9, 10e-9)
+    assert made.emulator.rig.probe_m == pytest.approx((100e-9, 10e-9), rel=1e-9)
+    assert float(peer.get(names.PROBE_POS_X)) == 100e-9
+    response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((500e-9, 0.0)))
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "within the scan frame alone" in response.reason
+    assert float(peer.get(names.PROBE_POS_X)) == 100e-9
+
+
+@pytest.mark.parametrize(
+    ("kind", "first", "settings"),
+    [
+        ("IV", "Bias-mon", {}),
+        ("force", "Z-mon", {"version": 3}),
+        ("IV", "Bias-mon", {"transport": "shm"}),
+        ("VP", "Bias-mon", {"card": "RPSPMC"}),
+    ],
+)
+def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first: str, settings: dict[str, Any]) -> None:
+    """A scan in between moves the tip: it is sent back first."""
+    made = bench(speed=20.0, **settings)
+    peer = made.start()
+    ready(peer)
+    moved(peer, 52.3456789e-9, -20e-9)
+    scanned(peer)
+    assert peer.set(names.SPEC_KIND, kind).ok
+    assert peer.act(names.START_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "FREE"]
+    (spectrum,) = (one for one in heard if isinstance(one, Spectrum))
+    assert spectrum.position_m == (52.3456789e-9, -20e-9)
+    assert spectrum.kind == kind
+    assert spectrum.names[0] == first
+    assert spectrum.filename.endswith("-VP001-VP.vpdata")
+    true = made.emulator.rig.spectrum
+    assert true is not None
+    assert true.position_m == pytest.approx((52.3456789e-9, -20e-9), rel=1e-6)
+    np.testing.assert_allclose(spectrum.values[:, 0], true.values[:, 0], rtol=1e-6)
+
+
+def test_a_spectrum_out_of_the_frame_is_refused(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved(peer, 100e-9, 10e-9)
+    elsewhere = ScanParameters(Region((900e-9, 0.0), (300e-9, 100e-9)), SHAPE, "")
+    assert peer.ask(ControlRequest.SET_SCAN_PARAMS, elsewhere).ok
+    peer.until(FREE)
+    response = peer.act(names.START_SPEC)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "within the scan frame alone" in response.reason
+
+
+def test_spectra_one_after_the_other(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer)
+    files = []
+    for _ in range(3):
+        assert peer.act(names.START_SPEC).ok
+        files += [one.filename[-12:] for one in peer.until(FREE) if isinstance(one, Spectrum)]
+    assert len(files) == 3
+
+
+@pytest.mark.parametrize("settings", [{}, {"card": "RPSPMC"}], ids=["sranger", "rpspmc"])
+def test_a_spectrum_is_stopped_where_the_hardware_can(bench: Make, settings: dict[str, Any]) -> None:
+    made = bench(speed=2.0, **settings)
+    peer = made.start()
+    ready(peer)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    made.at_panel(lambda emulator: emulator.rig.stop_move())
+    until_s = made.clock.now_s() + 60.0
+    while made.emulator.rig.spectrum is None and made.clock.now_s() < until_s:
+        peer.get(names.SPEC_KIND)
+    response = peer.act(names.STOP_SPEC)
+    if settings:
+        assert response.code == ControlResponse.ACTION_NOT_SUPPORTED
+        assert "RPSPMC" in response.reason
+        return
+    assert response.ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in heard)
+
+
+def test_the_approach_is_a_coarse_motor(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = made.start()
+    ready(peer)
+    made.at_panel(lambda emulator: setattr(emulator.rig, "engaged", False))
+    assert peer.act(names.ENGAGE).ok
+    assert states(peer.until(FREE)) == ["COARSE_MOTOR", "FREE"]
+    assert made.emulator.rig.engaged
+
+
+# --- at the panel ---
+
+
+def test_a_scan_started_at_the_panel_is_published(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer, shape=(40, 32))
+    made.at_panel(lambda emulator: emulator.program.start_scan())
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    assert {scan.region for scan in scans(heard)} == {TURNED}
+
+
+def test_busy_is_said(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    assert peer.act(names.START_SCAN).code == ControlResponse.NOT_FREE
+    assert peer.set(names.SCAN_SIZE_X, 1e-7).code == ControlResponse.NOT_FREE
+    assert peer.get(names.SCAN_RESOLUTION_X) == "32"
