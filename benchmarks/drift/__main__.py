@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import importlib.util
 import json
 import os
 import secrets
@@ -40,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console(record=True, width=140, highlight=False)
     plan = Plan(asked.seed, asked.quick, _available(asked.estimators, console))
     began_s = time.perf_counter()
-    modules = [(n, importlib.import_module(f"benchmarks.drift.{n}")) for n in asked.parts if _exists(n)]
+    modules = [(n, importlib.import_module(f"benchmarks.drift.{n}")) for n in asked.parts]
     lists = [module.jobs(plan) for _, module in modules]
     results = done([job for jobs in lists for job in jobs], asked.processes)
     rows: list[Row] = []
@@ -82,10 +81,6 @@ def _available(names: Sequence[str], console: Console) -> tuple[str, ...]:
         else:
             found.append(name)
     return tuple(found)
-
-
-def _exists(part: str) -> bool:
-    return importlib.util.find_spec(f"benchmarks.drift.{part}") is not None
 
 
 def _targets(rows: Sequence[Row]) -> Table:

@@ -55,24 +55,18 @@ class Frame:
 
 @dataclass(frozen=True)
 class View:
-    """A tip's image of a sample, wherever one wants to know it (cubic B-spline on a fine grid).
-
-    Attributes:
-        origin_px: (x, y) of the origin of the sample on the grid.
-    """
+    """A tip's image of a sample, wherever one wants to know it (cubic B-spline on a fine grid)."""
 
     grid: Grid
     coefficients: Array
-    origin_px: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, grid: Grid, image: Array, origin_px: tuple[float, float] = (0.0, 0.0)) -> View:
-        return cls(grid, ndimage.spline_filter(image, order=3, mode="nearest"), origin_px)
+    def of(cls, grid: Grid, image: Array) -> View:
+        return cls(grid, ndimage.spline_filter(image, order=3, mode="nearest"))
 
     def at(self, sample_px: Array) -> Array:
         """Values at positions (2, …) in the sample."""
-        origin_px = np.array(self.origin_px).reshape(2, *[1] * (sample_px.ndim - 1))
-        where = self.grid.index(sample_px + origin_px)
+        where = self.grid.index(sample_px)
         return np.asarray(ndimage.map_coordinates(self.coefficients, where, order=3, mode="nearest", prefilter=False))
 
     def gradient(self, sample_px: Array) -> Array:
@@ -212,24 +206,24 @@ def _views(
     """What the tip sees of the sample in each scan; once if it is the same."""
     corners = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
     reach = max(np.abs(f.sample_px(corners * f.width_px[:, None])).max() for f in frames)
-    grid = Grid(reach + MARGIN_PX + (ELSEWHERE_PX if how.elsewhere else 0.0))
+    grid = Grid(reach + MARGIN_PX)
     second_tip = None
     if how.second_tip_px:
         direction = random.uniform(0.0, 2 * math.pi)
         second_tip = (how.second_tip_px * math.cos(direction), how.second_tip_px * math.sin(direction))
     number = list(SURFACES).index(surface)
 
-    def relief(place: int) -> Array:
+    def relief(grid: Grid, place: int) -> Array:
         specimen = np.random.default_rng([seed, number, 1])
         height = SURFACES[surface](grid, specimen, np.random.default_rng([seed, number, 2, place]))
         level: Array = (height - height.mean()) / height.std()
         return level
 
-    height = relief(0)
+    height = relief(grid, 0)
     first = View.of(grid, imaged(height))
     if how.elsewhere:  # and not the same distance from what every place has near its origin
         x, y = random.uniform(-ELSEWHERE_PX, ELSEWHERE_PX, 2)
-        return first, View.of(grid, imaged(relief(1)), (x, y))
+        return first, View.of(grid, imaged(relief(Grid(grid.half_px, (x, y)), 1)))
     return first, View.of(grid, imaged(height, second_tip)) if second_tip else first
 
 

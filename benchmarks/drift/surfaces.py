@@ -24,9 +24,14 @@ BAND_PX = 0.5  # Gaussian that limits the band, as feedback and probe do
 
 @dataclass(frozen=True)
 class Grid:
-    """A square of fine points about the origin, of `half_px` in each direction at least."""
+    """A square of fine points, of `half_px` from its middle in each direction at least; positions are relative to it.
+
+    Attributes:
+        middle_px: (x, y) where it lies, for surfaces that have something special at their origin.
+    """
 
     half_px: float
+    middle_px: tuple[float, float] = (0.0, 0.0)
 
     @property
     def count(self) -> int:
@@ -44,14 +49,14 @@ class Grid:
 def stamper(grid: Grid, specimen: Random, place: Random) -> Array:
     """Bumps on tracks 102 px apart, 32 px wide, 3 to 11 bits of 17.8 px long; one ends near the origin."""
     pitch, half_width, bit, flank = 102.0, 16.0, 17.8, 6.0
-    x, y = grid.axis_px[None, :], grid.axis_px[:, None]
+    x, y = grid.axis_px[None, :] + grid.middle_px[0], grid.axis_px[:, None] + grid.middle_px[1]
     angle = math.radians(specimen.uniform(-15.0, 15.0))
     along = x * math.cos(angle) + y * math.sin(angle) + place.uniform(-15.0, 15.0)
     across = y * math.cos(angle) - x * math.sin(angle) + place.uniform(-20.0, 20.0)
     track = np.round(across / pitch)
     height = np.zeros(along.shape)
     for number in np.unique(track):
-        enough = 2 * math.ceil((1.5 * grid.half_px + 200.0) / (3 * bit))
+        enough = 2 * math.ceil((1.5 * (grid.half_px + max(map(abs, grid.middle_px))) + 200.0) / (3 * bit))
         runs = bit * np.minimum(3 + place.geometric(0.33, enough) - 1, 11)
         edges = np.cumsum(runs)
         edges -= edges[len(edges) // 2] + (0.0 if number == 0 else place.uniform(0.0, 8 * bit))
