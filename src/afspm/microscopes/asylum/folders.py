@@ -28,7 +28,7 @@ def local(igor_path: str, folders: Mapping[str, str]) -> Path:
     if sys.platform != "win32" or len(parts[0]) != 1:
         hint = f'folders = {{ "{igor_path}" = "/where/it/is/mounted" }}'
         raise ConfigError(f"Asylum saves to {igor_path!r}, which is not on this computer", where="folders", hint=hint)
-    return Path(PureWindowsPath(f"{parts[0]}:\\", *parts[1:]))
+    return Path(str(PureWindowsPath(f"{parts[0]}:/", *parts[1:])))
 
 
 def _begins(parts: list[str], start: list[str]) -> bool:
