@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from afspm import wire
 from afspm.clock import Clock
-from afspm.errors import NoResponse, WireError
+from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import ControlRequest, ControlResponse, Parameter, Response, ScopeState, ScopeStatus, names
 from afspm.runtime.link import Link
+from afspm.runtime.stopping import StopRequested
 from afspm.testing.translators.story import Heard, Story, told
 from afspm.testing.translators.verdicts import Failed, Lost, expect
 
 STARTED_S = 30.0
 """Real seconds until translator and scheduler are up and the microscope has said that it is free."""
+ANSWERED_S = 15.0
+"""Real seconds until an answer: longer than a scheduler waits for the translator's."""
 NOTICED_S = 10.0
 """Real seconds until what was asked for is published."""
 QUIET_S = 0.2
@@ -29,16 +33,18 @@ class Bench:
     """A component of a kind of its own: it is told everything, and hides nothing.
 
     Args:
-        link: connected, or about to be.
-        lost: says why nothing can be asked any more (a process ended); empty while all is well.
+        link: to the scheduler, connected or about to be.
+        direct: to the translator, past the scheduler, which would refuse some things by itself; None: there is none.
+        lost: says why the links were told that the parent is gone: which process has ended.
 
     Attributes:
         story: what is published.
         at_start: what of it was there before anything was asked.
     """
 
-    def __init__(self, link: Link, lost: Callable[[], str]) -> None:
+    def __init__(self, link: Link, direct: Link | None, lost: Callable[[], str]) -> None:
         self._link = link
+        self._direct = direct or link
         self._lost = lost
         self.clock: Clock = link.clock
         self.story = Story()
@@ -62,7 +68,7 @@ class Bench:
             self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a controller that is found")
         except Failed as failure:
             raise Lost(str(failure)) from failure
-        response = self._link.request(ControlRequest.REQUEST_CTRL, 0)
+        response = self._asked_by(self._link, ControlRequest.REQUEST_CTRL, 0)
         if not response.ok:
             raise Lost(f"control is not given: {answer_in_words(response)}")
         self.quiet()
@@ -81,14 +87,21 @@ class Bench:
             Failed: there is none.
             Lost: a process has ended, or control was taken away.
         """
-        self._require_alive()
-        try:
-            response = self._link.request(kind, subject)
-        except NoResponse:
-            self._require_alive()
-            raise Failed(f"an answer to REQ_{kind.name}", f"none, in {self._link.request_timeout_s:g} s") from None
+        response = self._asked_by(self._link, kind, subject)
         if response.code == ControlResponse.NOT_IN_CONTROL:
             raise Lost(f"control was lost: {response.reason}")
+        return response
+
+    def ask_directly(self, kind: ControlRequest, subject: Any) -> Response:
+        """As `ask`, past the scheduler: for what the translator has to refuse by itself."""
+        return self._asked_by(self._direct, kind, subject)
+
+    def _asked_by(self, link: Link, kind: ControlRequest, subject: Any) -> Response:
+        try:
+            with self._alive():
+                response = link.request(kind, subject, until_s=link.until(ANSWERED_S))
+        except NoResponse:
+            raise Failed(f"an answer to REQ_{kind.name}", f"none within {ANSWERED_S:g} s") from None
         self._stirred |= response.ok and not _only_asks(kind, subject)
         return response
 
@@ -125,19 +138,16 @@ class Bench:
             Failed: it did not come.
         """
         mark = self.story.mark()
-        if not self._link.wait(lambda: done() or bool(self._lost()), self._link.until(within_s)):
-            came = told(self.story.since(mark))
-            raise Failed(f"{expected} within {within_s:.3g} s", came)
-        self._require_alive()
+        self._wait(done, within_s, expected, mark)
 
     def wait_state(self, state: ScopeState, mark: int, within_s: float = NOTICED_S) -> None:
         """Wait until a state is heard after `mark`."""
-        if not self._link.wait(
-            lambda: self.story.has_state(state, mark) or bool(self._lost()), self._link.until(within_s)
-        ):
-            came = told(self.story.since(mark))
-            raise Failed(f"SS_{state.name} within {within_s:.3g} s", came)
-        self._require_alive()
+        self._wait(lambda: self.story.has_state(state, mark), within_s, f"SS_{state.name}", mark)
+
+    def _wait(self, done: Callable[[], bool], within_s: float, expected: str, mark: int) -> None:
+        with self._alive():
+            came = self._link.wait(done, self._link.until(within_s))
+        expect(came, f"{expected} within {within_s:.3g} s", told(self.story.since(mark)))
 
     def settled(self, mark: int, experiment_s: float = MOVED_S) -> list[Heard]:
         """All that is published after `mark` until the microscope is free and quiet."""
@@ -154,12 +164,9 @@ class Bench:
         until_s = self.clock.monotonic_s() + NOTICED_S
         while self.clock.monotonic_s() < until_s:
             count = len(self.story.all)
-            if not self._link.wait(
-                lambda n=count: len(self.story.all) != n or bool(self._lost()),  # type: ignore[misc]
-                self._link.until(QUIET_S),
-            ):
-                return
-            self._require_alive()
+            with self._alive():
+                if not self._link.wait(lambda n=count: len(self.story.all) != n, self._link.until(QUIET_S)):  # type: ignore[misc]
+                    return
 
     def real_s(self, experiment_s: float) -> float:
         """How long that may last in real time: never less than it takes to be noticed."""
@@ -178,9 +185,14 @@ class Bench:
         if self._stirred:
             self.quiet()
 
-    def _require_alive(self) -> None:
-        if self._lost():
-            raise Lost(self._lost())
+    @contextmanager
+    def _alive(self) -> Iterator[None]:
+        try:
+            yield
+        except StopRequested:
+            raise Lost(self._lost()) from None
+        except ExperimentEnded as ended:
+            raise Lost(str(ended)) from ended
 
 
 def _only_asks(kind: ControlRequest, subject: Any) -> bool:

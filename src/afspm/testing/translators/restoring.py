@@ -41,6 +41,7 @@ class Before:
         """
         wrong: list[str] = []
         try:
+            bench.quiet()
             bench.come_to_rest()
             self._put_back_together(bench, wrong)
             ordered = sorted(self.parameters, key=lambda name: name in _LAST)

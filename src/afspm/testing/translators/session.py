@@ -15,8 +15,9 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.experiment.parts import EMULATED
+from afspm.experiment.wiring import connectable
 from afspm.runtime.component import Component
-from afspm.runtime.launch import Launch
+from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
 from afspm.supervisor import common_clock, run_folder
 from afspm.supervisor.log import SUPERVISOR, RunLog
@@ -25,6 +26,7 @@ from afspm.testing.translators.bench import Bench
 from afspm.testing.translators.processes import Processes
 from afspm.testing.translators.support import Support, find_out
 from afspm.transport.launching import open_port
+from afspm.transport.port import ParentGone, Port
 
 NAME = "translator_test"
 SPEED = 20.0
@@ -116,19 +118,19 @@ def opened(options: Options) -> Iterator[Session]:
     own, starts = _starts(experiment, options, clock, folder)
     log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
     run_folder.write_experiment(folder, experiment.expanded())
-    port = open_port(own, clock)
-    processes = Processes(starts, log, clock, port.wake_up)
+    ports = [open_port(own, clock)]
+    address = _translator_address(experiment, starts)
+    if address is not None and not own.keys:  # with keys a translator obeys the scheduler alone
+        ports.append(open_port(replace(own, sockets=Sockets(control=address), envelopes=()), clock))
+
+    def none_goes_on() -> None:
+        for port in ports:
+            port.wake_up(ParentGone())
+
+    processes = Processes(starts, log, clock, none_goes_on)
     try:
-        link = Link(
-            port,
-            NAME,
-            source=own.sockets.subscribe[0],
-            session=os.urandom(4).hex(),
-            request_timeout_s=own.request_timeout_s,
-            request_retries=own.request_retries,
-            log=_logger(log),
-        )
-        bench = Bench(link, lambda: processes.ended)
+        links = [_link(port, own, _logger(log)) for port in ports]
+        bench = Bench(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
         bench.begin()
         abilities = resolved.abilities(translator)
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
@@ -137,7 +139,8 @@ def opened(options: Options) -> Iterator[Session]:
         yield Session(bench, support, named, resolved.simulated, folder)
         bench.end()
     finally:
-        port.close()
+        for port in ports:
+            port.close()
         processes.close()
         log.close()
 
@@ -168,6 +171,34 @@ def _starts(
             hint='lay a file over it with [scheduler] class = "Scheduler"',
         )
     return own, [start for start in starts if start.launch.name != NAME]
+
+
+def _translator_address(experiment: Experiment, starts: Sequence[Start]) -> str | None:
+    """Where the scheduler asks the translator; None: nobody says."""
+    for start in starts:
+        if start.role is Role.SCHEDULER:
+            return start.launch.sockets.control
+        if start.role is Role.TRANSLATOR and start.launch.sockets.serve:
+            return connectable(start.launch.sockets.serve)
+    net = experiment.resolved.net
+    keys = [net.links[part.name].control for part in experiment.resolved.with_role(Role.SCHEDULER)]
+    for key in filter(None, keys):
+        slot = net.slots.get(key)
+        address = key if slot is None else slot.address
+        return None if address is None else connectable(address)
+    return None
+
+
+def _link(port: Port, own: Launch, log: logging.Logger) -> Link:
+    return Link(
+        port,
+        NAME,
+        source=own.sockets.subscribe[0],
+        session=os.urandom(4).hex(),
+        request_timeout_s=own.request_timeout_s,
+        request_retries=own.request_retries,
+        log=log,
+    )
 
 
 def _clock(experiment: Experiment, options: Options) -> ExperimentClock:

@@ -29,7 +29,7 @@ def refused(kit: Taking) -> None:
     for kind, subject, what, needs in asked:
         if kit.support.has(*needs):
             _require_running(kit, mark)
-            response = kit.bench.ask(kind, subject)
+            response = kit.bench.ask_directly(kind, subject)
             expect(
                 response.code == ControlResponse.NOT_FREE, f"REP_NOT_FREE to {what} while SS_SCANNING",
                 answer_in_words(response),

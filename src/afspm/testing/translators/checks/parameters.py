@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from afspm.model import ControlResponse, Parameter, Response, names
+from afspm.model import ControlRequest, ControlResponse, Parameter, Response, names
 from afspm.testing.translators.bench import answer_in_words, value_in
 from afspm.testing.translators.registry import check
 from afspm.testing.translators.taking import Taking, number
@@ -136,7 +136,7 @@ def _require_refused(kit: Taking, name: str) -> None:
 def require_param_error(kit: Taking, name: str, value: str, unit: str | None, before: Parameter) -> None:
     """Setting that is refused with REP_PARAM_ERROR, and changes nothing."""
     asked = f"{name} = {value!r} {unit or ''}".rstrip()
-    response = kit.bench.set(name, value, unit)
+    response = kit.bench.ask_directly(ControlRequest.PARAM, Parameter(name, value, unit))
     expect(response.code == ControlResponse.PARAM_ERROR, f"REP_PARAM_ERROR to {asked}", answer_in_words(response))
     after = kit.bench.get(name)
     expect(

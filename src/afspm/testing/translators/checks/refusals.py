@@ -29,7 +29,7 @@ def unknown_action(kit: Taking) -> None:
 
 
 def _require(kit: Taking, kind: ControlRequest, subject: object, code: ControlResponse, what: str) -> None:
-    response = kit.bench.ask(kind, subject)
+    response = kit.bench.ask_directly(kind, subject)
     expect(response.code == code, f"REP_{code.name} to {what}", answer_in_words(response))
 
 
@@ -94,7 +94,7 @@ def _require_unchanged(kit: Taking, kind: ControlRequest, subject: object, publi
     bench = kit.bench
     bench.come_to_rest()
     before, mark = bench.story.newest(published), bench.story.mark()
-    response = bench.ask(kind, subject)
+    response = bench.ask_directly(kind, subject)
     expect(response.code == ControlResponse.PARAM_ERROR, f"REP_PARAM_ERROR to {what}", answer_in_words(response))
     heard = bench.settled(mark)
     expect(bench.story.newest(published) == before, f"nothing changed by {what}", told(heard))

@@ -1,0 +1,92 @@
+"""Each of these translators is wrong in one thing, and the checks say in which."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from afspm.testing.translators import Options, Report, run
+
+HERE = Path(__file__).parent
+EXPERIMENT = """
+[microscope]
+component = true
+class = "{name}"
+surface = "particles"
+seed = 4
+initial = {{ tip-bias-voltage = "200 mV", scan-angle = "3 deg" }}
+"""
+
+
+def checked(folder: Path, name: str, *only: str) -> Report:
+    shutil.copy(HERE / "broken.py", folder)
+    file = folder / "experiment.toml"
+    file.write_text(EXPERIMENT.format(name=name), encoding="utf-8")
+    return run(Options([file], runs=folder / "runs", only=only))
+
+
+@pytest.mark.parametrize(
+    ("name", "check", "said"),
+    [
+        ("HalfAFrameOff", "scan/frame", r"off by \(\+0\.50, \+0\.50\) frames"),
+        ("OnePixelTooLarge", "scan/frame", r"a size of \(516\.129, 516\.129\) nm instead of \(500, 500\) nm"),
+        ("InOtherCoordinates", "scan/frame", r"a size of \(5e\+11, 5e\+11\) nm instead of \(500, 500\) nm"),
+        ("SwappedAxes", "scan/not-square", r"a size of \(300, 600\) nm instead of \(600, 300\) nm"),
+        ("MirroredY", "scan/picture", "correlation of .*, and of 0.* with y mirrored"),
+        ("TurnedTheWrongWay", "scan/picture", "with angles the other way round"),
+        ("AngleOfTheWrongSign", "scan/turned", "an angle of -23° instead of 23°"),
+        (
+            "TimeOfTheStart",
+            "scan/time",
+            r"the time at which the scan .* ended, which lasted .*; came .* before it ended",
+        ),
+        ("WrongUnit", "scan/duration", "as scan-speed says .is its unit right"),
+        ("FreeBeforeTheScan", "scan/order", "SS_SCANNING, Scan2d …, SS_FREE; came SS_SCANNING, SS_FREE, Scan2d"),
+        ("CancelIgnored", "scan/cancel", "expected .*SS_FREE.*; came "),
+        ("SpectrumElsewhere", "spectrum/position", r"expected a spectrum at .*; came \(0, 0\) nm"),
+        ("NotOnlyWhatWasAsked", "frame/position-only", "a size of .* instead of"),
+        ("NeverFreeAgain", "frame/set", "expected SS_FREE within"),
+        ("PublishesTwice", "frame/set", "ScanParameters2d once.*; came SS_MOVING, ScanParameters2d, ScanParameters2d"),
+        ("SuccessWithoutChange", "feedback/numbers", "expected ZCtrlParameters with proportional_gain = "),
+        ("Clamps", "refused/too-large", "REP_PARAM_ERROR to scan-size-x = '1000' m; came REP_SUCCESS"),
+        ("AcceptsNaN", "refused/sample-slope-x", "REP_PARAM_ERROR to sample-slope-x = 'nan'; came REP_SUCCESS"),
+        ("AnyUnit", "refused/scan-speed", "REP_PARAM_ERROR to scan-speed = '2e-06' kg; came REP_SUCCESS"),
+        ("KnowsEveryAction", "refused/unknown-action", "REP_ACTION_NOT_SUPPORTED .*; came REP_SUCCESS"),
+        ("BusyNotRefused", "busy/refused", "REP_NOT_FREE to .* while SS_SCANNING; came REP_"),
+        ("SaysNothingAtTheStart", "published/in-force", "expected a ScanParameters at the start"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(name: str, check: str, said: str, tmp_path: Path) -> None:
+    report = checked(tmp_path, f"broken.{name}", check)
+    lines = {failure.name: failure.line for failure in report.failed}
+    assert list(lines) == [check], report
+    assert "\n" not in lines[check]
+    assert re.search(said, lines[check]), lines[check]
+    assert not report.passed
+
+
+def test_the_scan_before_is_not_taken_for_the_new_one(tmp_path: Path) -> None:
+    report = checked(tmp_path, "broken.StaleScan", "scan/not-square", "scan/turned")
+    assert [failure.name for failure in report.failed] == ["scan/turned"], report
+    assert "a size of (600, 300) nm instead of" in report.failed[0].line
+
+
+def test_a_translator_that_dies_is_said_to_and_nothing_more_is_tried(tmp_path: Path) -> None:
+    report = checked(tmp_path, "broken.DiesOfNaN", "refused/scan-speed", "refused/move-speed")
+    assert "the process microscope" in report.lost
+    assert "exit code 3" in report.lost
+    assert report.results == []
+    assert not report.passed
+
+
+def test_what_can_not_be_put_back_is_said(tmp_path: Path) -> None:
+    report = checked(tmp_path, "broken.OnlyUpwards", "parameter/tip-bias-voltage")
+    assert len(report.unrestored) == 1
+    assert "the bias is stuck" in report.unrestored[0]
+    assert not report.passed
+    written = json.loads((Path(report.folder) / "report.json").read_text(encoding="utf-8"))
+    assert written["unrestored"] == report.unrestored
