@@ -201,6 +201,69 @@ def test_a_jump_of_half_a_scan_is_found_at_once_and_believed_the_second_time() -
     assert np.linalg.norm(error_m(world, updates[14].before)) < 20.0 * NM
 
 
+def far_jump(distance_m: float) -> World:
+    """The sample jumps so far between scans 10 and 11 that the next ones share nothing with those before."""
+    jump = np.array([distance_m, 0.0])
+    return World(lambda t: STEADY(t) + (t > 10.5 * INTERVAL_S) * jump)
+
+
+@pytest.mark.parametrize("frames", [0.9, 2.0])
+def test_scans_that_match_only_each_other_do_not_count_as_found(frames: float) -> None:
+    world = far_jump(frames * SIZE_M)
+    updates = follow(BankTracker(world), 30)
+    assert not any(update.matched for update in updates[11:])
+    assert [update.lost for update in updates[10:13]] == [False, False, False]
+    assert all(update.lost for update in updates[13:])
+    assert updates[12].reason == "it matches only scans that matched nothing older"
+    assert updates[12].registrations["scan 11"].accepted
+    assert updates[29].after.sd_m > 500.0 * NM
+    assert "scan 0" in updates[29].registrations
+
+
+def test_after_a_far_jump_one_scan_that_shows_an_old_place_puts_all_right() -> None:
+    world = far_jump(0.9 * SIZE_M)
+    following = BankTracker(world)
+    follow(following, 20)
+    time_s = FRAME_S + 20 * INTERVAL_S
+    tip = following.forecast.at(time_s).mapping.inverse.apply((0.0, 0.0))
+    wide = following.add(scan_at(time_s, tip, size_m=3 * SIZE_M, pixels=16, key="wide"))
+    assert wide.matched
+    assert not wide.lost
+    assert np.linalg.norm(error_m(world, wide.after)) < 5.0 * NM
+    while_lost = [one for one in following.state()["references"] if one["scan"]["key"] in ("scan 18", "scan 19")]
+    assert [one["adrift"] for one in while_lost] == [False, False]
+    updates = follow(following, 4, first=21)
+    assert all(update.matched for update in updates)
+    assert np.linalg.norm(error_m(world, updates[-1].after)) < 2.0 * NM
+
+
+def test_a_place_first_seen_adrift_is_known_once_an_older_one_says_so() -> None:
+    """The first scan of a place next to the known one was not usable with any older; the next ones are."""
+    world = World(STEADY)
+    following = BankTracker(world)
+    follow(following, 8)
+    world.blind |= {f"scan {k}" for k in range(8)}
+    beside = (0.4 * SIZE_M, 0.0)
+    first = follow(following, 1, first=8, sample_m=beside)[0]
+    assert not first.matched
+    world.blind.clear()
+    second = follow(following, 1, first=9, sample_m=beside)[0]
+    assert second.matched
+    world.blind |= {"scan 9", *(f"scan {k}" for k in range(8))}
+    third = follow(following, 1, first=10, sample_m=beside)[0]
+    assert third.matched
+    assert np.linalg.norm(error_m(world, third.after)) < 2.0 * NM
+
+
+def test_however_long_it_is_lost_it_goes_on() -> None:
+    world = World(STEADY)
+    following = BankTracker(world)
+    follow(following, 5)
+    following.restore({**following.state(), "unmatched": 100_000})
+    world.blind.add("scan 5")
+    assert not follow(following, 1, first=5)[0].matched
+
+
 def test_a_new_velocity_is_learned_within_three_scans() -> None:
     turn_s = FRAME_S + 15 * INTERVAL_S
     turned = steady((-0.4 * NM, 0.2 * NM))

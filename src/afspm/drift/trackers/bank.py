@@ -15,7 +15,7 @@ from afspm.drift.trackers import saving
 from afspm.drift.trackers.compensation import Compensation
 from afspm.drift.trackers.filters import Filters
 from afspm.drift.trackers.forecast import BankForecast
-from afspm.drift.trackers.pairs import Comparison, Measured, Newest, agreeing
+from afspm.drift.trackers.pairs import AGREEMENT, Comparison, Measured, Newest, agreeing
 from afspm.drift.trackers.references import Reference, References
 from afspm.drift.trackers.settings import BankSettings
 from afspm.drift.tracking import Forecast, Prediction, Update
@@ -36,10 +36,12 @@ class BankTracker:
     stays consistent and nothing is counted twice. Positions are those at the middle of a scan; where the overlap lies
     elsewhere, the time that its rows were taken at counts.
 
-    A result far from all that was expected is believed only if that of the next scan is too. It is lost when the
-    standard deviation of a position is more than half of what a scan may be misplaced and still be compared; several
-    scans in a row that nothing could be registered with mean that too. It then looks everywhere, and is found again
-    when that has made positions certain enough.
+    A result far from all that was expected is believed only if that of the next scan is too. A scan that nothing could
+    be registered with is adrift: kept where it was predicted, but it proves nothing, and neither do those that are
+    known by it alone; how they lie to each other is still followed. Several scans in a row without a place of their own
+    mean that all of them may lie anywhere: it is lost, as it is whenever the standard deviation of a position is more
+    than half of what a scan may be misplaced and still be compared. It then looks everywhere, and is found again when
+    that has made positions certain enough; those adrift are then put right with it.
 
     Args:
         estimator: gets what is expected as prior.
@@ -84,16 +86,17 @@ class BankTracker:
         registrations = {self._references.kept[number].scan.key: found for number, found in tried.items()}
         found = self._compared(newest, tried)
         used = self._believed(newest, found, anywhere=anywhere)
-        self._unmatched = 0 if used else self._unmatched + bool(tried)
-        self._learn(newest, used, tried)
+        placed = used is not None and not all(self._references.kept[one.link.number].adrift for one in used.measured)
+        self._unmatched = 0 if placed else self._unmatched + bool(tried)
+        self._learn(newest, used, tried, placed=placed)
         after = self._known(self._filters)
         self._lost = after.sd_m > self._limit_m(scan)
         return Update(
             key=scan.key,
             before=before,
             after=after,
-            matched=used is not None,
-            reason="" if used else self._why_not(tried, found),
+            matched=placed,
+            reason="" if placed else self._why_not(tried, found, adrift=used is not None),
             lost=self._lost,
             registrations=registrations,
             forecast=self._forecast,
@@ -161,7 +164,7 @@ class BankTracker:
     def _tried(self, newest: Newest, *, anywhere: bool) -> dict[int, Registration]:
         """What the estimator says of the scan and each reference, by its number, the best first."""
         kept, filters = self._references.kept, newest.filters
-        widening = self._settings.widening * 4.0**self._unmatched
+        widening = self._settings.widening * 4.0 ** min(self._unmatched, self._settings.lost_after)
         tried = {}
         for number in self._references.candidates(newest.scan, *_drifts(filters), anywhere=anywhere):
             prior = None if anywhere else newest.prior(number, kept[number], widening)
@@ -197,25 +200,27 @@ class BankTracker:
         far_m, since_s = float(np.linalg.norm(found.apart_m)), newest.scan.mid_s - self._matched_s
         return replace(found, filters=found.filters.widened(far_m, far_m / max(since_s, 1.0)))
 
-    def _learn(self, newest: Newest, used: Comparison | None, tried: Table[int, Registration]) -> None:
+    def _learn(self, newest: Newest, used: Comparison | None, tried: Table[int, Registration], *, placed: bool) -> None:
         """Take in what is believed; keep the scan, unless it is in doubt, and let go of what there is too much of."""
         settings, references, scan = self._settings, self._references, newest.scan
+        filters = newest.filters if used is None else used.filters
+        if self._unmatched == settings.lost_after and not placed:
+            filters = self._cut_off(filters, scan)
         noise = np.eye(2) * settings.jitter_m**2
         if used is None:
-            filters = newest.filters
-            if self._unmatched == settings.lost_after:
-                filters = filters.widened(self._limit_m(scan), settings.start_velocity_sd_m_s)
             self._filters = filters.with_scan(noise)
         else:
-            self._matched_s = scan.mid_s
-            filters = used.filters.with_scan(noise + used.scan_noise_m2)
+            filters = filters.with_scan(noise + used.scan_noise_m2)
             rows, values, pair_noise = used.rows(filters.mean.shape[1])
             self._filters = filters.updated(rows, values, pair_noise, forget=settings.forget, rarest=settings.rarest)
-        numbers = {one.link.number for one in used.measured} if used else set()
-        adrift = all(references.kept[number].adrift for number in numbers) and bool(tried)
-        references.judged({number: number in numbers for number in tried}, self._scans)
+        if placed:
+            self._matched_s = scan.mid_s
+            numbers = {one.link.number for one in used.measured} if used else set()
+            references.judged({number: number in numbers for number in tried}, self._scans)
+            self._vouch(newest, {number: tried[number] for number in tried if tried[number].accepted})
         drift_m, drifts_m = _drifts(self._filters)
-        anchor = references.needs_anchor(scan, drift_m, drifts_m[:-1])
+        adrift = bool(tried) and not placed
+        anchor = not adrift and references.needs_anchor(scan, drift_m, drifts_m[:-1])
         references.kept.append(Reference(scan, newest.compensated_m_s, anchor, adrift, used=self._scans))
         if self._doubted_m is not None:
             self._drop(len(references) - 1)
@@ -223,12 +228,30 @@ class BankTracker:
             self._drop(number)
         self._forecast = BankForecast.of(self._filters, self._compensation)
 
+    def _cut_off(self, filters: Filters, scan: DriftScan) -> Filters:
+        """With the present and all that is adrift anywhere, and together: what lies between them is known still."""
+        adrift = [number for number, one in enumerate(self._references) if one.adrift]
+        return filters.widened(self._limit_m(scan), self._settings.start_velocity_sd_m_s, scans=adrift)
+
+    def _vouch(self, newest: Newest, found: Table[int, Registration]) -> None:
+        """Those adrift that the newest scan, the last in the state, finds where they are thought to be are known."""
+        assert self._filters is not None
+        kept, states = self._references.kept, self._filters.mean.shape[1]
+        for number in [number for number in found if kept[number].adrift]:
+            one = Measured.of(newest, number, kept[number], found[number], self._settings.inflation)
+            expected, covariance = self._filters.mixed(one.link.rows(states, states - 4))
+            apart = one.value_m - expected
+            if apart @ np.linalg.solve(covariance + one.pair_noise_m2, apart) <= AGREEMENT:
+                kept[number] = replace(kept[number], adrift=False)
+
     def _drop(self, number: int) -> None:
         assert self._filters is not None
         del self._references.kept[number]
         self._filters = self._filters.without_scan(number)
 
-    def _why_not(self, tried: Table[int, Registration], found: Comparison | None) -> str:
+    def _why_not(self, tried: Table[int, Registration], found: Comparison | None, *, adrift: bool) -> str:
+        if adrift:
+            return "it matches only scans that matched nothing older"
         if found is not None:
             far = f"found {found.surprise**0.5:.1f} standard deviations from where it was expected"
             return f"{far}; believed if the next one is too"

@@ -9,6 +9,7 @@ later counts (as landmarks in simultaneous localisation and mapping: Smith, Self
 from __future__ import annotations
 
 from collections.abc import Mapping as Table
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -72,11 +73,14 @@ class Filters:
         covariance[:, :4, :4] += gained
         return replace(self, time_s=time_s, mean=mean, covariance=covariance)
 
-    def widened(self, position_sd_m: float, velocity_sd_m_s: float) -> Filters:
-        """Knowing less of the present."""
+    def widened(self, position_sd_m: float, velocity_sd_m_s: float, scans: Sequence[int] = ()) -> Filters:
+        """Knowing less of the present, and of where the given scans lie: all of them by the same unknown distance."""
         covariance = self.covariance.copy()
-        for k, sd in enumerate((position_sd_m, position_sd_m, velocity_sd_m_s, velocity_sd_m_s)):
-            covariance[:, k, k] += sd**2
+        for axis in range(2):
+            together = [axis, *(4 + 4 * number + axis for number in scans)]
+            for state in together:
+                covariance[:, state, together] += position_sd_m**2
+            covariance[:, 2 + axis, 2 + axis] += velocity_sd_m_s**2
         return replace(self, covariance=covariance)
 
     def with_scan(self, noise_m2: Array) -> Filters:

@@ -21,7 +21,7 @@ from afspm.drift.trackers.references import Reference
 
 Array = NDArray[np.float64]
 
-_AGREEMENT = 25.0  # chi2 of the difference of two references' results
+AGREEMENT = 25.0  # chi2 of the difference of two references' results
 _ALIKE = 0.05  # by which part the courses of two scans may differ if drift is to shear them alike
 
 
@@ -161,7 +161,7 @@ def agreeing(measured: list[Measured], filters: Filters) -> list[Measured]:
             apart = other.value_m - one.value_m - expected
             # both have the scan's own error in common
             noise = covariance + one.pair_noise_m2 + other.pair_noise_m2
-            if i == j or apart @ np.linalg.solve(noise, apart) <= _AGREEMENT:
+            if i == j or apart @ np.linalg.solve(noise, apart) <= AGREEMENT:
                 group.append(other)
         groups.append(group)
     return max(groups, key=len)

@@ -24,7 +24,7 @@ class Reference:
     Attributes:
         compensated_m_s: (2,) velocity with which tip coordinates followed the sample then.
         anchor: it stands for its part of the sample from now on.
-        adrift: it could not be compared with any that was not, so it is where it was predicted.
+        adrift: it could not be compared with any that was not, so where it is was predicted and not seen.
         refusals: how often in a row it could not be registered while another one could.
         used: number of the scan that was last registered with it.
     """
@@ -99,7 +99,8 @@ class References:
     def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:
         """Numbers of those that a scan is to be compared with, the best first.
 
-        Anchors of the same resolution come first, then the newest: the others show what may have changed since.
+        Those adrift, which prove nothing, come last. Anchors of the same resolution come first, then the newest: the
+        others show what may have changed since.
 
         Args:
             drift_m: (2,) expected in the scan.
@@ -113,7 +114,13 @@ class References:
             shared = overlap_ratio(kept.scan.region, scan.region, drift_m - drifts_m[number])
             if anywhere or shared >= self.choice.overlap_min:
                 other_kind = _alike(kept.scan, scan) < 0.5
-                rank = (other_kind, -round(4 * shared), not kept.anchor, number if kept.anchor else -number)
+                rank = (
+                    kept.adrift,
+                    other_kind,
+                    -round(4 * shared),
+                    not kept.anchor,
+                    number if kept.anchor else -number,
+                )
                 fitting.append((rank, number))
         return [number for _, number in sorted(fitting)][: self.choice.compared]
 
