@@ -15,6 +15,8 @@ from afspm.model import Frame, Region
 
 Array = NDArray[np.float64]
 
+_STRETCHED = 2.0  # generous: thermal expansion, creep and shear by drift stay below a few per cent
+
 
 @dataclass(frozen=True, eq=False)
 class Mapping:
@@ -108,3 +110,13 @@ class Mapping:
         size_m = (region.size_m[0] * scale, region.size_m[1] * scale)
         turned = region.angle_rad + (angle if abs(angle) > 1e-15 else 0.0)
         return replace(region, center_m=(float(x), float(y)), size_m=size_m, angle_rad=turned, frame=frame)
+
+
+def unlike_drift(linear: Array) -> str:
+    """Why a finite 2 x 2 part can't be what a sample does between two scans, for a person; empty if it can."""
+    if np.linalg.det(linear) <= 0.0:
+        return f"mirrored or flat: {linear.tolist()}"
+    stretches = np.linalg.svd(linear, compute_uv=False)
+    if stretches[0] > _STRETCHED or stretches[1] < 1.0 / _STRETCHED:
+        return f"stretched by {stretches[0]:.3g} and {stretches[1]:.3g}"
+    return ""

@@ -68,6 +68,10 @@ def test_what_is_right_passes_untouched() -> None:
         (replace(FOUND, covariance_m2=np.diag([1e-20, -1e-20])), "covariance"),
         (replace(FOUND, covariance_m2=np.array([[1e-20, 9e-21], [0.0, 1e-20]])), "covariance"),
         (replace(Registration.refused("x"), reason=""), "without a reason"),
+        (replace(FOUND, linear=np.diag([-2.0, 0.0])), "mirrored"),
+        (replace(FOUND, linear=np.diag([-1.0, 0.0])), "mirrored or flat"),
+        (replace(FOUND, linear=np.diag([0.0, 1.5])), "stretched by 2.5"),
+        (replace(FOUND, displacement_m=np.array([-1.1e-6, 0.0])), "share nothing"),
     ],
 )
 def test_what_an_estimator_gets_wrong_is_refused_with_the_reason(answer: Any, reason: str) -> None:
@@ -75,6 +79,11 @@ def test_what_an_estimator_gets_wrong_is_refused_with_the_reason(answer: Any, re
     assert not found.accepted
     assert "Told" in found.reason
     assert reason in found.reason
+
+
+def test_a_sample_that_was_turned_and_moved_by_most_of_a_frame_may_be() -> None:
+    turned = replace(FOUND, linear=np.array([[0.0, -1.0], [1.0, 0.0]]) - np.eye(2), displacement_m=np.array([9e-7, 0]))
+    assert said(turned) is turned
 
 
 def test_an_estimator_can_not_change_the_scans_it_is_given() -> None:

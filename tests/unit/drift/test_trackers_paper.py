@@ -144,6 +144,27 @@ def test_rotation_and_scale_are_predicted_through_their_logarithms(
         assert predicted.apply(center) == pytest.approx(Turning().matrix(300.0) @ center)
 
 
+@pytest.mark.parametrize("stretch_per_interval", [0.02, -0.02])
+@pytest.mark.parametrize("hours", [12.0, 1000.0])
+def test_after_a_long_pause_only_the_translation_of_the_last_rate_is_predicted(
+    stretch_per_interval: float, hours: float
+) -> None:
+    """An error of two per cent in one interval must not become a scan of thrice the size, or none at all."""
+
+    class Stretching:
+        def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+            linear = np.eye(2) * math.expm1(stretch_per_interval)
+            return Registration(True, "", np.array([NM, 0.0]), np.eye(2) * 1e-20, linear, np.zeros(2))
+
+    following = PaperTracker(Stretching(), transform="affine")
+    following.add(scan_at(0.0))
+    following.add(scan_at(INTERVAL_S))
+    soon, late = (following.forecast.at(INTERVAL_S + s).mapping for s in (INTERVAL_S, hours * 3600.0))
+    assert soon.scale == pytest.approx(math.exp(-2 * stretch_per_interval))
+    assert late.scale == pytest.approx(math.exp(-stretch_per_interval))
+    assert np.linalg.norm(late.translation_m) == pytest.approx(hours * 4 * NM, rel=0.1)
+
+
 def test_a_translation_leaves_rotation_out() -> None:
     following = PaperTracker(Turning())
     following.add(scan_at(0.0, (0.3e-6, 0.0)))

@@ -6,13 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from afspm.drift.mapping import unlike_drift
+from afspm.drift.overlap import overlap_ratio
 from afspm.drift.registration import DriftScan, Estimator, Prior, Registration
 
 
 class Guarded:
     """Runs an estimator so that nobody else needs to be careful.
 
-    An exception, a result that is none, of wrong shapes, or accepted with values that can't be, comes out as refused.
+    An exception, a result that is none, of wrong shapes, or accepted with values that can't be, comes out as refused;
+    so does a displacement with which the scans would share nothing, and a sample that is mirrored or much stretched.
     The estimator gets copies: what it does to them can't reach those who compare the same scans later.
     """
 
@@ -29,7 +32,7 @@ class Guarded:
             found = self.inner.register(_copied(reference), _copied(scan), prior)
         except Exception as error:  # anybody's code may stumble in any way
             return Registration.refused(f"{self.name} failed: {type(error).__name__}: {error}")
-        wrong = _wrong(found)
+        wrong = _wrong(found) or _impossible(found, reference, scan)
         return Registration.refused(f"{self.name} failed: {wrong}") if wrong else found
 
 
@@ -58,4 +61,16 @@ def _wrong(found: object) -> str:
     largest = np.abs(covariance).max()
     if np.abs(covariance - covariance.T).max() > 1e-6 * largest or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         return f"accepted with a covariance that can't be: {covariance.tolist()}"
+    return ""
+
+
+def _impossible(found: Registration, reference: DriftScan, scan: DriftScan) -> str:
+    """Why an accepted result of the right form can't be true of any sample; empty if it can."""
+    if not found.accepted:
+        return ""
+    if unlike := unlike_drift(np.eye(2) + found.linear):
+        return f"accepted with a sample {unlike}"
+    if overlap_ratio(reference.region, scan.region, found.displacement_m) == 0.0:
+        far_m = float(np.hypot(*found.displacement_m))
+        return f"accepted with a displacement of {far_m:.3g} m, with which the scans share nothing"
     return ""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.mapping import Mapping
+from afspm.drift.mapping import Mapping, unlike_drift
 from afspm.drift.overlap import intersection_ratio, sr_norm
 from afspm.drift.registration import DriftScan, Estimator, Registration
 from afspm.drift.trackers import saving
@@ -47,9 +47,14 @@ class PaperForecast:
     rate_covariance: Array
 
     def at(self, time_s: float) -> Prediction:
-        """M_k times the step that the last rate makes of the time since."""
+        """M_k times the step that the last rate makes of the time since; of its translation alone once that has gone
+        on for so long that no sample would turn out like it."""
         since_s = time_s - self.time_s
-        mapping = Mapping(self.matrix @ exponential(self.rate * since_s))
+        step = exponential(self.rate * since_s)
+        if not np.isfinite(step).all() or unlike_drift(step[:2, :2]):
+            step = np.eye(3)
+            step[:2, 2] = self.rate[:2, 2] * since_s
+        mapping = Mapping(self.matrix @ step)
         # x_S = M x_T stays while M moves, so in tip coordinates the sample moves by minus the rate.
         velocity = -self.rate[:2, 2]
         covariance = self.covariance_m2 + since_s**2 * self.rate_covariance
