@@ -78,6 +78,19 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
     assert scans["PhaseTrace"].unit == "deg"
 
 
+def test_a_scan_comes_with_the_frame_that_was_told_whatever_its_digits(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    peer.until(FREE)
+    odd = Region((1e-6 / 3, -1e-7 / 7), (1e-6 / 9, 1e-6 / 7), 1 / 3)
+    assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(odd, SHAPE, "")).ok
+    told = peer.until(lambda one: isinstance(one, ScanParameters) and one.shape == SHAPE)[-1]
+    assert told.region.size_m == pytest.approx(odd.size_m, rel=1e-14)
+    assert told.region.center_m == pytest.approx(odd.center_m, rel=1e-12)
+    peer.until(FREE)
+    assert {scan.region for scan in scanned(peer).values()} == {told.region}
+
+
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: str) -> None:
     """Against the heights of the simulated sample at each pixel: half a frame off, or a mirrored axis, would show."""
@@ -139,6 +152,33 @@ def test_images_that_somebody_takes_at_the_panel_are_published_too(bench: Make) 
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "FREE"]
     assert {one.region for one in heard if isinstance(one, Scan)} == {TURNED}
+
+
+def test_a_scan_that_outlives_the_translator_is_published_by_the_next(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.process.kill()
+    peer = made.start()
+    scans = [one for one in peer.until(FREE) if isinstance(one, Scan)]
+    assert {(scan.region, Path(scan.filename).name) for scan in scans} == {(TURNED, "Image0000.ibw")}
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    scans = [one for one in peer.until(FREE) if isinstance(one, Scan)]
+    assert {Path(scan.filename).name for scan in scans} == {"Image0001.ibw"}
+
+
+def test_a_frame_that_asylum_makes_of_it_is_told(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    # as if the ratios meant something else: what its panels say, and what it scans
+    made.at_panel(lambda emulator: emulator.controller.values.put("FastRatio", 1.0))
+    scan = scanned(peer)["HeightTrace"]
+    assert scan.region.size_m[1] > 2 * TURNED.size_m[1]
+    assert "it is delivered as the file says" in made.said()
 
 
 # --- parameters ---
@@ -324,3 +364,16 @@ def test_a_force_curve_that_is_stopped_gives_none(bench: Make) -> None:
     heard = peer.until(FREE)
     assert states(heard) == ["INTERRUPTED", "FREE"]
     assert not any(isinstance(one, Spectrum) for one in heard)
+
+
+def test_a_force_curve_that_somebody_takes_is_published_with_the_place_of_its_file(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start()
+    peer.until(FREE)
+    made.at_panel(lambda emulator: emulator.rig.move_probe((20e-9, 30e-9)))
+    made.at_panel(lambda emulator: emulator.rig.stop_move())
+    x, y = made.emulator.rig.probe_m
+    made.at_panel(lambda emulator: emulator.controller.curve(made.clock.now_s()))
+    peer.until(ScopeState.SPEC)
+    (curve,) = [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
+    assert curve.position_m == pytest.approx((x, y), rel=1e-4, abs=1e-12)

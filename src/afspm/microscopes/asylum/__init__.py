@@ -13,10 +13,11 @@ from afspm.microscopes.asylum.frame import GLOBALS, NAMES, asylums, from_image, 
 from afspm.microscopes.asylum.harvest import SCAN, Harvest
 from afspm.microscopes.asylum.link import Link
 from afspm.microscopes.asylum.session import Session
-from afspm.microscopes.in_force import POSITION
+from afspm.microscopes.asylum.xop import XopError
+from afspm.microscopes.in_force import FRAME, POSITION, frame
 from afspm.microscopes.microscope import ControllerLost, Microscope, action
 from afspm.microscopes.parameters import FEEDBACK_ON, Value
-from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
 
 ENGAGED: Final = "x-engaged"
@@ -87,11 +88,15 @@ class Asylum(Microscope):
         self.close()
         self._session = session = Session(Link(self._address, self._reply_timeout_s, self.clock.monotonic_s))
         self._kept: dict[str, Any] = self.memory.setdefault("kept", dict(_AT_FIRST))
-        self._harvest = Harvest(self.memory)
-        self._activity = Activity(session, self._harvest, self.memory, self._folders, self.clock, self.log)
+        self._harvest = Harvest(self.memory, self.log)
+        self._activity = Activity(
+            session, self._harvest, self.memory, self._folders, self._frame_in_force, self.clock, self.log
+        )
         session.doing()
         if not session.at_once:
             self.log.warning("Igor has not afspm.ipf: every value is asked for by itself, feedback can't be switched")
+        for what in (SCAN, FORCE):
+            self._activity.folder(what)
         if self._spots != "none":
             session.do("InitProbePos")
         if self._base_name and session.text("GetBaseName") != self._base_name:
@@ -167,6 +172,9 @@ class Asylum(Microscope):
         found = {name: self.table[name].from_vendor(values[self.table[name].vendor]) for name in numbers}
         return found | super().read([name for name in wanted if name not in found])
 
+    def _frame_in_force(self) -> Region:
+        return frame(self.read(FRAME))[0]
+
     def _write_frame(self, framed: Mapping[str, Value]) -> None:
         wanted = asylums(framed, self.read(NAMES))
         there = self._igor.values(list(wanted))
@@ -212,10 +220,18 @@ class Asylum(Microscope):
             self._put_spot(probe_m)
         up = self._kept[names.SCAN_DIRECTION] == names.UP
         self._igor.put("LastScan", 1)
-        if not self._igor.do("DoScanFunc", "UpScan" if up else "DownScan"):
-            raise self._activity.refuse(SCAN)
+        self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
         self._igor.put("LastScan", 1)  # also where beginning to scan puts it back
         self._activity.settle(SCAN)
+
+    def _begin(self, what: str, function: str, button: str) -> None:
+        try:
+            accepted = self._igor.do(function, button)
+        except XopError:
+            self._activity.forget()
+            raise
+        if not accepted:
+            raise self._activity.refuse(what)
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
@@ -231,10 +247,8 @@ class Asylum(Microscope):
             reason = "without ARGetStatus it can't be seen when a force curve has ended"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
         self._activity.saves(FORCE)
-        x, y = self._probe_m() if self._spots != "none" else (0.0, 0.0)
-        self._activity.begin(FORCE, (x, y))
-        if self._igor.ask("DoForceFunc", "Single") == 1.0:
-            raise self._activity.refuse(FORCE)
+        self._activity.begin(FORCE, None if self._spots == "none" else self._probe_m())
+        self._begin(FORCE, "DoForceFunc", "Single")
         self._activity.settle(FORCE)
 
     @action(names.STOP_SPEC)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from afspm.clock import Clock
-from afspm.errors import ConfigError, Refused
+from afspm.errors import Refused
 from afspm.microscopes.asylum.folders import local
-from afspm.microscopes.asylum.frame import GLOBALS, generic
 from afspm.microscopes.asylum.harvest import SCAN, Harvest, Target
 from afspm.microscopes.asylum.session import Session
-from afspm.microscopes.in_force import frame
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 
 FORCE: Final = "force"
@@ -33,6 +31,7 @@ class Activity:
         harvest: takes what comes of it.
         kept: JSON-able, and lasts: the frame of the image that spots are counted on.
         folders: see `folders.local`.
+        frame_in_force: as it was set.
     """
 
     def __init__(
@@ -41,6 +40,7 @@ class Activity:
         harvest: Harvest,
         kept: dict[str, Any],
         folders: Mapping[str, str],
+        frame_in_force: Callable[[], Region],
         clock: Clock,
         log: logging.Logger,
     ) -> None:
@@ -48,6 +48,7 @@ class Activity:
         self._harvest = harvest
         self._kept = kept
         self._folders = folders
+        self._frame_in_force = frame_in_force
         self._clock = clock
         self._log = log
         self._moving_until_s = -math.inf
@@ -82,9 +83,13 @@ class Activity:
         x, y, width, height, angle = kept
         return Region((x, y), (width, height), angle)
 
-    def begin(self, what: str, position_m: tuple[float, float] = (math.nan, math.nan)) -> None:
-        """A measurement begins, with what is in force now."""
-        taken: dict[str, Any] = {"position": list(position_m)}
+    def begin(self, what: str, position_m: tuple[float, float] | None = None) -> None:
+        """A measurement begins, with what is in force now.
+
+        Args:
+            position_m: of a force curve; None: it is left to the file to know.
+        """
+        taken: dict[str, Any] = {"position": position_m and list(position_m)}
         if what == SCAN:
             region = self._frame_in_force()
             taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad]}
@@ -92,19 +97,27 @@ class Activity:
         self._harvest.begin(what, self._target(what), taken)
 
     def saves(self, what: str) -> None:
-        """Have it saved, and find out where.
+        """Have it saved where it can be found.
 
         Raises:
-            ConfigError: that is nowhere that can be seen from here.
+            Refused: ACTION_ERROR: its folder can't be seen from here.
         """
         name = _SAVED_TO[what]
         if self._session.values([name])[name] != _SAVE:
             self._log.warning("Asylum was not to save (%s): now it is", name)
             self._session.put(name, _SAVE)
-        folder = self._target(what).folder
+        folder = self.folder(what)
         if not folder.is_dir():
-            hint = "is the drive there? see the setting folders"
-            raise ConfigError(f"Asylum's folder {folder} can't be seen from here", where="folders", hint=hint)
+            reason = f"Asylum's folder {folder} can't be seen from here: is the drive there? see the setting folders"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
+
+    def folder(self, what: str) -> Path:
+        """Where Asylum saves to, as seen from here.
+
+        Raises:
+            ConfigError: the settings don't say.
+        """
+        return local(self._session.text("GS", _SAVED_TO[what]), self._folders)
 
     def settle(self, what: str) -> None:
         """Until what was begun is seen running, or has ended already.
@@ -140,10 +153,6 @@ class Activity:
         """The tip was sent away; it arrives, which Asylum does not tell, after so long at the latest."""
         self._moving_until_s = self._clock.now_s() + lasts_s
 
-    def _frame_in_force(self) -> Region:
-        return frame(generic(self._session.values(GLOBALS)))[0]
-
     def _target(self, what: str) -> Target:
-        folder: Path = local(self._session.text("GS", _SAVED_TO[what]), self._folders)
         suffix = self._session.values(["BaseSuffix"])["BaseSuffix"]
-        return Target(folder, self._session.text("GetBaseName"), round(suffix))
+        return Target(self.folder(what), self._session.text("GetBaseName"), round(suffix))

@@ -6,6 +6,7 @@ awaited, and which results there are.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -53,8 +54,9 @@ class Harvest:
         kept: JSON-able, and lasts.
     """
 
-    def __init__(self, kept: dict[str, Any]) -> None:
+    def __init__(self, kept: dict[str, Any], log: logging.Logger) -> None:
         self._kept = kept
+        self._log = log
         self._read: dict[str, Content] = {}
         self.broken_off = False
         """Whether what came last was a part of an image; until `results` is called again."""
@@ -71,7 +73,7 @@ class Harvest:
         """A measurement begins.
 
         Args:
-            taken: "frame" (x, y, width, height, angle) of a scan, "position" of a spectrum.
+            taken: "frame" (x, y, width, height, angle) of a scan, "position" of a spectrum, None if it is not known.
         """
         self._kept["running"] = {
             "what": what,
@@ -143,6 +145,7 @@ class Harvest:
         if any(_unfinished(one) for one in content):
             self.broken_off = True
             return True
+        self._warn_of_frame(path, content[0], measured)
         self._kept["taken"] += 1
         # numbered, since Asylum may overwrite a file by one of the same name
         result = f"{self._kept['taken']}: {path.name}"
@@ -151,6 +154,12 @@ class Harvest:
         self._kept["results"] = [*self._kept["results"], entry][-_LISTED:]
         self._read = {result: content}
         return True
+
+    def _warn_of_frame(self, path: Path, one: Scan | Spectrum, measured: Mapping[str, Any]) -> None:
+        """If Asylum scanned another frame than was set: the file is right then."""
+        if isinstance(one, Scan) and one.region != _frame(measured):
+            told = f"{path.name} says a frame of {one.region}, and not of {_frame(measured)} as was in force"
+            self._log.warning("%s: it is delivered as the file says", told)
 
 
 def _target(measured: Mapping[str, Any]) -> Target:
@@ -191,11 +200,16 @@ def _as_taken(one: Scan | Spectrum, measured: Mapping[str, Any]) -> Scan | Spect
     """With the frame or position that was set, of which the note has five digits, and our time."""
     time_ns = measured["end_ns"]
     if isinstance(one, Scan):
-        x, y, width, height, angle = measured["frame"]
-        region = Region((x, y), (width, height), angle)
+        region = _frame(measured)
         return replace(one, region=region if _same(region, one.region) else one.region, time_ns=time_ns)
-    x, y = measured["position"]
-    return replace(one, kind=measured["what"], position_m=(x, y), time_ns=time_ns)
+    place = measured["position"]
+    position_m = one.position_m if place is None else (place[0], place[1])
+    return replace(one, kind=measured["what"], position_m=position_m, time_ns=time_ns)
+
+
+def _frame(measured: Mapping[str, Any]) -> Region:
+    x, y, width, height, angle = measured["frame"]
+    return Region((x, y), (width, height), angle)
 
 
 def _same(a: Region, b: Region) -> bool:
