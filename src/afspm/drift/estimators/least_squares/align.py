@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from afspm.drift.estimators.least_squares.prepare import flatten_rows
 from afspm.drift.estimators.least_squares.rows import noise_metric, products, seen, without_lines
 from afspm.drift.estimators.least_squares.shrink import denoised
+from afspm.drift.estimators.least_squares.spectra import FineFilter
 from afspm.drift.estimators.least_squares.warp import COUNT, Pair, derivative
 
 Array = NDArray[np.float64]
@@ -62,18 +63,20 @@ def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, ste
     return theta
 
 
-def generalised_least_squares(pair: Pair, theta: Array, believed: Believed, rounds: int = 3, steps: int = 3) -> Fit:
+def generalised_least_squares(
+    pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter, rounds: int = 3, steps: int = 3
+) -> Fit:
     """theta by rows (see `rows`), where scars count less. The gradient, the noise and the weights are estimated anew in
     each round, from what the one before has left."""
-    fit = _round(pair, theta, believed, steps)
+    fit = _round(pair, theta, believed, seen_through, steps)
     for _ in range(rounds - 1):
-        before, fit = fit, _round(pair, fit.theta, believed, steps)
+        before, fit = fit, _round(pair, fit.theta, believed, seen_through, steps)
         if np.hypot(*(fit.theta - before.theta)[:2]) < SETTLED_PX:
             break
     return fit
 
 
-def _round(pair: Pair, theta: Array, believed: Believed, steps: int) -> Fit:
+def _round(pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter, steps: int) -> Fit:
     """Newton's steps to H'Q r + P (theta - mean) = 0. H is free of most of the noise of the gradient (see `shrink`),
     but it is the gradient with its noise that says how r changes with theta."""
     one, two, known = pair.warped(theta)
@@ -82,7 +85,7 @@ def _round(pair: Pair, theta: Array, believed: Believed, steps: int) -> Fit:
     left = without_lines(residual, known)
     signal = pair.columns(*_signal(gradient, left / 2, known), mean, residual)
     weight = known * _row_weights(left, known)[:, None]
-    signal_q = seen(signal, weight, noise_metric(left, known))
+    signal_q = seen(signal, weight, noise_metric(left, known, seen_through))
     signal_q *= max(weight.sum(), 1.0) / max(float(np.vdot(signal_q[:, -1], residual)), 1e-300)
     signal_q, signal = signal_q[:, :-1], signal[:, :-1]
     curvature = products(signal_q, pair.columns(*gradient, mean, residual)[:, :-1])

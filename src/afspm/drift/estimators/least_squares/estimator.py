@@ -24,7 +24,7 @@ from afspm.drift.estimators.least_squares.rows import without_lines
 from afspm.drift.estimators.least_squares.scene import Scene
 from afspm.drift.estimators.least_squares.score import Scorer
 from afspm.drift.estimators.least_squares.search import Correlation, candidates
-from afspm.drift.estimators.least_squares.spectra import fine_filtered, shared_information
+from afspm.drift.estimators.least_squares.spectra import FineFilter, shared_information
 from afspm.drift.estimators.least_squares.warp import COUNT, LINEAR, Box, Pair
 from afspm.drift.registration import DriftScan, Prior, Registration
 
@@ -108,9 +108,10 @@ def _fine(
     scene: Scene, box: Box, theta: Array, expected: Expected | None, shears: tuple[Array, list[Array]]
 ) -> tuple[Array, Array]:
     """theta and its covariance."""
-    pair = Pair(*scene.splines(fine_filtered(scene.first.values, scene.second.values)), box)
+    fine = FineFilter.of(scene.first.values, scene.second.values)
+    pair = Pair(*scene.splines((fine.applied(scene.first.values), fine.applied(scene.second.values))), box)
     believed = _believed(expected)
-    fit = generalised_least_squares(pair, theta, believed)
+    fit = generalised_least_squares(pair, theta, believed, fine)
     return shear.averaged(fit.theta, covariance(fit, believed), shears[1], shears[0])
 
 

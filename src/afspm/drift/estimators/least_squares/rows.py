@@ -11,9 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.drift.estimators.least_squares.spectra import FineFilter
+
 Array = NDArray[np.float64]
 
-HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the fine filter colours them
+HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
 def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
@@ -51,8 +53,9 @@ def products(one: Array, two: Array, block_rows: int = 8) -> Array:
     return np.concatenate([np.add.reduceat(part, starts, axis=0) for part in parts])
 
 
-def noise_metric(residual: Array, known: NDArray[np.bool_]) -> Array | None:
-    """Q of white and 1/f noise, N(f) = a + b / f, fitted to the spectra of the rows of a residual (median over rows).
+def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:
+    """Q of white and 1/f noise, N(f) = a + b / f, fitted to the spectra of the rows of a residual (median over rows),
+    after what the filter has done to them.
 
     None: it is as good as white (b W <= 0.3 a).
     """
@@ -66,7 +69,7 @@ def noise_metric(residual: Array, known: NDArray[np.bool_]) -> Array | None:
     spectrum = np.abs(np.fft.rfft(residual[whole], axis=1)) ** 2 / width
     f = np.arange(spectrum.shape[1]) / width
     used = (f < HIGHEST_FREQUENCY) & (f > 1.5 / width)
-    power = np.median(spectrum[:, used], axis=0) / np.log(2.0)
+    power = np.median(spectrum[:, used], axis=0) / np.log(2.0) / seen_through.along_rows(f[used])
     model = np.stack([np.ones(used.sum()), 1.0 / f[used]], axis=1)
     expected = power
     for _ in range(3):  # the scatter of a spectrum is in proportion to what is expected of it

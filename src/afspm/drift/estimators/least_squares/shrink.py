@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.drift.estimators.least_squares.spectra import MEDIAN_POWER
+
 Array = NDArray[np.float64]
 
 PATCH_PX, STEP_PX = 8, 4
 CERTAIN = 9.0  # times its noise power must a coefficient have to be kept for its own sake
-MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance
 
 
 def denoised(image: Array, noise: Array) -> Array:

@@ -2,50 +2,75 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance
 BLUR_PX = 0.7  # takes what interpolation would alias
 
 
-def cosine_frequencies(shape: tuple[int, int]) -> Array:
+def cosine_frequencies(shape: tuple[int, ...]) -> Array:
     """Length of the frequency of each coefficient of a cosine transform, cycles per pixel."""
     fy, fx = (np.arange(n) / (2.0 * n) for n in shape)
     length: Array = np.hypot(fy[:, None], fx[None, :])
     return length
 
 
-def fine_filtered(first: Array, second: Array) -> tuple[Array, Array]:
-    """Both images through the same radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.7²).
+@dataclass(frozen=True, eq=False)
+class FineFilter:
+    """The radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.7²) that the fine alignment sees both images through.
 
     Applied to both of two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and
     Thomson, Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S and N come from the radial
     mean of both spectra: N is its floor in the top octave, and S, the rest, is taken flat below its peak: a filter
     that whitens low frequencies would have a long impulse response, and the borders would leak across the image.
-    """
-    from scipy.fft import dctn, idctn
 
-    transforms = [dctn(values, norm="ortho") for values in (first, second)]
-    bins = np.arange(0.0, 0.72, max(1.0 / min(t.shape[0] for t in transforms), 1.0 / 64))
-    power, count = np.zeros(bins.size + 1), np.zeros(bins.size + 1)
-    where = [np.digitize(cosine_frequencies(t.shape), bins) for t in transforms]
-    for transform, index in zip(transforms, where, strict=True):
-        power += np.bincount(index.ravel(), (transform**2).ravel(), bins.size + 1)
-        count += np.bincount(index.ravel(), minlength=bins.size + 1)
-    power = power[1:] / np.maximum(count[1:], 1.0)
-    floor = float(np.median(np.concatenate([t[cosine_frequencies(t.shape) > 0.35] ** 2 for t in transforms]))) / 0.4549
-    signal = np.maximum(power - floor, 0.0)
-    peak = int(np.argmax(signal))
-    signal[:peak] = signal[peak]
-    gain = np.sqrt(2.0 * signal / (2.0 * signal + floor + 1e-300))
-    out = []
-    for transform in transforms:
-        f = cosine_frequencies(transform.shape)
-        h = np.interp(f, bins + (bins[1] - bins[0]) / 2, gain) * np.exp(-2.0 * (np.pi * f * BLUR_PX) ** 2)
-        out.append(idctn(transform * h, norm="ortho"))
-    return out[0], out[1]
+    Attributes:
+        frequency: per pixel, ascending.
+        gain: sqrt(2 S / (2 S + N)) there.
+    """
+
+    frequency: Array
+    gain: Array
+
+    @classmethod
+    def of(cls, first: Array, second: Array) -> FineFilter:
+        """For two images."""
+        from scipy.fft import dctn
+
+        shapes = [first.shape, second.shape]
+        squares = np.concatenate([dctn(values, norm="ortho").ravel() ** 2 for values in (first, second)])
+        length = np.concatenate([cosine_frequencies(shape).ravel() for shape in shapes])
+        width = max(1.0 / min(*first.shape, *second.shape), 1.0 / 64)
+        index = (length / width).astype(np.intp)
+        power = np.bincount(index, squares) / np.maximum(np.bincount(index), 1)
+        floor = float(np.median(squares[length > 0.35])) / MEDIAN_POWER
+        signal = np.maximum(power - floor, 0.0)
+        signal[: np.argmax(signal)] = signal.max()
+        gain = np.sqrt(2.0 * signal / (2.0 * signal + floor + 1e-300))
+        return cls((np.arange(power.size) + 0.5) * width, gain)
+
+    def at(self, frequency: Array) -> Array:
+        """H"""
+        h: Array = np.interp(frequency, self.frequency, self.gain) * np.exp(-2.0 * (np.pi * frequency * BLUR_PX) ** 2)
+        return h
+
+    def applied(self, values: Array) -> Array:
+        """An image, filtered."""
+        from scipy.fft import dctn, idctn
+
+        filtered: Array = idctn(dctn(values, norm="ortho") * self.at(cosine_frequencies(values.shape)), norm="ortho")
+        return filtered
+
+    def along_rows(self, frequency: Array) -> Array:
+        """What it makes of the power of noise that each row has by itself, at frequencies along the rows."""
+        across = (np.arange(64) + 0.5) / 128
+        power: Array = np.mean(self.at(np.hypot(frequency[:, None], across)) ** 2, axis=1)
+        return power
 
 
 def independent_values(first: Array, second: Array) -> float:
