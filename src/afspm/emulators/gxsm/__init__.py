@@ -38,6 +38,10 @@ class GxsmEmulator(Emulator):
         auto_save, probe_auto_save: what its panel has on.
         reach_m: of the scanner in x and y, from the centre.
         seed, faults, and all of the simulated world: as of every emulator.
+
+    Attributes:
+        unanswered: calls that have come.
+        silent: it was asked something that blocks it for good.
     """
 
     vendor = "GXSM"
@@ -83,16 +87,16 @@ class GxsmEmulator(Emulator):
         self._user_unit, self._decimal_comma = user_unit, decimal_comma
         self._auto_save, self._probe_auto_save = auto_save, probe_auto_save
         self._reach_m = reach_m
-        self._waiting: deque[Call] = deque()
-        self._silent = False
+        self.unanswered: deque[Call] = deque()
+        self.silent = False
         self._console: Console | None = None
         self._block: Block | None = None
 
     def open(self) -> str:
         """Run the script in the console, or open the shared memory."""
         files.prepare(self._version)
-        self._silent = False
-        self._waiting.clear()
+        self.silent = False
+        self.unanswered.clear()
         self.program = Program(
             self.rig,
             self.faults,
@@ -107,7 +111,7 @@ class GxsmEmulator(Emulator):
         self.program.auto_save, self.program.probe_auto_save = self._auto_save, self._probe_auto_save
         self._calls = Calls(self.program)
         if self._transport == "shm":
-            self._block = Block(self._block_name, self._process, self.faults, self.clock.now_s, self._waiting.append)
+            self._block = Block(self._block_name, self._process, self.faults, self.clock.now_s, self.unanswered.append)
             return f"shm:{self._block_name}@{self._block.pid}"
         return self.run_script()
 
@@ -115,7 +119,7 @@ class GxsmEmulator(Emulator):
         """Run the script in the console, as a user does. Returns where it listens."""
         if self._console is not None:
             self._console.end()
-            self._waiting.clear()
+            self.unanswered.clear()
         self._console = Console(self._script, self.port, self._post)
         while (address := self._console.poll()) is None:
             self.serve(1.0)
@@ -155,16 +159,16 @@ class GxsmEmulator(Emulator):
             self._block = None
 
     def _post(self, call: Call) -> None:
-        self._waiting.append(call)
+        self.unanswered.append(call)
         self.woken.post()
 
     def _answer_all(self) -> None:
-        while self._waiting and not self._silent and not self.faults.lasts("wedge", self.clock.now_s()):
-            call = self._waiting.popleft()
+        while self.unanswered and not self.silent and not self.faults.lasts("wedge", self.clock.now_s()):
+            call = self.unanswered.popleft()
             try:
                 found = self._calls.answer(call.method, call.arguments)
             except Silence:
-                self._silent = True
+                self.silent = True
                 return
             except Exception as error:  # what a script of the user's is to see
                 found = error

@@ -55,7 +55,8 @@ class BridgeLink:
             raise ControllerLost(what, where=self._where, hint=_HINT) from error
         except OSError as error:
             self.close()
-            raise ControllerLost(f"the connection was lost at {method}: {error}", where=self._where) from error
+            what = f"the connection was lost at {method}: {error}"
+            raise ControllerLost(what, where=self._where, hint=_HINT) from error
         except ControllerLost:
             self.close()
             raise

@@ -113,6 +113,8 @@ class Harvest:
             files = self._new(ended)
             over = now_s >= ended["until_s"]
             gaps = [file for file, content in files.items() if _gaps(content)]
+            if not any(scan.values.any() for content in files.values() for scan in content.scans):
+                gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
             if gaps and (over or not self._rewritten):
                 self._give_up(f"was stopped: {gaps[0]} lacks lines")
             elif files and not gaps and (over or self._all(ended, files)):

@@ -70,7 +70,7 @@ _CALLS: Final[dict[str, Callable[..., Any]]] = {
     **{f"{core}.multiarray scalar": lambda kind, content: _array(content, kind, (), "C").item() for core in _CORES},
     **{f"{core}.numeric _frombuffer": _from_buffer for core in _CORES},
 }
-_NAMES: Final = {*_CALLS, "numpy ndarray"}
+_CLASSES: Final[dict[str, object]] = {**_CALLS, "numpy ndarray": object()}
 
 
 def loads(content: bytes) -> Any:
@@ -146,9 +146,9 @@ class _Machine:
             raise BadReply(f"GXSM's reply does what no value needs: {name}")
 
     def _named(self, name: object) -> Any:
-        if name not in _NAMES:
+        if name not in _CLASSES:
             raise BadReply(f"GXSM's reply asks for {str(name)[:100]!r}, which is not run")
-        return _CALLS.get(str(name))
+        return _CLASSES[str(name)]
 
     def _top(self, kind: type) -> Any:
         if not isinstance(self._stack[-1], kind):

@@ -1,0 +1,272 @@
+"""What can go wrong at GXSM: each gives an error with a name, nothing hangs, and it is found again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gxsm_bench import Bench, Peer, scans, states
+
+from afspm.model import ControlResponse, ScopeState, Spectrum, names
+
+Make = Callable[..., Bench]
+FREE = ScopeState.FREE
+UNDEFINED = ScopeState.UNDEFINED
+SHM: dict[str, Any] = {"transport": "shm"}
+BRIDGE: dict[str, Any] = {}
+
+
+def small(made: Bench, **settings: object) -> Peer:
+    """A translator that has found GXSM, with a frame of few pixels in force."""
+    peer = made.start(**settings)
+    peer.until(FREE)
+    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
+    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
+    assert peer.set(names.SCAN_SIZE_X, 100e-9).ok
+    peer.until(lambda one: getattr(one, "shape", None) == (8, 16) and one.region.size_m[0] == 100e-9)
+    peer.until(FREE)
+    return peer
+
+
+def scanned(peer: Peer) -> list[str]:
+    assert peer.act(names.START_SCAN).ok
+    found = scans(peer.until(FREE))
+    assert found
+    return [Path(scan.filename).name for scan in found]
+
+
+# --- calls ---
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "told"),
+    [
+        ("garbage", BRIDGE, "of what it is doing"),
+        ("nan", BRIDGE, "GXSM says nan for"),
+        ("wrong-type", BRIDGE, "GXSM replied '\\x04' to"),
+        ("error", BRIDGE, "SystemError: an emulated error"),
+        ("error", SHM, "can't be passed on"),
+        ("wrong-type", SHM, "GXSM replied '\\x04' to"),
+        ("bad-pickle", SHM, "GXSM's reply is no pickle of a value"),
+        ("evil-pickle", SHM, "GXSM's reply asks for 'posix mkdir', which is not run"),
+        ("code", SHM, "can't be passed on"),
+        ("huge", SHM, "GXSM replied 2147483648 bytes"),
+    ],
+)
+def test_a_bad_answer_has_a_name_and_gxsm_is_found_again(
+    bench: Make, kind: str, settings: dict[str, Any], told: str
+) -> None:
+    made = bench(**settings)
+    peer = small(made)
+    made.strike(kind)
+    peer.until(UNDEFINED)
+    peer.until(FREE)
+    assert told in made.said()
+    assert scanned(peer)
+    assert not Path("evil").exists()
+
+
+@pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
+def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, Any]) -> None:
+    made = bench(speed=1.0, **settings)
+    peer = small(made, reply_timeout_s=0.3)
+    made.strike("wedge", duration_s=1.5)
+    peer.until(UNDEFINED)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "the controller can't be reached" in response.reason
+    peer.until(FREE)
+    assert "no answer to" in made.said()
+    assert peer.get(names.SCAN_RESOLUTION_X) == "16"
+
+
+@pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
+def test_a_gxsm_that_crashes_and_is_started_again_is_found(bench: Make, settings: dict[str, Any]) -> None:
+    made = bench(**settings)
+    address = made.address.partition("@")[0]
+    if settings:
+        process = f"t{os.getpid()}"
+        made = bench(process=process, **settings)
+        address = f"{made.address.partition('@')[0]}@{process}"
+    peer = small(made, address=address)
+    made.strike("crash")
+    peer.until(UNDEFINED)
+    made.start_controller_again()
+    peer.until(FREE)
+    assert scanned(peer)
+
+
+def test_the_memory_of_a_gxsm_that_has_ended_is_not_believed(bench: Make, left_behind: Path) -> None:
+    made = bench(block=left_behind.name, **SHM)
+    peer = small(made)
+    made.strike("stale-block")
+    peer.until(UNDEFINED)
+    assert left_behind.exists()
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "no process is called" in made.said() or "has ended" in made.said()
+
+
+@pytest.fixture
+def left_behind() -> Iterator[Path]:
+    path = Path("/dev/shm", f"afspm_left_{os.getpid()}")
+    yield path
+    path.unlink(missing_ok=True)
+
+
+def test_a_script_that_was_stopped_is_missed_until_it_runs_again(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("script-stopped")
+    peer.until(UNDEFINED)
+    assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
+    assert "is bridge.py running in GXSM's console?" in made.said()
+    made.at_panel(lambda emulator: emulator.run_script())
+    peer.until(FREE)
+    assert scanned(peer)
+
+
+def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
+    made = bench(decimal_comma=True)
+    peer = made.start()
+    peer.until(UNDEFINED)
+    assert peer.set(names.TIP_BIAS_VOLTAGE, 0.25).code == ControlResponse.NO_RESPONSE
+    assert "start it with LC_NUMERIC=C" in made.said()
+    assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.bias_v == 0.1
+
+
+def test_what_gxsm_does_not_take_is_refused_though_it_says_0(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    made.strike("refused")
+    response = peer.set(names.TIP_BIAS_VOLTAGE, 0.3)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "the controller made 0.1 V of 0.3 V; nothing was changed" in response.reason
+    assert peer.set(names.TIP_BIAS_VOLTAGE, 0.3).ok
+
+
+# --- scans ---
+
+
+def test_a_scan_that_did_not_begin_is_told_and_an_old_one_not_taken_for_it(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert scanned(peer)
+    made.at_panel(lambda emulator: emulator.woken.post())
+    made.strike("no-start")
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(heard)
+    assert "did it begin at all" in made.said()
+
+
+def test_a_scan_without_channels_is_told(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    made.at_panel(lambda emulator: emulator.program.channels.clear())
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert "is a channel set" in made.said()
+
+
+@pytest.mark.parametrize("saving", ["afspm", "gxsm"])
+def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, saving: str) -> None:
+    """GXSM saves it with zeros in the lines that it did not come to, and nothing says so."""
+    made = bench(speed=5.0)
+    peer = small(made, saving=saving)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    until_s = made.clock.now_s() + 60.0
+    while made.clock.now_s() < until_s and (made.emulator.program.last is None):
+        peer.get(names.SPEC_KIND)
+    made.strike("panel-stop")
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
+    assert not scans(heard)
+    assert "lacks lines" in made.said()
+
+
+@pytest.mark.parametrize("kind", ["file-late", "half-file"])
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("saving", ["afspm", "gxsm"])
+def test_files_that_take_their_time_are_waited_for(bench: Make, kind: str, version: int, saving: str) -> None:
+    made = bench(speed=20.0, version=version)
+    peer = small(made, saving=saving)
+    expected = scanned(peer)
+    made.strike(kind, count=2, duration_s=3.0)
+    assert [name.replace("002", "001") for name in scanned(peer)] == expected
+
+
+@pytest.mark.parametrize("kind", ["file-late", "half-file", "file-missing"])
+def test_a_channel_that_does_not_come_is_named_and_the_others_are_published(bench: Make, kind: str) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, result_timeout_s=20.0)
+    made.strike(kind, duration_s=1e6)
+    found = scanned(peer)  # the last channel is written first
+    assert found == ["scan001-M-Xp-ZSmTopo.nc", "scan001-Xm-ZSmTopo.nc", "scan001-Xp-ImTunnel.nc"]
+    assert "GXSM did not save Xp-dFreq.nc" in made.said()
+
+
+def test_a_scan_none_of_whose_files_comes_is_broken_off(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, result_timeout_s=20.0)
+    made.strike("file-missing", count=4)
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert "no new file in" in made.said()
+    assert scanned(peer)
+
+
+def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path: Path) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, scan_dir=str(tmp_path / "not there"), result_timeout_s=20.0)
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert "can't be seen from here" in made.said()
+
+
+def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, reply_timeout_s=0.3)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.strike("wedge", duration_s=20.0)
+    heard = peer.until(FREE)
+    assert "UNDEFINED" in states(heard)
+    assert scans(heard)
+
+
+# --- spectra ---
+
+
+def test_a_spectrum_that_is_not_saved_is_told(bench: Make) -> None:
+    made = bench(speed=20.0, probe_auto_save=False)
+    peer = small(made, result_timeout_s=20.0)
+    assert peer.act(names.START_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
+    assert "is probe Auto Save on" in made.said()
+
+
+@pytest.mark.parametrize("kind", ["file-late", "half-file"])
+def test_a_spectrum_that_takes_its_time_is_waited_for(bench: Make, kind: str) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    made.strike(kind, duration_s=3.0)
+    assert peer.act(names.START_SPEC).ok
+    assert any(isinstance(one, Spectrum) for one in peer.until(FREE))
+
+
+def test_a_spectrum_whose_name_was_there_already_is_the_new_one(bench: Make) -> None:
+    """GXSM overwrites it."""
+    made = bench(speed=20.0)
+    (made.files / "scan001-VP001-VP.vpdata").write_text("of last year")
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))
+    assert spectrum.filename.endswith("scan001-VP001-VP.vpdata")

@@ -1,0 +1,207 @@
+"""The emulated GXSM as programs of others see it: all that the real one was seen to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gxsm_bench import Bench
+from raw_clients import MemoryClient, SocketClient, client
+
+from afspm.files import read
+
+Make = Callable[..., Bench]
+KINDS: list[dict[str, Any]] = [{"version": 3}, {"version": 4}, {"version": 4, "transport": "shm"}]
+KIND_IDS = ["gxsm3", "gxsm4", "gxsm4-shm"]
+
+
+@contextmanager
+def calling(made: Bench) -> Iterator[SocketClient | MemoryClient]:
+    caller = client(made.address)
+    try:
+        yield caller
+    finally:
+        caller.close()
+
+
+def until(made: Bench, what: Callable[[], bool], lasts_s: float = 600.0) -> None:
+    """Until it is so; in the time of the experiment."""
+    until_s = made.clock.now_s() + lasts_s
+    while not what():
+        assert made.clock.now_s() < until_s
+
+
+def small(gxsm: SocketClient | MemoryClient) -> None:
+    for ref, value in {"PointsX": "16", "PointsY": "8", "RangeX": "1000", "RangeY": "500"}.items():
+        assert gxsm.call("set", ref, value) == 0
+
+
+def bits(gxsm: SocketClient | MemoryClient) -> int:
+    return int(gxsm.call("rtquery", "s")[0])
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+def test_a_scan_from_first_to_last(bench: Make, kind: dict[str, Any]) -> None:
+    made = bench(speed=10.0, **kind)
+    with calling(made) as gxsm:
+        small(gxsm)
+        gxsm.call("set", "OffsetX", "200")
+        gxsm.call("set", "Rotation", "15")
+        gxsm.call("action", "UNCHECK-MainAutoSave")
+        assert gxsm.call("startscan") == 0
+        until(made, lambda: bool(bits(gxsm) & 2))
+        scanning = made.emulator.program.last
+        assert scanning is not None
+        assert made.clock.now_s() >= scanning.start_s + 0.15, "it takes a moment to be seen"
+        gxsm.call("set", "RangeX", "2000")
+        until(made, lambda: not bits(gxsm) & 2)
+        assert list(gxsm.call("get_geometry", 0)) == [1000.0, 500.0, 200.0, 0.0, 15.0], "of the scan, not of the next"
+        assert list(gxsm.call("get_dimensions", 0))[:2] == [16.0, 8.0]
+        image = gxsm.call("get_slice", 0, 0, 0, 0, 8)
+        assert gxsm.call("autosave") == 7
+        path = Path(gxsm.call("chfname", 0))
+        until(made, lambda: path.exists() and _readable(path))
+        (scan,) = read(path).scans
+        np.testing.assert_allclose(scan.values[::-1] * 1e10, image, rtol=1e-6)
+        assert scan.region.center_m == pytest.approx((20e-9, 0.0))
+        assert math.degrees(scan.region.angle_rad) == pytest.approx(-15.0)
+        gxsm.call("autosave")
+        again = Path(gxsm.call("chfname", 0))
+        assert again.name[4:7] == "002", "it is saved again"
+
+
+def _readable(path: Path) -> bool:
+    try:
+        return bool(read(path).scans)
+    except Exception:
+        return False
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+def test_what_is_set_is_never_refused_in_words(bench: Make, kind: dict[str, Any]) -> None:
+    made = bench(user_unit="nm", **kind)
+    with calling(made) as gxsm:
+        assert gxsm.call("set", "RangeX", "30.5") == 0
+        assert gxsm.call("get", "RangeX") == 30.5
+        assert gxsm.call("get", "RangeY") == 30.5, "set along with it"
+        assert gxsm.call("gets", "RangeX") == "30.5 nm    "
+        assert gxsm.call("gets", "Rang") == "30.5 nm    ", "the last that begins so"
+        assert gxsm.call("set", "RangeX", "1e9") == 0
+        assert gxsm.call("get", "RangeX") == 30.5
+        assert made.emulator.program.dialogs == ["Valid Range of RangeX: 0.0 to 40000.0"]
+        assert gxsm.call("set", "RangeX", "1.5nm") == 0
+        assert gxsm.call("get", "RangeX") == 1.5, "as much of a text as is a number"
+        assert gxsm.call("set", "PointsX", "33.7") == 0
+        assert gxsm.call("get", "PointsX") == 33.0
+        assert gxsm.call("set", "OffsetX", "abc") == 0
+        assert gxsm.call("get", "OffsetX") == 0.0
+        assert gxsm.call("set", "nonsense", "1") == 0
+        assert gxsm.call("gets", "nonsense") == "ERROR"
+        with pytest.raises(RuntimeError, match="SystemError" if "transport" not in kind else "status -1"):
+            gxsm.call("set", "RangeX", 12.5)
+        assert gxsm.call("moveto_scan_xy", 10.0, 0.0) == -1, "in ångström, whatever the unit: 15 from side to side"
+        assert gxsm.call("moveto_scan_xy", 7.0, 0.0) == 0
+
+
+def test_unknown_parameters_are_minus_infinity_in_4_and_garbage_in_3(bench: Make) -> None:
+    with calling(bench(version=4)) as gxsm:
+        assert gxsm.call("get", "dsp-nonsense") == -math.inf
+    with calling(bench(version=3)) as gxsm, pytest.raises(RuntimeError, match="UnicodeDecodeError"):
+        gxsm.call("get", "dsp-nonsense")
+
+
+def test_a_decimal_comma_cuts_numbers(bench: Make) -> None:
+    with calling(bench(decimal_comma=True)) as gxsm:
+        gxsm.call("set", "RangeX", "12.75")
+        assert gxsm.call("get", "RangeX") == 12.0
+        gxsm.call("set", "RangeX", "12,75")
+        assert gxsm.call("get", "RangeX") == 12.75
+
+
+def test_the_bits_of_the_redpitaya_mean_other_things(bench: Make) -> None:
+    made = bench(speed=10.0, card="RPSPMC")
+    with calling(made) as gxsm:
+        small(gxsm)
+        assert bits(gxsm) == 1
+        gxsm.call("action", "DSP_VP_IV_EXECUTE")
+        until(made, lambda: bits(gxsm) == 3)
+        until(made, lambda: bits(gxsm) == 1)
+        gxsm.call("startscan")
+        until(made, lambda: bits(gxsm) == 3)
+        until(made, lambda: bits(gxsm) == 17)
+        assert "DSP_VP_ABORT_EXECUTE" not in gxsm.call("list_actions")
+
+
+def test_what_action_returns_in_3_is_not_looked_at(bench: Make) -> None:
+    with calling(bench(version=3)) as gxsm:
+        assert gxsm.call("action", "CHECK-MainAutoSave") is None
+        assert gxsm.call("action", "nonsense") is None
+
+
+def test_the_bridge_passes_on_what_it_was_made_for_and_nothing_else(bench: Make) -> None:
+    made = bench()
+    with calling(made) as gxsm:
+        for method in ("waitscan", "load", "__class__", "signal"):
+            with pytest.raises(RuntimeError, match=f"{method} is not passed on"):
+                gxsm.call(method)
+        assert gxsm.call("y_current") == 0
+    with calling(made) as gxsm:
+        assert gxsm.call("y_current") == 0, "one client after the other"
+
+
+def test_shared_memory_without_the_lock_mixes_answers_up(bench: Make) -> None:
+    made = bench(transport="shm")
+    one, other = (MemoryClient(made.address, locked=False) for _ in range(2))
+    made.strike("wedge", duration_s=50.0)
+    one.ask("get", "PointsX")
+    other.ask("gets", "RangeX")
+    one.answer()
+    until(made, lambda: one.status() != 1)
+    assert one.answer() == other.answer(), "who asked for what is not known any more"
+    one.close()
+    other.close()
+
+
+def test_shared_memory_has_a_code_for_each_failure(bench: Make) -> None:
+    with calling(bench(transport="shm")) as gxsm:
+        with pytest.raises(RuntimeError, match="status -4"):
+            gxsm.call("nonsense")
+        with pytest.raises(RuntimeError, match="status -1"):
+            gxsm.call("get")
+        assert gxsm.call("get", "PointsX") == 64.0
+
+
+def test_waiting_for_the_simulator_silences_gxsm_for_good(bench: Make) -> None:
+    made = bench(transport="shm", card="simulator")
+    gxsm = MemoryClient(made.address)
+    gxsm.ask("waitscan")
+    until(made, lambda: made.emulator.silent)
+    gxsm.ask("get", "PointsX")
+    until(made, lambda: len(made.emulator.unanswered) == 1)
+    made.at_panel(lambda emulator: None)
+    assert gxsm.status() == 1
+    gxsm.close()
+
+
+def test_a_spectrum_and_its_event(bench: Make) -> None:
+    made = bench(speed=10.0)
+    with calling(made) as gxsm:
+        gxsm.call("set", "OffsetX", "70")
+        gxsm.call("moveto_scan_xy", 50.0, 20.0)
+        until(made, lambda: not bits(gxsm) & 16)
+        gxsm.call("action", "DSP_VP_IV_EXECUTE")
+        until(made, lambda: bool(bits(gxsm) & 8))
+        until(made, lambda: not bits(gxsm) & 8)
+        path = made.files / "scan001-VP001-VP.vpdata"
+        until(made, lambda: path.exists() and b"END OF HEADER" in path.read_bytes())
+        content = read(path)
+        assert content.header["GXSM-Main-Offset"].startswith("X0=70 Ang"), "the offset, and not where it was taken"
+        true = made.emulator.rig.spectrum
+        assert true is not None
+        assert true.position_m == pytest.approx((12e-9, 2e-9))
+        np.testing.assert_allclose(content.spectra[0].values[:, 0], true.values[:, 0], rtol=1e-9)
