@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from asylum_bench import Bench, Peer, states
+from asylum_bench import Bench, Emulated, Peer, states
 
 from afspm.files import read
 from afspm.model import (
@@ -152,6 +152,34 @@ def test_images_that_somebody_takes_at_the_panel_are_published_too(bench: Make) 
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "FREE"]
     assert {one.region for one in heard if isinstance(one, Scan)} == {TURNED}
+
+
+def test_images_that_follow_each_other_at_the_panel_are_each_published_once(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer)
+
+    def suffix(last_scan: bool = False) -> int:
+        """Of the image that is being scanned."""
+        found: list[float] = []
+
+        def at_panel(emulator: Emulated) -> None:
+            emulator.controller.values.put("LastScan", float(last_scan))
+            found.append(emulator.controller.values.get("BaseSuffix"))
+
+        made.at_panel(at_panel)
+        return round(found[0])
+
+    made.at_panel(lambda emulator: emulator.controller.scan(made.clock.now_s(), True))
+    deadline_s = made.clock.monotonic_s() + 20.0
+    while suffix() < 2:
+        assert made.clock.monotonic_s() < deadline_s
+    last = f"Image{suffix(last_scan=True):04d}.ibw"
+    heard = peer.until(lambda one: isinstance(one, Scan) and Path(one.filename).name == last)
+    files = [Path(one.filename).name for one in heard if isinstance(one, Scan) and one.channel == "HeightTrace"]
+    assert files == [f"Image{i:04d}.ibw" for i in range(len(files))]
+    assert len(files) > 2
+    assert states(peer.until(FREE)) == ["FREE"]
 
 
 def test_a_scan_that_outlives_the_translator_is_published_by_the_next(bench: Make) -> None:

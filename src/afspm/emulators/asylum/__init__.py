@@ -95,8 +95,8 @@ class AsylumEmulator(Emulator):
     def open(self) -> str:
         """Bind the XOP's socket."""
         self._server = Server(self.port, self.woken, self.log)
-        # a path without a drive is one of this computer
-        path = self._save_path or "".join(f":{part}" for part in self.folder.parts[1:]) + ":"
+        # "C:Users:Me:"; where there are no drives it begins with a colon
+        path = self._save_path or f"{self.folder.drive.rstrip(':')}:{':'.join(self.folder.parts[1:])}:"
         texts = {"SaveImage": path, "SaveForce": path, "BaseName": self._base_name}
         self.controller = Controller(
             self.rig,
