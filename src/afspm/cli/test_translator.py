@@ -49,6 +49,15 @@ def check_translator(
     speed: Annotated[
         float, typer.Option(min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.")
     ] = 20.0,
+    frame: Annotated[
+        str,
+        typer.Option(
+            metavar="SIZE",
+            help='Stay within a square of this side about the centre of the frame that is set, e.g. "500 nm". '
+            "Default: within the frame that is set.",
+            show_default=False,
+        ),
+    ] = "",
     yes: Annotated[bool, typer.Option("--yes", "-y", help="The tip is withdrawn: don't ask.")] = False,
     listed: Annotated[bool, typer.Option("--list", help="List the checks, and do none.")] = False,
 ) -> None:
@@ -62,6 +71,7 @@ def check_translator(
     from rich.console import Console
 
     from afspm.testing.translators import Options
+    from afspm.units import si
 
     if listed:
         _list()
@@ -69,7 +79,7 @@ def check_translator(
     if not files:
         raise typer.BadParameter("an experiment file is wanted", param_hint="FILE")
     console = Console(file=sys.stdout, highlight=False)
-    options = Options(files, names_in(without), runs, speed, names_in(only))
+    options = Options(files, names_in(without), runs, speed, names_in(only), si(frame, "m") if frame else None)
     if not yes and not _is_simulated(options):
         typer.confirm(_ASK, abort=True)
     _run(options, console, report)

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from afspm.model import Region, RegionChange, ScanParameters
+from afspm.model import Region, RegionChange, ScanParameters, names
 
 if TYPE_CHECKING:
     from afspm.testing.translators.support import Support
@@ -29,7 +29,7 @@ class Frame:
     def request(self, support: Support) -> ScanParameters:
         """What to ask for; without the angle, where the microscope has none."""
         (left, low), (width, height) = self.region.top_left_m, self.region.size_m
-        angle = self.region.angle_rad if support.has("scan-angle") else None
+        angle = self.region.angle_rad if support.has(names.SCAN_ANGLE) else None
         return ScanParameters(RegionChange(left, low, width, height, angle), self.shape)
 
 

@@ -43,6 +43,12 @@ class Processes:
         """Which of them have ended, and how; empty while all run."""
         return "; ".join(f"the process {name} {how}" for name, how in self._ended.items())
 
+    @property
+    def errors(self) -> str:
+        """The last error that each of them has told."""
+        said = {name: reader.last_error for name, reader in self._readers.items()}
+        return "; ".join(f"{name} said: {error}" for name, error in said.items() if error)
+
     def close(self) -> None:
         """End all that still run: they are asked first, and killed if that does not help."""
         for process in self._running.values():

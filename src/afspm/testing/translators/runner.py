@@ -58,7 +58,7 @@ def do(check: Check, kit: Taking) -> Result:
 @contextmanager
 def restored(session: Session, report: Report) -> Iterator[Taking]:
     """What is in force when the block begins is so again at its end, however that comes."""
-    kit = Taking(session.bench, session.support)
+    kit = Taking(session.bench, session.support, session.options.frame_m)
     before = Before.of(session.bench, session.support)
     try:
         yield kit

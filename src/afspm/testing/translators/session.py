@@ -25,6 +25,7 @@ from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators.bench import Bench
 from afspm.testing.translators.processes import Processes
 from afspm.testing.translators.support import Support, find_out
+from afspm.testing.translators.verdicts import Lost
 from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
 
@@ -57,6 +58,8 @@ class Options:
         runs: the folder of run folders.
         speed: of the clock of a simulated microscope; experiment seconds in a real second.
         only: parts of the names of the checks to do; empty: all.
+        frame_m: the side of the square, about the centre of the frame that is set, that nothing is done outside of;
+            None: the frame that is set.
     """
 
     files: Sequence[Path]
@@ -64,6 +67,7 @@ class Options:
     runs: Path = Path("runs")
     speed: float = SPEED
     only: Collection[str] = ()
+    frame_m: float | None = None
 
 
 @dataclass
@@ -81,6 +85,7 @@ class Session:
     translator: str
     simulated: bool
     folder: Path
+    options: Options
 
 
 def prepare(options: Options) -> Experiment:
@@ -131,12 +136,15 @@ def opened(options: Options) -> Iterator[Session]:
     try:
         links = [_link(port, own, _logger(log)) for port in ports]
         bench = Bench(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
-        bench.begin()
+        try:
+            bench.begin()
+        except Lost as lost:
+            raise Lost("; ".join(filter(None, (str(lost), processes.errors)))) from lost
         abilities = resolved.abilities(translator)
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
         support = find_out(bench, sorted(actions), sorted(parameters))
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
-        yield Session(bench, support, named, resolved.simulated, folder)
+        yield Session(bench, support, named, resolved.simulated, folder, options)
         bench.end()
     finally:
         for port in ports:

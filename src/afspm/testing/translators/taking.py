@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from afspm.model import (
@@ -72,14 +72,18 @@ class Taking:
 
     Attributes:
         frames: to take scans of; Skipped where the microscope has not said what is set.
+            `frame_m` is the side of what they are parts of, instead of the frame that is set.
     """
 
-    def __init__(self, bench: Bench, support: Support) -> None:
+    def __init__(self, bench: Bench, support: Support, frame_m: float | None = None) -> None:
         self.bench = bench
         self.support = support
         self._kept: dict[str, Taken | Exception] = {}
         initial = bench.story.newest(ScanParameters)
-        self._whole = initial.region if initial is not None and isinstance(initial.region, Region) else None
+        region = None if initial is None else initial.region
+        self._whole = region if isinstance(region, Region) else None
+        if self._whole is not None and frame_m is not None:
+            self._whole = replace(self._whole, size_m=(frame_m, frame_m))
 
     @property
     def frames(self) -> Frames:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from afspm.model import ControlRequest, Feedback, names
+from afspm.model import ControlRequest, ControlResponse, Feedback, names
+from afspm.testing.translators.bench import answer_in_words
 from afspm.testing.translators.registry import check
 from afspm.testing.translators.story import told
 from afspm.testing.translators.taking import Taking, number
@@ -33,8 +34,12 @@ def set_and_require(kit: Taking, wanted: Feedback) -> None:
     kit.bench.come_to_rest()
     before, mark = in_force(kit), kit.bench.story.mark()
     given = {name: value for name, value in vars(wanted).items() if value is not None}
-    kit.bench.asked(ControlRequest.SET_ZCTRL_PARAMS, wanted, f"setting {', '.join(given)} of the feedback")
+    response = kit.bench.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted)
     heard = kit.bench.settled(mark)
+    if response.code in (ControlResponse.PARAM_ERROR, ControlResponse.PARAM_NOT_SUPPORTED):
+        require_same(before, in_force(kit))
+        raise Skipped(f"it can't be set here: {answer_in_words(response)}")
+    expect(response.ok, f"REP_SUCCESS to setting {', '.join(given)} of the feedback", answer_in_words(response))
     after = in_force(kit)
     count = sum(isinstance(one.thing, Feedback) for one in heard)
     expect(count == 1, "the new ZCtrlParameters once", told(heard))
