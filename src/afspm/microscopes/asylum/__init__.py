@@ -195,8 +195,8 @@ class Asylum(Microscope):
 
     def _put_spot(self, xy_m: tuple[float, float]) -> None:
         spot_m = on_image(xy_m, self._activity.image) if self._spots == "image" else xy_m
-        self._igor.do("SetProbePosX", spot_m[0])
-        self._igor.do("SetProbePosY", spot_m[1])
+        if not (self._igor.do("SetProbePosX", spot_m[0]) and self._igor.do("SetProbePosY", spot_m[1])):
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum refuses the spot")
 
     # --- results ---
 

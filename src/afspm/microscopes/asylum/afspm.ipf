@@ -93,7 +93,7 @@ End
 // Whether the z feedback is running.
 Function AfspmFeedbackOn()
 	String/G root:Packages:afspmStatus = ""
-	SVAR loop = root:Packages:afspmStatus
+	SVAR answer = root:Packages:afspmStatus
 	Execute/Q/Z "root:Packages:afspmStatus = td_ReadString(\"PIDSLoop.2.Status\")"
-	return str2num(loop) == 1
+	return str2num(answer) == 1
 End
