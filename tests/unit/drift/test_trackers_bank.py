@@ -255,6 +255,18 @@ def test_a_place_first_seen_adrift_is_known_once_an_older_one_says_so() -> None:
     assert np.linalg.norm(error_m(world, third.after)) < 2.0 * NM
 
 
+@pytest.mark.parametrize("unusable", [1, 2, 6])
+def test_where_the_first_scans_were_not_usable_the_first_two_that_match_begin(unusable: int) -> None:
+    world = World(STEADY, blind={f"scan {k}" for k in range(unusable)})
+    updates = follow(BankTracker(world), unusable + 8)
+    assert [update.matched for update in updates[1:]] == [k > unusable for k in range(1, unusable + 8)]
+    assert not any(update.lost for update in updates[unusable + 1 :])
+    assert updates[unusable].lost == (unusable > 1)
+    last = updates[-1]
+    assert np.linalg.norm(error_m(world, last.after)) < 3.0 * NM
+    assert last.after.sd_m < 50.0 * NM
+
+
 def test_however_long_it_is_lost_it_goes_on() -> None:
     world = World(STEADY)
     following = BankTracker(world)

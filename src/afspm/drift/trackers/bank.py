@@ -23,7 +23,7 @@ from afspm.errors import InvalidValue
 
 Array = NDArray[np.float64]
 
-VERSION = 1
+VERSION = 2
 _LIKE = 1.2  # a second surprise may differ from the first by so much of it: a new velocity doubles it
 
 
@@ -60,6 +60,7 @@ class BankTracker:
         self._compensation = Compensation()
         self._scans = 0
         self._unmatched = 0  # scans in a row that should have matched
+        self._proven = False  # whether any two scans have matched; before, the first may be the unusable one
         self._doubted_m: Array | None = None  # where the newest scan was found, from where it was expected
         self._matched_s = 0.0
         self._lost = False
@@ -86,11 +87,11 @@ class BankTracker:
         registrations = {self._references.kept[number].scan.key: found for number, found in tried.items()}
         found = self._compared(newest, tried)
         used = self._believed(newest, found, anywhere=anywhere)
-        placed = used is not None and not all(self._references.kept[one.link.number].adrift for one in used.measured)
+        placed = used is not None and any(self._proves(one.link.number) for one in used.measured)
         self._unmatched = 0 if placed else self._unmatched + bool(tried)
         self._learn(newest, used, tried, placed=placed)
         after = self._known(self._filters)
-        self._lost = after.sd_m > self._limit_m(scan)
+        self._lost = after.sd_m > self._limit_m(scan) or self._unmatched >= self._settings.lost_after
         return Update(
             key=scan.key,
             before=before,
@@ -169,7 +170,7 @@ class BankTracker:
         for number in self._references.candidates(newest.scan, *_drifts(filters), anywhere=anywhere):
             prior = None if anywhere else newest.prior(number, kept[number], widening)
             tried[number] = self._estimator.register(kept[number].scan, newest.scan, prior)
-        firm = [number for number in tried if not kept[number].adrift]
+        firm = [number for number in tried if self._proves(number)]
         if not anywhere and not any(tried[number].accepted for number in firm):
             # not where it was expected, or not to be recognised: somewhere else?
             for number in firm[: self._settings.second_looks]:
@@ -184,7 +185,7 @@ class BankTracker:
             for number, found in tried.items()
             if found.accepted
         ]
-        firm = [one for one in measured if not kept[one.link.number].adrift]
+        firm = [one for one in measured if self._proves(one.link.number)]
         return Comparison(agreeing(firm or measured, newest.filters), newest.filters) if measured else None
 
     def _believed(self, newest: Newest, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
@@ -204,7 +205,7 @@ class BankTracker:
         """Take in what is believed; keep the scan, unless it is in doubt, and let go of what there is too much of."""
         settings, references, scan = self._settings, self._references, newest.scan
         filters = newest.filters if used is None else used.filters
-        if self._unmatched == settings.lost_after and not placed:
+        if self._unmatched == settings.lost_after and self._proven and not placed:
             filters = self._cut_off(filters, scan)
         noise = np.eye(2) * settings.jitter_m**2
         if used is None:
@@ -216,6 +217,9 @@ class BankTracker:
         if placed:
             self._matched_s = scan.mid_s
             numbers = {one.link.number for one in used.measured} if used else set()
+            if not self._proven:
+                references.known(numbers)
+            self._proven = True
             references.judged({number: number in numbers for number in tried}, self._scans)
             self._vouch(newest, {number: tried[number] for number in tried if tried[number].accepted})
         drift_m, drifts_m = _drifts(self._filters)
@@ -233,6 +237,10 @@ class BankTracker:
         adrift = [number for number, one in enumerate(self._references) if one.adrift]
         return filters.widened(self._limit_m(scan), self._settings.start_velocity_sd_m_s, scans=adrift)
 
+    def _proves(self, number: int) -> bool:
+        """Whether what is registered with a reference has a place by that."""
+        return not (self._proven and self._references.kept[number].adrift)
+
     def _vouch(self, newest: Newest, found: Table[int, Registration]) -> None:
         """Those adrift that the newest scan, the last in the state, finds where they are thought to be are known."""
         assert self._filters is not None
@@ -242,7 +250,7 @@ class BankTracker:
             expected, covariance = self._filters.mixed(one.link.rows(states, states - 4))
             apart = one.value_m - expected
             if apart @ np.linalg.solve(covariance + one.pair_noise_m2, apart) <= AGREEMENT:
-                kept[number] = replace(kept[number], adrift=False)
+                self._references.known([number])
 
     def _drop(self, number: int) -> None:
         assert self._filters is not None
@@ -284,6 +292,7 @@ class BankTracker:
             "compensation": [list(change) for change in self._compensation.changes],
             "scans": self._scans,
             "unmatched": self._unmatched,
+            "proven": self._proven,
             "doubted_m": self._doubted_m,
             "matched_s": self._matched_s,
             "lost": self._lost,
@@ -301,6 +310,7 @@ class BankTracker:
         self._compensation = Compensation.from_list(state["compensation"])
         self._scans, self._unmatched = int(state["scans"]), int(state["unmatched"])
         self._doubted_m = None if state["doubted_m"] is None else np.asarray(state["doubted_m"], dtype=np.float64)
+        self._proven = bool(state["proven"])
         self._matched_s, self._lost = float(state["matched_s"]), bool(state["lost"])
         self._references.kept = [Reference.from_dict(one) for one in state["references"]]
         self._forecast = BankForecast.at_start()

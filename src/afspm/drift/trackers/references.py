@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, replace
 from typing import Any
@@ -132,6 +132,11 @@ class References:
                 self.kept[number] = replace(kept, refusals=0, used=step)
             elif any(tried.values()):
                 self.kept[number] = replace(kept, refusals=kept.refusals + 1)
+
+    def known(self, numbers: Iterable[int]) -> None:
+        """These are not adrift any more."""
+        for number in numbers:
+            self.kept[number] = replace(self.kept[number], adrift=False)
 
     def needs_anchor(self, scan: DriftScan, drift_m: Array, drifts_m: Array) -> bool:
         """Whether no anchor stands for what a scan has seen."""
