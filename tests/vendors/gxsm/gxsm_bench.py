@@ -24,8 +24,6 @@ from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
 DEADLINE_S = 30.0
-REAL_LINK = "AFSPM_GXSM"
-"""The environment variable with the address of a real GXSM, e.g. "shm", whose tip may be moved."""
 
 
 class Peer:

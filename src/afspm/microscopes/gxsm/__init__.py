@@ -13,7 +13,7 @@ from afspm.microscopes.gxsm.frame import REFNAMES, Frame, number, send, user_uni
 from afspm.microscopes.gxsm.hardware import APPROACH, AUTOSAVE_OFF, Hardware, available, execute, recognised
 from afspm.microscopes.gxsm.harvest import Harvest
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
-from afspm.microscopes.in_force import POSITION
+from afspm.microscopes.in_force import FRAME, POSITION, frame
 from afspm.microscopes.microscope import ControllerLost, Microscope, action
 from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
@@ -96,6 +96,7 @@ class Gxsm(Microscope):
             self._harvest,
             self.clock,
             self.log,
+            region=lambda: frame(self.read(FRAME))[0],
             saves=self._saves,
             scan_dir=self._scan_dir,
             probe_dir=self._probe_dir,

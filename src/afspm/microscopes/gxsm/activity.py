@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +14,7 @@ from afspm.microscopes.gxsm.frame import Frame
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
 from afspm.microscopes.gxsm.harvest import SCAN, Harvest
 from afspm.microscopes.gxsm.link import Asking
-from afspm.model import ControlResponse, ScopeState, ScopeStatus
+from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 
 _SHOWS_S: Final = 1.0
 """So long, in experiment time, what was begun may take to be seen running; 0.3 s were measured."""
@@ -26,7 +27,7 @@ class Activity:
 
     Args:
         ask: GXSM.
-        frame: of the next scan.
+        frame: of the next scan; `region` the same, as it was set.
         saves: whether GXSM is told to save a scan at its end; if not, it does so by itself.
         scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
     """
@@ -40,6 +41,7 @@ class Activity:
         clock: Clock,
         log: logging.Logger,
         *,
+        region: Callable[[], Region],
         saves: bool,
         scan_dir: Path | None,
         probe_dir: Path | None,
@@ -47,6 +49,7 @@ class Activity:
         self._ask = ask
         self._hardware = hardware
         self._frame = frame
+        self._region = region
         self._harvest = harvest
         self._clock = clock
         self._log = log
@@ -150,7 +153,7 @@ class Activity:
 
     def _begin_scan(self, begun_ns: int) -> None:
         self._stopping = False
-        region = self._frame.region()
+        region = self._region()
         taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad]}
         self._harvest.begin(SCAN, self._folder(), begun_ns, taken)
 
