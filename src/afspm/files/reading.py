@@ -36,6 +36,8 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
         FileError: missing, not whole, not what its suffix says, without a reader, or its library is missing.
     """
     path = Path(path)
+    if not path.is_file():
+        raise FileError("no such file", where=str(path))
     name = FORMATS.get(path.suffix.lower())
     if name is None:
         raise FileError(
@@ -43,8 +45,6 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
             where=str(path),
             hint=f"read: {' '.join(FORMATS)}",
         )
-    if not path.is_file():
-        raise FileError("no such file", where=str(path))
     module, _, function = name.partition(":")
     reader: Reader = getattr(import_module(f"afspm.files.{module}"), function)
     try:

@@ -137,6 +137,12 @@ def test_a_format_without_a_reader_is_refused_with_those_there_are(name: str, tm
         afspm.read(tmp_path / name)
 
 
+@pytest.mark.parametrize("name", ["folder", "scan.xyz"])
+def test_what_is_not_there_is_not_told_to_have_the_wrong_suffix(name: str, tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no such file"):
+        afspm.read(tmp_path / name)
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_what_is_not_there_or_something_else_is_refused_by_its_name(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
