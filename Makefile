@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test check bench bench-drift soak chaos simulate clean
+.PHONY: demo demo-drift test test-translators check bench bench-drift soak chaos simulate clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -23,6 +23,14 @@ demo-drift: $(SETUP)
 ## all tests
 test: $(SETUP)
 	@$(BIN)/pytest -n 2 --dist loadgroup
+
+## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
+TRANSLATORS ?= simulator image nanonis asylum gxsm
+test-translators: $(SETUP)
+	@failed=; for name in $(TRANSLATORS); do \
+	  $(BIN)/afspm test-translator experiments/every_microscope/$$name.toml --frame "500 nm" --runs build/translators \
+	    --report build/translators/$$name.json || failed="$$failed $$name"; \
+	done; test -z "$$failed" || { echo "not as they should be:$$failed"; exit 1; }
 
 ## style, types, and who may import whom
 check: $(SETUP)

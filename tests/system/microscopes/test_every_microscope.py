@@ -1,0 +1,100 @@
+"""The same experiment file, unchanged, on the simulator and on every emulated controller: the same scans."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from afspm.supervisor.ports import FreePorts
+
+ROOT = Path(__file__).parents[3]
+FILES = ROOT / "experiments" / "every_microscope"
+AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
+DEADLINE_S = 90.0
+HEIGHTS = {"simulator": "Height", "nanonis": "Z Forward", "asylum": "HeightTrace", "gxsm": "ZS-Topo"}
+ADDRESSES = {"nanonis": "127.0.0.1:{port}", "asylum": "tcp://127.0.0.1:{port}", "gxsm": "127.0.0.1:{port}"}
+NOISE_M = 0.8e-9
+"""The rms between two scans of the same place whose lines are not taken at the same moments."""
+OVERLAY = """
+[keeper]
+component = true
+class = "keeper.Keeper"
+"""
+PORTS = """
+[controller]
+port = {port}
+
+[microscope]
+address = "{address}"
+"""
+
+Kept = list[tuple[list[Any], NDArray[np.float64]]]
+"""[x, y, width, height, angle] and the heights of each scan."""
+
+
+def scans_on(microscope: str, folder: Path) -> Kept:
+    """Run the experiment; the heights as they were published."""
+    overlay = folder / "overlay.toml"
+    port = FreePorts().take()
+    ports = PORTS.format(port=port, address=ADDRESSES.get(microscope, "").format(port=port))
+    overlay.write_text(OVERLAY + (ports if microscope in ADDRESSES else ""), encoding="utf-8")
+    (folder / "keeper.py").write_text(Path(__file__).with_name("keeper.py").read_text(encoding="utf-8"))
+    files = [str(FILES / "experiment.toml"), str(FILES / f"{microscope}.toml"), str(overlay)]
+    done = subprocess.run(
+        [*AFSPM, "run", *files, "--runs", str(folder / "runs")],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    kept = []
+    for file in sorted((folder / "runs").glob("*/kept-*.npz")):
+        with np.load(file) as found:
+            channel, unit, *place = json.loads(str(found["facts"]))
+            if channel == HEIGHTS[microscope]:
+                assert unit == "m"
+                kept.append((place, found["values"]))
+    return kept
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Kept:
+    return scans_on("simulator", tmp_path_factory.mktemp("simulator"))
+
+
+def apart_m(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """The rms of the difference, less its plane: z has no zero, and the slope of a sample is nobody's."""
+    rows, columns = np.indices(a.shape).reshape(2, -1)
+    plane = np.stack([rows, columns, np.ones(a.size)], axis=1)
+    difference = (a - b).ravel()
+    return float(np.std(difference - plane @ np.linalg.lstsq(plane, difference, rcond=None)[0]))
+
+
+@pytest.mark.xdist_group("every_microscope")
+@pytest.mark.parametrize("microscope", sorted(ADDRESSES))
+def test_the_same_scans_of_the_same_sample(microscope: str, simulated: Kept, tmp_path: Path) -> None:
+    found = scans_on(microscope, tmp_path)
+    assert len(found) == len(simulated) == 3
+    for (place, heights), (wanted_place, wanted) in zip(found, simulated, strict=True):
+        assert place == pytest.approx(wanted_place, rel=1e-6, abs=1e-12)
+        assert heights.shape == wanted.shape == (48, 64)
+        assert apart_m(heights, wanted) < NOISE_M
+
+
+@pytest.mark.xdist_group("every_microscope")
+def test_a_pixel_off_or_a_flipped_axis_would_be_seen(simulated: Kept) -> None:
+    one_pixel_m = [
+        min(apart_m(heights[:, 1:], heights[:, :-1]), apart_m(heights[1:], heights[:-1])) for _, heights in simulated
+    ]
+    assert max(one_pixel_m) > 1.5 * NOISE_M
+    for _, heights in simulated:
+        assert apart_m(heights[::-1], heights) > 3 * NOISE_M
+        assert apart_m(heights[:, ::-1], heights) > 3 * NOISE_M
