@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from afspm.clock import Clock
@@ -127,6 +128,7 @@ class Microscope(ABC):
         clock, log: of the experiment; given before `connect`.
         run_dir: the folder of this run.
         wake: call it, from any thread, to have the controller looked at now rather than at the next poll.
+        lacking: actions that this controller turned out not to have, and why; set it when connecting.
         memory: a dict of JSON values, kept on disk: saved with every request and result, there after a restart.
     """
 
@@ -143,6 +145,7 @@ class Microscope(ABC):
     log: logging.Logger
     run_dir: Path
     wake: Callable[[], None]
+    lacking: Mapping[str, str] = MappingProxyType({})
     memory: dict[str, Any]
 
     def __init__(

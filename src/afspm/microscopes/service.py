@@ -160,6 +160,8 @@ class Service:
             near = difflib.get_close_matches(name[:100], self.actions, n=1)
             hint = f", perhaps {near[0]!r}" if near else ""
             raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"this microscope has no action {name[:100]!r}{hint}")
+        if name in self._microscope.lacking:
+            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{name}: {self._microscope.lacking[name]}")
         return self.actions[name]
 
     def _refuse_if_busy(self, allowed: bool) -> None:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.gxsm.activity import Activity
 from afspm.microscopes.gxsm.frame import REFNAMES, Frame, number, send, user_unit_m
-from afspm.microscopes.gxsm.hardware import APPROACH, AUTOSAVE_OFF, Hardware, available, execute, recognised
+from afspm.microscopes.gxsm.hardware import ABORT, APPROACH, AUTOSAVE_OFF, Hardware, available, execute, recognised
 from afspm.microscopes.gxsm.harvest import Harvest
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
 from afspm.microscopes.in_force import FRAME, POSITION, frame
@@ -84,6 +84,7 @@ class Gxsm(Microscope):
         found = recognised(self._refnames, self._actions)
         self._hardware = Hardware(self._given_hardware) if self._given_hardware else found
         self._find_parameters()
+        self.lacking = self._missing_actions()
         self._frame = Frame(ask, user_unit_m(ask))
         if self._saves and AUTOSAVE_OFF in self._actions:
             ask.call("action", AUTOSAVE_OFF)
@@ -108,6 +109,19 @@ class Gxsm(Microscope):
         lacking = sorted(vendors.keys() - self._refs.keys())
         self.table = self._whole_table.without(lacking)
         self.log.info("GXSM with the hardware %s; unsupported: %s", self._hardware.value, ", ".join(lacking) or "none")
+
+    def _missing_actions(self) -> dict[str, str]:
+        """GXSM says 0 to actions that it does not have."""
+        needed = {names.ENGAGE: [APPROACH], names.STOP_SPEC: [ABORT]}
+        needed[names.START_SPEC] = [execute(kind) for kind in self._whole_table[names.SPEC_KIND].choices]
+        for name, what in self.added_actions.items():
+            if "command" in what:
+                needed[name] = [str(what["command"])]
+        return {
+            name: f"this GXSM has no action {' or '.join(wanted[:3])} with its hardware ({self._hardware.value})"
+            for name, wanted in needed.items()
+            if self._actions.isdisjoint(wanted)
+        }
 
     def close(self) -> None:
         """Let go of the link. What was begun goes on."""
@@ -226,7 +240,9 @@ class Gxsm(Microscope):
         """Take a spectrum of the kind `x-spec-kind` where the probe was sent to last: it is sent there again, since a
         scan has moved it."""
         kind = str(self._kept[names.SPEC_KIND])
-        self._refuse_missing(execute(kind))
+        if execute(kind) not in self._actions:
+            reason = f"this GXSM has no {execute(kind)} with its hardware ({self._hardware.value}): see x-spec-kind"
+            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
         position_m = self._probe_m()
         region = self._frame.region()
         reach_m = math.hypot(*region.size_m)
@@ -236,24 +252,16 @@ class Gxsm(Microscope):
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
         """Break the spectrum off."""
-        self._activity.stop_curve(self._actions)
+        self._activity.stop_curve()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
         """The auto approach."""
-        self._refuse_missing(APPROACH)
         self._ask.call("action", APPROACH)
 
     def command(self, text: str) -> None:
         """One of GXSM's actions, e.g. "DSP_CMD_STOPALL"."""
-        self._refuse_missing(text)
         self._ask.call("action", text)
-
-    def _refuse_missing(self, name: str) -> None:
-        """GXSM says 0 to actions that it does not have."""
-        if name not in self._actions:
-            reason = f"this GXSM has no action {name!r} with its hardware ({self._hardware.value})"
-            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
 
 
 __all__ = ["AfspmError", "Gxsm", "GxsmError"]

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from afspm.clock import Clock
-from afspm.errors import Refused
 from afspm.microscopes.gxsm.errors import GxsmError
 from afspm.microscopes.gxsm.frame import Frame
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
 from afspm.microscopes.gxsm.harvest import SCAN, Harvest
 from afspm.microscopes.gxsm.link import Asking
-from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.model import Region, ScopeState, ScopeStatus
 
 _SHOWS_S: Final = 1.0
 """So long, in experiment time, what was begun may take to be seen running; 0.3 s were measured."""
@@ -86,16 +85,9 @@ class Activity:
         self._ask.call("stopscan")
         self._stop()
 
-    def stop_curve(self, actions: frozenset[str]) -> None:
-        """Break the spectrum off.
-
-        Raises:
-            Refused: ACTION_NOT_SUPPORTED: this hardware can't.
-        """
+    def stop_curve(self) -> None:
+        """Break the spectrum off."""
         if not self._execute:
-            if ABORT not in actions:
-                reason = f"GXSM has no action to break a spectrum off with this hardware ({self._hardware.value})"
-                raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
             self._ask.call("action", ABORT)
         self._stop()
 
