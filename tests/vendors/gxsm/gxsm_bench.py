@@ -184,8 +184,13 @@ class Bench:
     def start(self, **settings: Any) -> Peer:
         """The translator, as a process of its own."""
         given = {"address": self.address, "reply_timeout_s": 2.0, "result_timeout_s": 2.0 * self._speed} | settings
-        made = Process(self.folder, self._stack, self.clock, given)
-        return made.peer
+        self._process = Process(self.folder, self._stack, self.clock, given)
+        return self._process.peer
+
+    def kill(self) -> None:
+        """The translator."""
+        self._process.process.kill()
+        self._process.process.wait(DEADLINE_S)
 
     def said(self) -> str:
         """The translator's log."""

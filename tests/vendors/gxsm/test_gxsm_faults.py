@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from gxsm_bench import Bench, Peer, scans, states
 
+from afspm.emulators.gxsm.program import Program
 from afspm.model import ControlResponse, ScopeState, Spectrum, names
 
 Make = Callable[..., Bench]
@@ -209,6 +210,7 @@ def test_a_channel_that_does_not_come_is_named_and_the_others_are_published(benc
     found = scanned(peer)  # the last channel is written first
     assert found == ["scan001-M-Xp-ZSmTopo.nc", "scan001-Xm-ZSmTopo.nc", "scan001-Xp-ImTunnel.nc"]
     assert "GXSM did not save Xp-dFreq.nc" in made.said()
+    assert len(scanned(peer)) == 4, "it is not given up for ever"
 
 
 def test_a_scan_none_of_whose_files_comes_is_broken_off(bench: Make) -> None:
@@ -220,6 +222,24 @@ def test_a_scan_none_of_whose_files_comes_is_broken_off(bench: Make) -> None:
     assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
     assert "no new file in" in made.said()
     assert scanned(peer)
+
+
+def test_a_gxsm_that_names_its_channels_only_once_it_scans(bench: Make) -> None:
+    """Files of before are in its folder, too, and not taken for the new ones."""
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert scanned(peer)
+    made.at_panel(lambda emulator: setattr(emulator.program, "names", _named_late(emulator.program)))
+    assert {name[:7] for name in scanned(peer)} == {"scan002"}
+
+
+def _named_late(program: Program) -> Callable[[float], list[Path]]:
+    names, first = program.names, program.last
+
+    def late(now_s: float) -> list[Path]:
+        return [] if program.last is first else names(now_s)
+
+    return late
 
 
 def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path: Path) -> None:

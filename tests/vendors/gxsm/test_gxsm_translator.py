@@ -394,3 +394,22 @@ def test_busy_is_said(bench: Make) -> None:
     assert peer.act(names.START_SCAN).code == ControlResponse.NOT_FREE
     assert peer.set(names.SCAN_SIZE_X, 1e-7).code == ControlResponse.NOT_FREE
     assert peer.get(names.SCAN_RESOLUTION_X) == "32"
+
+
+# --- over a restart ---
+
+
+def test_a_scan_that_ends_while_the_translator_is_down_is_published_by_the_next(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.kill()
+    until_s = made.clock.now_s() + 600.0
+    while made.emulator.rig.busy(made.clock.now_s()) and made.clock.now_s() < until_s:
+        pass
+    peer = made.start()
+    heard = peer.until(FREE)
+    assert {scan.region for scan in scans(heard)} == {TURNED}
+    assert len(list(made.files.glob("*.nc"))) == 4

@@ -168,9 +168,9 @@ class Activity:
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
 
-    def _folder(self) -> Path:
+    def _folder(self) -> Path | None:
         channels = [] if self._scan_dir else self._channels(1)
-        return self._scan_dir or (Path(channels[0]).parent if channels else Path())
+        return self._scan_dir or (Path(channels[0]).parent if channels else None)
 
     def _channels(self, most: int = _CHANNELS) -> list[str]:
         """Where GXSM would save each channel."""

@@ -29,6 +29,8 @@ _STORED: Final = 1e-5
 """Relative: what is lost of a length in a file."""
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Files tell the second in which a scan began."""
+_SOON_S: Final = 1.0
+"""After so long, in experiment time, a channel that did not come before will not come; 0.3 s were measured."""
 
 
 class Harvest:
@@ -62,18 +64,18 @@ class Harvest:
         """Whether nothing came of what has ended; until `results` is called."""
         return self._broken_off
 
-    def begin(self, what: str, folder: Path, begun_ns: int, taken: Mapping[str, Any]) -> None:
+    def begin(self, what: str, folder: Path | None, begun_ns: int, taken: Mapping[str, Any]) -> None:
         """A measurement begins.
 
         Args:
-            folder: where its files will be.
+            folder: where its files will be; None: GXSM does not say yet.
             begun_ns: not before this; 0: it was found running.
             taken: "frame" (x, y, width, height, angle) of a scan, "position" of a spectrum.
         """
         newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
         self._kept["running"] = {
             "what": what,
-            "folder": str(folder),
+            "folder": None if folder is None else str(folder),
             "newest_ns": newest,
             "begun_ns": begun_ns,
             **taken,
@@ -90,13 +92,17 @@ class Harvest:
         Args:
             channels: where GXSM says that it saves each channel of a scan.
         """
-        named = (_NUMBERED.search(Path(path).name) for path in channels)
+        paths = [Path(path) for path in channels]
+        named = (_NUMBERED.search(path.name) for path in paths)
         ended = {
             **self._kept["running"],
             "end_ns": now_ns,
             "until_s": now_ns / NS_PER_S + self._patience_s,
             "channels": [match[1] for match in named if match],
         }
+        if ended["folder"] is None and paths:  # a scan's: old ones in there are told by when they began
+            ended["folder"] = str(paths[0].parent)
+            ended["begun_ns"] = ended["begun_ns"] or now_ns
         self._kept["running"], self._kept["ended"] = None, ended
         self._sizes, self._whole = {}, {}
 
@@ -117,7 +123,7 @@ class Harvest:
                 gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
             if gaps and (over or not self._rewritten):
                 self._give_up(f"was stopped: {gaps[0]} lacks lines")
-            elif files and not gaps and (over or self._all(ended, files)):
+            elif files and not gaps and (over or self._all(ended, files, now_s)):
                 self._add(ended, files)
             elif over:
                 self._give_up(self._missing(ended))
@@ -138,7 +144,7 @@ class Harvest:
     def _new(self, ended: Mapping[str, Any]) -> dict[Path, FileContent]:
         """The files of what has ended that are whole: they have stopped growing, and can be read."""
         found = {}
-        for file in sorted(_files(Path(ended["folder"]), ended["what"])):
+        for file in sorted(_files(_folder(ended), ended["what"])):
             stat = file.stat()
             if stat.st_mtime_ns <= ended["newest_ns"]:
                 continue
@@ -158,13 +164,17 @@ class Harvest:
             found = dict(sorted(found.items(), key=lambda item: item[0].stat().st_mtime_ns)[-1:])
         return found
 
-    def _all(self, ended: Mapping[str, Any], files: Iterable[Path]) -> bool:
-        """Whether no file is missing; those that did not come with the scans before are not waited for."""
+    def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
+        """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
         there = {match[1] for match in (_NUMBERED.search(file.name) for file in files) if match}
-        return set(ended["channels"]) - set(self._kept["absent"]) <= there
+        missing = set(ended["channels"]) - there
+        soon_s = ended["end_ns"] / NS_PER_S + _SOON_S
+        return not missing or (missing <= set(self._kept["absent"]) and now_s >= soon_s)
 
     def _missing(self, ended: Mapping[str, Any]) -> str:
-        folder = Path(ended["folder"])
+        folder = _folder(ended)
+        if folder is None:
+            return "GXSM does not say where it saves: did it begin at all, is a channel set?"
         if not folder.is_dir():
             return f"its folder {folder} can't be seen from here (scan_dir, probe_dir)"
         if ended["what"] == SCAN:
@@ -181,7 +191,7 @@ class Harvest:
             there = {match[1] for match in (_NUMBERED.search(file.name) for file in files) if match}
             absent = sorted(set(ended["channels"]) - there)
             if set(absent) - set(self._kept["absent"]):
-                self._log.warning("GXSM did not save %s: from now on that is not waited for", ", ".join(absent))
+                self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
             self._kept["absent"] = absent
         entry = {
             "files": [str(file) for file in files],
@@ -196,8 +206,14 @@ def _name(entry: Mapping[str, Any]) -> str:
     return f"{entry['files'][0]} ({entry['end_ns']})"
 
 
-def _files(folder: Path, what: str) -> list[Path]:
-    return list(folder.glob("*.nc" if what == SCAN else "*.vpdata")) if folder.is_dir() else []
+def _folder(ended: Mapping[str, Any]) -> Path | None:
+    return None if ended["folder"] is None else Path(ended["folder"])
+
+
+def _files(folder: Path | None, what: str) -> list[Path]:
+    if folder is None or not folder.is_dir():
+        return []
+    return list(folder.glob("*.nc" if what == SCAN else "*.vpdata"))
 
 
 def _older(content: FileContent, begun_ns: int) -> bool:
