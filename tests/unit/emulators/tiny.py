@@ -59,6 +59,7 @@ class Tiny(Emulator):
         for one in (self._client, getattr(self, "_listener", None)):
             if one is not None:
                 one.close()
+        self._client = None  # it may be opened again
 
 
 def ask(address: str, *lines: str) -> list[str]:
