@@ -52,6 +52,7 @@ def test_settings_reach_the_scheduler_in_si_and_a_table_with_a_class_is_left_to_
         ('rescan = { tolerance = "20 s" }', "s can't be converted to m"),
         ('rescan = { rule = "papr" }', "not 'papr'"),
         ('compensate = { x = "x-rate" }', "drift.compensate.y is missing"),
+        ('compensate = { x = "x-drift-rate-x", y = "x-rate" }', "needs the parameter 'x-rate'"),
         ("rescan = { tolerance = 0.0 }", "a tolerance of 0.0 m is none"),
     ],
 )

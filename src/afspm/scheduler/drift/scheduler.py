@@ -37,6 +37,7 @@ class DriftCompensatedScheduler(Scheduler):
     flags: ClassVar = ("thermal-drift",)
     publishes: ClassVar = (MAPPING, RESCAN)
     plain_settings: ClassVar = ("drift",)
+    needs_parameters: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -47,6 +48,8 @@ class DriftCompensatedScheduler(Scheduler):
     ) -> None:
         super().__init__(control, limits, cache)
         self.drift = DriftSettings.from_table(drift or {}) if not isinstance(drift, DriftSettings) else drift
+        if (compensate := self.drift.compensate) is not None:
+            self.needs_parameters = (compensate.x, compensate.y)
 
     def check(self) -> None:
         """Whether estimator and tracker can be made. Raises ConfigError if not."""
