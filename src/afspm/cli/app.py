@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from afspm.cli import check, drift, emulate, graph, keys, run, test_translator
+from afspm.cli import check, drift, emulate, graph, keys, new, run, test_translator
 
 app = typer.Typer(
     name="afspm",
@@ -20,4 +20,5 @@ app.command("graph")(graph.graph)
 app.command("keys")(keys.keys)
 app.command("emulate")(emulate.emulate)
 app.command("test-translator")(test_translator.check_translator)
+app.add_typer(new.app, name="new")
 app.add_typer(drift.app, name="drift")

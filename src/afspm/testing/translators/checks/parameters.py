@@ -41,6 +41,8 @@ _STEPS = {
     names.SAMPLE_SLOPE_X: Step(from_zero=1e-3),
     names.SAMPLE_SLOPE_Y: Step(from_zero=1e-3),
     names.TIP_BIAS_VOLTAGE: Step(from_zero=1e-3),
+    names.ZCTRL_PGAIN: Step(from_zero=1e-2),
+    names.ZCTRL_IGAIN: Step(from_zero=1e-2),
 }
 _PLACES = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.PROBE_POS_X, names.PROBE_POS_Y)
 

@@ -1,0 +1,45 @@
+"""Packages to begin with: real ones, checked and tested as they are. `afspm new` writes them by another name."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from afspm.errors import ConfigError, FileError
+
+_MODULE, _CLASS = "my_scope", "MyScope"
+_SKIPPED = {"__pycache__", "__init__.pyc"}
+
+
+def write_translator(name: str, into: Path) -> Path:
+    """Write the package of a translator.
+
+    Args:
+        name: of the package; "my-scope" becomes my_scope, with the class MyScope.
+
+    Returns:
+        its folder, new in `into`.
+
+    Raises:
+        ConfigError: it can't be called that.
+        FileError: there is such a folder, or it can't be written.
+    """
+    module = re.sub(r"[\s-]+", "_", name.strip()).lower()
+    if not module.isidentifier() or module in ("afspm", "tests"):
+        raise ConfigError(f"{name!r} can't be the name of a package", hint="letters, digits and _, e.g. my_scope")
+    class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
+    target = into / module
+    source = Path(__file__).with_name("translator")
+    try:
+        target.mkdir(parents=True)
+        for file in sorted(source.rglob("*")):
+            if file.is_file() and _SKIPPED.isdisjoint(file.parts):
+                written = target / str(file.relative_to(source)).replace(_MODULE, module)
+                written.parent.mkdir(parents=True, exist_ok=True)
+                text = file.read_text(encoding="utf-8")
+                written.write_text(text.replace(_MODULE, module).replace(_CLASS, class_name), encoding="utf-8")
+    except FileExistsError:
+        raise FileError("there is such a folder already", where=str(target), hint="choose another name") from None
+    except OSError as error:
+        raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
+    return target
