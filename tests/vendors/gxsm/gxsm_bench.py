@@ -13,6 +13,7 @@ from queue import SimpleQueue
 from threading import Event
 from typing import Any
 
+import pytest
 import zmq
 
 from afspm import wire
@@ -146,6 +147,8 @@ class Bench:
     """An emulator and a translator of it."""
 
     def __init__(self, folder: Path, stack: ExitStack, speed: float, emulator: dict[str, Any]) -> None:
+        if emulator.get("transport") == "shm" and not sys.platform.startswith("linux"):
+            pytest.skip("Gxsm4's shared memory is there on Linux alone")
         self.folder, self._stack, self._speed = folder, stack, speed
         self.clock = ExperimentClock.starting_now(speed=speed)
         block = f"afspm_test_{os.getpid()}_{id(self)}"

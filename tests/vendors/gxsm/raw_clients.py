@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import fcntl
 import json
 import mmap
 import os
@@ -58,6 +57,8 @@ class MemoryClient:
             self.memory = mmap.mmap(file.fileno(), 16_777_344)
 
     def call(self, method: str, *arguments: Any) -> Any:
+        import fcntl
+
         with Path(tempfile.gettempdir(), "gxsm4_pyshm_transaction.lock").open("a") as lock:
             if self._locked:
                 fcntl.flock(lock, fcntl.LOCK_EX)

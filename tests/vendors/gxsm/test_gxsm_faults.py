@@ -191,9 +191,10 @@ def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, saving: 
     assert "lacks lines" in made.said()
 
 
-@pytest.mark.parametrize("kind", ["file-late", "half-file"])
-@pytest.mark.parametrize("version", [3, 4])
-@pytest.mark.parametrize("saving", ["afspm", "gxsm"])
+@pytest.mark.parametrize(
+    ("kind", "version", "saving"),
+    [("file-late", 3, "afspm"), ("half-file", 3, "gxsm"), ("file-late", 4, "gxsm"), ("half-file", 4, "afspm")],
+)
 def test_files_that_take_their_time_are_waited_for(bench: Make, kind: str, version: int, saving: str) -> None:
     made = bench(speed=20.0, version=version)
     peer = small(made, saving=saving)

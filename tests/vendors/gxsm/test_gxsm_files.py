@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm import files
 from afspm.emulators.gxsm.channels import CHANNELS
+from afspm.emulators.gxsm.saving import FAULT_KINDS, Saving
 from afspm.files import netcdf, read
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "gxsm"
@@ -24,7 +26,34 @@ REAL = {
 CURVE = "gxsm4/scan006-VP001-VP.vpdata"
 BOTH = [(version, label) for version, files_ in REAL.items() for label in files_]
 
+START_S = 1000.0
+
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real files are not here")
+
+
+def sizes(folder: Path) -> dict[str, int]:
+    return {file.name: file.stat().st_size for file in folder.iterdir()}
+
+
+def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_path: Path) -> None:
+    saving = Saving(tmp_path, Faults([], FAULT_KINDS, START_S))
+    saving.write([(tmp_path / "a", bytes(100)), (tmp_path / "b", bytes(200))], START_S)
+    seen = [sizes(tmp_path)]
+    next_s: float | None = START_S
+    while next_s is not None:
+        next_s = saving.advance(next_s)
+        if sizes(tmp_path) != seen[-1]:
+            seen.append(sizes(tmp_path))
+    assert seen == [{}, {"b": 100}, {"b": 200}, {"b": 200, "a": 50}, {"b": 200, "a": 100}]
+
+
+def test_the_next_number_is_the_first_that_no_file_has(tmp_path: Path) -> None:
+    saving = Saving(tmp_path, Faults([], FAULT_KINDS, START_S))
+    (tmp_path / "scan001-Xp-a.nc").touch()
+    paths = [saving.free(ending) for ending in ("Xp-a.nc", "Xp-b.nc")]
+    assert [path.name for path in paths] == ["scan002-Xp-a.nc", "scan001-Xp-b.nc"]
+    saving.counted(paths)
+    assert saving.named("Xp-a.nc", saving.counter).name == "scan003-Xp-a.nc"
 
 
 def written(folder: Path, version: int, label: str, real: Path) -> Path:

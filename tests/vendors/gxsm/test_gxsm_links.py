@@ -7,7 +7,6 @@ import math
 import os
 import pickle
 import socket
-import struct
 import subprocess
 import sys
 import time
@@ -42,6 +41,8 @@ ARRAYS = [
     np.arange(5, dtype="<i4"),
 ]
 
+
+on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="shared memory as Linux has it")
 
 # --- pickles ---
 
@@ -236,15 +237,20 @@ def test_addresses() -> None:
     assert Address.parse("shm:mine@other") == Address(block="mine", process="other")
 
 
-def test_nobody_there_is_said(tmp_path: Path) -> None:
+def test_nobody_there_is_said() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(ControllerLost, match=r"is bridge.py running in GXSM's console\?"):
         open_link(Address(host="127.0.0.1", port=port), 1.0, time.monotonic)
+
+
+@on_linux
+def test_no_process_of_that_name_is_said() -> None:
     with pytest.raises(ControllerLost, match="no process is called 'no-such-gxsm'"):
         open_link(Address.parse("shm:nothing@no-such-gxsm"), 1.0, time.monotonic)
 
 
+@on_linux
 def test_a_process_that_the_signal_would_end_is_never_signalled() -> None:
     """As a GXSM that was started with -s, or anything else of the same name."""
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
@@ -253,8 +259,16 @@ def test_a_process_that_the_signal_would_end_is_never_signalled() -> None:
         assert process.poll() is None
 
 
+def test_shared_memory_is_for_linux_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    with pytest.raises(ConfigError, match=r"run bridge\.py in GXSM's console"):
+        open_link(Address.parse("shm"), 1.0, time.monotonic)
+
+
 @pytest.fixture
 def block() -> Iterator[Path]:
+    if not sys.platform.startswith("linux"):
+        pytest.skip("shared memory as Linux has it")
     path = Path("/dev/shm", f"afspm_test_block_{os.getpid()}")
     path.write_bytes(bytes(16_777_344))
     yield path
@@ -330,12 +344,3 @@ def test_bits_are_read_as_the_hardware_means_them() -> None:
 def test_memory_that_nobody_has_written_is_no_set_of_bits(slots: list[float]) -> None:
     with pytest.raises(BadReply):
         decoded(Hardware.SRANGER, slots)
-
-
-def test_the_longest_answer_of_the_memory_fits(block: Path) -> None:
-    """An image of 1024 x 2047 pixels is the largest that goes through."""
-    image = np.zeros((1024, 2047))
-    content = pickle.dumps(image, 4)
-    assert len(content) <= 16_777_344 - 136
-    assert struct.calcsize("<q") == 8
-    np.testing.assert_array_equal(pickles.loads(content), image)

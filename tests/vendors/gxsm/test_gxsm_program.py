@@ -108,6 +108,50 @@ def test_what_is_set_is_never_refused_in_words(bench: Make, kind: dict[str, Any]
         assert gxsm.call("moveto_scan_xy", 7.0, 0.0) == 0
 
 
+def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
+    """And in the first moments of a scan those of the scan before."""
+    made = bench(speed=10.0)
+    for name in ("scan001-M-Xp-ZSmTopo.nc", "scan002-M-Xp-ZSmTopo.nc"):
+        (made.files / name).write_bytes(b"of last year")
+    with calling(made) as gxsm:
+        small(gxsm)
+
+        def name(channel: int) -> str:
+            return Path(gxsm.call("chfname", channel)).name
+
+        gxsm.call("startscan")
+        until(made, lambda: bool(bits(gxsm) & 2))
+        assert name(0) == "scan001-M-Xp-ZSmTopo.nc", "which is there already"
+        until(made, lambda: not bits(gxsm) & 2)
+        until(made, lambda: name(0) == "scan003-M-Xp-ZSmTopo.nc")
+        assert name(2) == "scan001-Xp-ImTunnel.nc", "each channel counts by itself"
+        until(made, lambda: len(list(made.files.glob("*.nc"))) == 6)
+        gxsm.call("startscan")
+        saved = name(0)
+        started = made.emulator.program.last
+        assert started is not None
+        assert saved == "scan003-M-Xp-ZSmTopo.nc" or made.clock.now_s() > started.start_s + 0.04
+        until(made, lambda: name(0) == "scan004-M-Xp-ZSmTopo.nc")
+        assert gxsm.call("chfname", 4) == "EE: invalid channel"
+
+
+def test_a_scan_that_is_stopped_is_saved_with_zeros(bench: Make) -> None:
+    made = bench(speed=5.0)
+    with calling(made) as gxsm:
+        small(gxsm)
+        gxsm.call("startscan")
+        until(made, lambda: gxsm.call("y_current") >= 3)
+        gxsm.call("stopscan")
+        assert not bits(gxsm) & 2, "free at once"
+        path = made.files / "scan001-M-Xp-ZSmTopo.nc"
+        until(made, lambda: path.exists() and _readable(path))
+        (scan,) = read(path).scans
+        there = np.isfinite(scan.values).all(axis=1)
+        assert there[-3:].all(), "from the top"
+        assert not there[0]
+        assert gxsm.call("get_slice", 0, 0, 0, 7, 1).tolist() == [[0.0] * 16]
+
+
 def test_unknown_parameters_are_minus_infinity_in_4_and_garbage_in_3(bench: Make) -> None:
     with calling(bench(version=4)) as gxsm:
         assert gxsm.call("get", "dsp-nonsense") == -math.inf
