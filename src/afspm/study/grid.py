@@ -51,12 +51,19 @@ class Grid:
         """Each combination once, and what it is called: what differs between them; the defaults first.
 
         Raises:
-            ConfigError, InvalidValue: as `NightSettings.of`.
+            ConfigError, InvalidValue: as `NightSettings.of`; or what is told to a part that no night has.
         """
         fixed = {name: values[0] for name, values in self.values.items() if len(values) == 1}
+        nights = [(chosen, NightSettings.of(fixed | chosen)) for chosen in [{}, *self._combinations()]]
+        for name in self.values:
+            if not any(_is_in_force(name, settings) for _, settings in nights):
+                part = name.rpartition(".")[0]
+                raise ConfigError(
+                    f"{name} is told to nobody: no night has an estimator or tracker {part!r}",
+                    hint='name it as well, e.g. tracker = "paper" and paper.queue = 5',
+                )
         told: list[NightSettings] = []
-        for chosen in [{}, *self._combinations()]:
-            settings = NightSettings.of(fixed | chosen)
+        for chosen, settings in nights:
             in_force = [name for name in chosen if _is_in_force(name, settings)]
             label = " ".join(f"{name}={chosen[name]}" for name in in_force) or "defaults"
             if settings not in told:
@@ -70,8 +77,8 @@ class Grid:
 
 
 def _is_in_force(name: str, settings: NightSettings) -> bool:
-    part, dot, _ = name.partition(".")
-    return not dot or part in {getattr(settings, one)["class"] for one in PARTS}
+    classes = tuple(f"{getattr(settings, one)['class']}." for one in PARTS)
+    return "." not in name or name.startswith(classes)
 
 
 def _value(text: str) -> Any:

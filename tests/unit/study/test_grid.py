@@ -30,6 +30,18 @@ def test_what_belongs_to_another_tracker_makes_no_combination() -> None:
     assert named["tracker=paper paper.queue=10"].tracker == {"class": "paper", "queue": 10}
 
 
+@pytest.mark.parametrize("given", [["paper.queue=3,5"], ["tracker=bank", "paper.queue=3"], ["tracker.queue=3"]])
+def test_what_is_told_to_a_part_that_no_night_has_is_refused(given: list[str]) -> None:
+    with pytest.raises(ConfigError, match="told to nobody"):
+        dict(Grid.of(given).settings())
+
+
+def test_a_user_s_own_part_is_told_by_its_whole_name() -> None:
+    named = dict(Grid.of(["estimator=my_lab.Periodicity", "my_lab.Periodicity.lattice_m=1e-9,2e-9"]).settings())
+    assert [one.estimator.get("lattice_m") for one in named.values()] == [None, 1e-9, 2e-9]
+    assert list(named)[1] == "my_lab.Periodicity.lattice_m=1e-09"
+
+
 def test_a_file_is_read_and_the_command_line_goes_on_top_of_it(tmp_path: Path) -> None:
     file = tmp_path / "grid.toml"
     file.write_text('tracker = ["bank", "paper"]\nhours = 2\n[paper]\nqueue = [3, 5]\nf_min = 0.5\n', encoding="utf-8")
