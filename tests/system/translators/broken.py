@@ -129,11 +129,11 @@ class WrongUnit(Broken):
     """The speed in another unit than the controller's, there and back."""
 
     def set(self, values: Mapping[str, Value]) -> None:
-        super().set({name: 50.0 * float(v) if name == names.SCAN_SPEED else v for name, v in values.items()})
+        super().set({name: float(v) / 10.0 if name == names.SCAN_SPEED else v for name, v in values.items()})
 
     def get(self, vendor: str) -> Value:
         value = super().get(vendor)
-        return float(value) / 50.0 if vendor == names.SCAN_SPEED else value
+        return 10.0 * float(value) if vendor == names.SCAN_SPEED else value
 
 
 class NotOnlyWhatWasAsked(Broken):

@@ -12,6 +12,8 @@ import pytest
 from afspm.testing.translators import Options, Report, run
 
 HERE = Path(__file__).parent
+STUCK = ("NeverFreeAgain", "SuccessWithoutChange")
+"""Of these nothing can be put back."""
 EXPERIMENT = """
 [microscope]
 component = true
@@ -67,6 +69,8 @@ def test_what_is_wrong_is_said_in_one_line(name: str, check: str, said: str, tmp
     assert "\n" not in lines[check]
     assert re.search(said, lines[check]), lines[check]
     assert not report.passed
+    if name not in STUCK:
+        assert report.unrestored == []
 
 
 def test_the_scan_before_is_not_taken_for_the_new_one(tmp_path: Path) -> None:

@@ -74,6 +74,11 @@ class Story:
         """Whether it was said after `mark`."""
         return any(one.state is state for one in self.all[mark:])
 
+    def at_s(self, state: ScopeState, mark: int) -> float | None:
+        """When it was first said after `mark`, experiment time; None: not yet."""
+        times = (one.time_ns for one in self.all[mark:] if one.state is state and one.time_ns is not None)
+        return next((time_ns / 1e9 for time_ns in times), None)
+
 
 def told(heard: Iterable[Heard]) -> str:
     """What was heard, for a person."""

@@ -26,6 +26,8 @@ from afspm.units import convert
 
 SCAN_S = 8.0
 """Experiment seconds that a scan is to last, where its speed can be set: long enough to tell its start from its end."""
+LINE_S = 0.25
+"""Experiment seconds that a line, there and back, is to last at least: no scanner is driven to its limits."""
 LONG_REAL_S = 3.0
 """Real seconds that a scan has to last at least in the middle of which something is asked."""
 UNKNOWN_S = 1200.0
@@ -99,7 +101,7 @@ class Taking:
 
     def take_scan(self, frame: Frame) -> Taken:
         """Take a scan, to its end."""
-        expected_s = self.prepare(frame, SCAN_S)
+        expected_s = self.prepare(frame, max(SCAN_S, LINE_S * frame.shape[0]))
         heard = self._measure(names.START_SCAN, ScopeState.SCANNING, expected_s)
         if not scans(heard):
             raise Failed("a Scan2d between SS_SCANNING and SS_FREE", told(heard))

@@ -89,6 +89,7 @@ def as_parameters(kit: Taking) -> None:
 @check("feedback/on-off", "the feedback is switched off and on, and published")
 def on_off(kit: Taking) -> None:
     before = in_force(kit).on
+    kit.support.settable[names.FEEDBACK_ON] = False
     if before is None:
         raise Skipped("the microscope does not say whether its feedback is on")
     for on in (not before, before):
@@ -96,3 +97,4 @@ def on_off(kit: Taking) -> None:
         if kit.support.has(names.FEEDBACK_ON):
             value = str(kit.bench.get(names.FEEDBACK_ON).value).lower()
             expect(value == str(on).lower(), f"{names.FEEDBACK_ON} = {str(on).lower()}", value)
+            kit.support.settable[names.FEEDBACK_ON] = True

@@ -1,0 +1,86 @@
+"""Pictures of one surface, told with wrong axes: which idea of the axes explains them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from afspm.model import Region
+from afspm.testing.translators.frames import Frames
+from afspm.testing.translators.likeness import CLEARLY, LIKE, Idea, Picture, ideas, likenesses
+
+WHOLE = Region((2e-6, -1e-6), (1e-6, 1e-6), math.radians(10.0))
+TOLD = "as told"
+
+
+def surface_m(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bumps without any symmetry."""
+    random = np.random.default_rng(3)
+    places = random.uniform(-0.75e-6, 0.75e-6, (60, 2)) + WHOLE.center_m
+    heights = random.uniform(0.2, 1.0, 60)
+    bumps = (
+        height * np.exp(-((x_m - x) ** 2 + (y_m - y) ** 2) / (40e-9) ** 2)
+        for (x, y), height in zip(places, heights, strict=True)
+    )
+    return np.asarray(sum(bumps))
+
+
+def picture_of(region: Region, shape: tuple[int, int], noise: float = 0.02, seed: int = 0) -> Picture:
+    values = surface_m(*region.pixels_m(shape))
+    return Picture(region, values + np.random.default_rng(seed).normal(0.0, noise, shape))
+
+
+def all_pictures(noise: float = 0.02) -> tuple[Picture, list[Picture]]:
+    frames = Frames(WHOLE)
+    details = [frames.plain, frames.wide, frames.turned]
+    return (
+        picture_of(WHOLE, (96, 96), noise),
+        [picture_of(frame.region, frame.shape, noise, seed) for seed, frame in enumerate(details, 1)],
+    )
+
+
+def test_right_axes_fit_as_told_and_better_than_any_others() -> None:
+    found = likenesses(*all_pictures())
+    assert found[TOLD] > 0.95
+    assert max(value for name, value in found.items() if name != TOLD) < found[TOLD] - CLEARLY
+
+
+@pytest.mark.parametrize("name", [name for name in ideas(0.0) if not name.startswith((TOLD, "half", "with x and y s"))])
+def test_wrong_axes_are_found_out(name: str) -> None:
+    wrong: Idea = ideas(WHOLE.angle_rad)[name]  # each is its own inverse
+    larger, details = all_pictures()
+    found = likenesses(wrong(larger), [wrong(detail) for detail in details])
+    assert max(found, key=lambda one: found[one]) == name
+    assert found[name] > 0.95
+    assert found[TOLD] < found[name] - CLEARLY
+
+
+def test_swapped_axes_are_found_out() -> None:
+    larger, details = all_pictures()
+
+    def swapped(picture: Picture) -> Picture:
+        return replace(picture, values=picture.values.T.copy())
+
+    square = [detail for detail in details if detail.values.shape[0] == detail.values.shape[1]]
+    found = likenesses(swapped(larger), list(map(swapped, square)))
+    assert max(found, key=lambda one: found[one]) == "with x and y swapped"
+
+
+def test_half_a_frame_is_found_out() -> None:
+    """Told by its centre where its corner is meant."""
+    larger, details = all_pictures()
+
+    def moved(picture: Picture) -> Picture:
+        return ideas(WHOLE.angle_rad)["half a frame away (+0.5, +0.5)"](picture)
+
+    found = likenesses(moved(larger), list(map(moved, details)))
+    assert max(found, key=lambda one: found[one]) == "half a frame away (-0.5, -0.5)"
+    assert found[TOLD] < LIKE
+
+
+def test_noise_is_like_nothing() -> None:
+    assert max(likenesses(*all_pictures(noise=5.0)).values()) < LIKE
