@@ -145,6 +145,17 @@ def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
     assert found["I-Tunnel"].filename.endswith("scan001-Xp-ImTunnel.nc")
 
 
+def test_a_scan_that_is_saved_twice_is_published_once(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    made.at_panel(lambda emulator: setattr(emulator.program, "auto_save", True))
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert len({scan.channel for scan in scans(heard)}) == len(scans(heard)) == 4
+    assert len(scanned(peer)) == 4
+
+
 def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
     made = bench()
     peer = made.start(saving="gxsm")

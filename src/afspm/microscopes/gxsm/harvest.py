@@ -93,12 +93,11 @@ class Harvest:
             channels: where GXSM says that it saves each channel of a scan.
         """
         paths = [Path(path) for path in channels]
-        named = (_NUMBERED.search(path.name) for path in paths)
         ended = {
             **self._kept["running"],
             "end_ns": now_ns,
             "until_s": now_ns / NS_PER_S + self._patience_s,
-            "channels": [match[1] for match in named if match],
+            "channels": sorted(_endings(paths)),
         }
         if ended["folder"] is None and paths:  # a scan's: old ones in there are told by when they began
             ended["folder"] = str(paths[0].parent)
@@ -160,14 +159,13 @@ class Harvest:
             content = self._whole.get(file)
             if content is not None and not _older(content, ended["begun_ns"]):
                 found[file] = content
-        if ended["what"] != SCAN:  # the newest alone: there is one for each spectrum
-            found = dict(sorted(found.items(), key=lambda item: item[0].stat().st_mtime_ns)[-1:])
-        return found
+        if ended["what"] == SCAN:  # one for each channel, should somebody have it saved again
+            return {file: found[file] for file in _endings(found).values()}
+        return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
 
     def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
         """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
-        there = {match[1] for match in (_NUMBERED.search(file.name) for file in files) if match}
-        missing = set(ended["channels"]) - there
+        missing = set(ended["channels"]) - _endings(files).keys()
         soon_s = ended["end_ns"] / NS_PER_S + _SOON_S
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= soon_s)
 
@@ -188,8 +186,7 @@ class Harvest:
 
     def _add(self, ended: Mapping[str, Any], files: Mapping[Path, FileContent]) -> None:
         if ended["what"] == SCAN:
-            there = {match[1] for match in (_NUMBERED.search(file.name) for file in files) if match}
-            absent = sorted(set(ended["channels"]) - there)
+            absent = sorted(set(ended["channels"]) - _endings(files).keys())
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
             self._kept["absent"] = absent
@@ -204,6 +201,12 @@ class Harvest:
 def _name(entry: Mapping[str, Any]) -> str:
     """Of a result: files of spectra may be overwritten."""
     return f"{entry['files'][0]} ({entry['end_ns']})"
+
+
+def _endings(files: Iterable[Path]) -> dict[str, Path]:
+    """What tells the channels of a scan from each other: what follows the number in a file's name; the last of each."""
+    named = ((_NUMBERED.search(file.name), file) for file in files)
+    return {match[1]: file for match, file in named if match}
 
 
 def _folder(ended: Mapping[str, Any]) -> Path | None:
