@@ -48,12 +48,15 @@ def files(
     """Follow drift in recorded scans.
 
     Prints a table, and writes it (drift.csv), figures, and the scans laid on top of each other over their common area
-    (drift_stack.nc). Files that can't be read are named, and the rest goes on.
+    (drift_stack.nc). Files that can't be read are named, and the rest goes on. An estimator or tracker of your own,
+    module.Class, is looked for in this folder, too.
     """
     _one_thread_a_process()
     from afspm.cli import drift_files
+    from afspm.experiment.classes import importing_from
 
-    drift_files.run(paths, channel, estimator, tracker, output, jobs or os.cpu_count() or 1)
+    with importing_from([Path.cwd()]):
+        drift_files.run(paths, channel, estimator, tracker, output, jobs or os.cpu_count() or 1)
 
 
 @app.command("study")
@@ -76,8 +79,10 @@ def study(
     """Simulate many nights over a grid of settings, and say which are best and whether the defaults hold."""
     _one_thread_a_process()
     from afspm.cli import drift_study
+    from afspm.experiment.classes import importing_from
 
-    drift_study.run(settings or [], nights, seed, cluster, jobs or os.cpu_count() or 1)
+    with importing_from([Path.cwd()]):
+        drift_study.run(settings or [], nights, seed, cluster, jobs or os.cpu_count() or 1)
 
 
 def _one_thread_a_process() -> None:
