@@ -17,6 +17,7 @@ from afspm.model import (
     ProbePosition,
     Region,
     Scan,
+    ScanLines,
     ScanParameters,
     ScopeState,
     Spectrum,
@@ -164,6 +165,30 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
     assert [scan.filename[-19:-16] for scan in found] == ["001", "002"]
     assert made.emulator.program.auto_save
     assert len(list(made.files.glob("*.nc"))) == 8
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_lines_come_while_it_scans(bench: Make, version: int) -> None:
+    """Of the second scan on: only files tell what channels are called."""
+    made = bench(speed=20.0, version=version)
+    peer = made.start(live_lines_s=1.0)
+    ready(peer, shape=(40, 32))
+    assert peer.act(names.START_SCAN).ok
+    assert not any(isinstance(one, ScanLines) for one in peer.until(FREE))
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    for whole in scans(heard):
+        lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == whole.channel]
+        assert len(lines) >= 2
+        assert lines[0].first_row + len(lines[0].values) == 40, "the highest first"
+        picture = None
+        for one in lines:
+            assert (one.unit, one.region) == (whole.unit, whole.region)
+            picture = one.into(picture)
+        assert picture is not None
+        there = np.isfinite(picture)
+        assert there.any()
+        np.testing.assert_allclose(picture[there], whole.values[there], rtol=1e-6)
 
 
 # --- parameters ---

@@ -13,10 +13,11 @@ from afspm.microscopes.gxsm.frame import REFNAMES, Frame, number, send, user_uni
 from afspm.microscopes.gxsm.hardware import ABORT, APPROACH, AUTOSAVE_OFF, Hardware, available, execute, recognised
 from afspm.microscopes.gxsm.harvest import Harvest
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
+from afspm.microscopes.gxsm.live import new_lines
 from afspm.microscopes.in_force import FRAME, POSITION, frame
 from afspm.microscopes.microscope import ControllerLost, Microscope, action
 from afspm.microscopes.parameters import FEEDBACK_ON, Value
-from afspm.model import ControlResponse, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
 
 _OWN: Final = (*Frame.names, *POSITION, FEEDBACK_ON, names.SPEC_KIND, names.CONTROLLER)
@@ -35,7 +36,7 @@ class Gxsm(Microscope):
         hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
         scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
         reply_timeout_s: how long an answer may take, in real time.
-        parameters, actions, poll_period_s, result_timeout_s: as for every microscope.
+        parameters, actions, poll_period_s, result_timeout_s, live_lines_s: as for every microscope.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -54,9 +55,14 @@ class Gxsm(Microscope):
         actions: Mapping[str, Mapping[str, Any]] | None = None,
         poll_period_s: Duration = 0.1,
         result_timeout_s: Duration = 10.0,
+        live_lines_s: Duration | None = None,
     ) -> None:
         super().__init__(
-            parameters=parameters, actions=actions, poll_period_s=poll_period_s, result_timeout_s=result_timeout_s
+            parameters=parameters,
+            actions=actions,
+            poll_period_s=poll_period_s,
+            result_timeout_s=result_timeout_s,
+            live_lines_s=live_lines_s,
         )
         kinds = [kind.value for kind in Hardware]
         if hardware is not None and hardware not in kinds:
@@ -97,7 +103,7 @@ class Gxsm(Microscope):
             self._harvest,
             self.clock,
             self.log,
-            region=lambda: frame(self.read(FRAME))[0],
+            set_frame=lambda: frame(self.read(FRAME)),
             saves=self._saves,
             scan_dir=self._scan_dir,
             probe_dir=self._probe_dir,
@@ -222,6 +228,13 @@ class Gxsm(Microscope):
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         """Read the files of one."""
         return self._harvest.load(result)
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        """From GXSM's memory, where lines that were not scanned yet are zero; of channels that a scan was saved of."""
+        endings, taken = self._activity.endings(), self._harvest.scanning
+        if taken is None or not endings:
+            return ()
+        return new_lines(self._ask, endings, self._harvest.channels, taken, start)
 
     # --- actions ---
 

@@ -11,7 +11,7 @@ from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
 from afspm.microscopes.gxsm.frame import Frame
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
-from afspm.microscopes.gxsm.harvest import SCAN, Harvest
+from afspm.microscopes.gxsm.harvest import SCAN, Harvest, endings
 from afspm.microscopes.gxsm.link import Asking
 from afspm.model import Region, ScopeState, ScopeStatus
 
@@ -26,7 +26,7 @@ class Activity:
 
     Args:
         ask: GXSM.
-        frame: of the next scan; `region` the same, as it was set.
+        frame: of the next scan; `set_frame` gives the same, as it was set, and (rows, columns).
         saves: whether GXSM is told to save a scan at its end; if not, it does so by itself.
         scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
     """
@@ -40,7 +40,7 @@ class Activity:
         clock: Clock,
         log: logging.Logger,
         *,
-        region: Callable[[], Region],
+        set_frame: Callable[[], tuple[Region, tuple[int, int]]],
         saves: bool,
         scan_dir: Path | None,
         probe_dir: Path | None,
@@ -48,7 +48,7 @@ class Activity:
         self._ask = ask
         self._hardware = hardware
         self._frame = frame
-        self._region = region
+        self._set_frame = set_frame
         self._harvest = harvest
         self._clock = clock
         self._log = log
@@ -57,6 +57,7 @@ class Activity:
         self._stopping = False
         self._execute = ""
         self._shows_until_s = self._arrives_s = 0.0
+        self._endings: list[str] = []
 
     # --- what is begun ---
 
@@ -103,6 +104,15 @@ class Activity:
 
     # --- what goes on ---
 
+    def endings(self) -> list[str]:
+        """Of the files of each channel of the running scan; none before it was seen running: GXSM would still tell of
+        the scan before."""
+        if self._harvest.what != SCAN or self._shows_until_s > 0.0:
+            return []
+        if not self._endings:
+            self._endings = [next(iter(endings([Path(path)])), "") for path in self._channels()]
+        return self._endings
+
     def doing(self) -> Doing:
         """What GXSM says."""
         return decoded(self._hardware, self._ask.numbers("rtquery", STATUS))
@@ -144,9 +154,9 @@ class Activity:
         self._ask.call("action", action)
 
     def _begin_scan(self, begun_ns: int) -> None:
-        self._stopping = False
-        region = self._region()
-        taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad]}
+        self._stopping, self._endings = False, []
+        region, shape = self._set_frame()
+        taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad], "shape": list(shape)}
         self._harvest.begin(SCAN, self._folder(), begun_ns, taken)
 
     def _begin_curve(self, kind: str, position_m: tuple[float, float]) -> None:

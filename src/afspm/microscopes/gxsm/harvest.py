@@ -50,7 +50,7 @@ class Harvest:
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._whole: dict[Path, FileContent] = {}
         self._broken_off = False
-        for key, empty in (("running", None), ("ended", None), ("results", []), ("absent", [])):
+        for key, empty in (("running", None), ("ended", None), ("results", []), ("absent", []), ("channels", {})):
             kept.setdefault(key, empty)
 
     @property
@@ -58,6 +58,21 @@ class Harvest:
         """Which measurement is running: `SCAN`, the kind of a spectrum, or nothing."""
         running = self._kept["running"]
         return running["what"] if running else ""
+
+    @property
+    def scanning(self) -> tuple[Region, tuple[int, int]] | None:
+        """The frame of the running scan, and (rows, columns)."""
+        if self.what != SCAN:
+            return None
+        x, y, width, height, angle = self._kept["running"]["frame"]
+        rows, columns = self._kept["running"]["shape"]
+        return Region((x, y), (width, height), angle), (rows, columns)
+
+    @property
+    def channels(self) -> dict[str, list[str]]:
+        """Name and unit of each channel of the last scans, by the ending of its files."""
+        found: dict[str, list[str]] = self._kept["channels"]
+        return found
 
     @property
     def broken_off(self) -> bool:
@@ -70,7 +85,7 @@ class Harvest:
         Args:
             folder: where its files will be; None: GXSM does not say yet.
             begun_ns: not before this; 0: it was found running.
-            taken: "frame" (x, y, width, height, angle) of a scan, "position" of a spectrum.
+            taken: "frame" (x, y, width, height, angle) and "shape" of a scan, "position" of a spectrum.
         """
         newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
         self._kept["running"] = {
@@ -97,7 +112,7 @@ class Harvest:
             **self._kept["running"],
             "end_ns": now_ns,
             "until_s": now_ns / NS_PER_S + self._patience_s,
-            "channels": sorted(_endings(paths)),
+            "channels": sorted(endings(paths)),
         }
         if ended["folder"] is None and paths:  # a scan's: old ones in there are told by when they began
             ended["folder"] = str(paths[0].parent)
@@ -160,12 +175,12 @@ class Harvest:
             if content is not None and not _older(content, ended["begun_ns"]):
                 found[file] = content
         if ended["what"] == SCAN:  # one for each channel, should somebody have it saved again
-            return {file: found[file] for file in _endings(found).values()}
+            return {file: found[file] for file in endings(found).values()}
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
 
     def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
         """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
-        missing = set(ended["channels"]) - _endings(files).keys()
+        missing = set(ended["channels"]) - endings(files).keys()
         soon_s = ended["end_ns"] / NS_PER_S + _SOON_S
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= soon_s)
 
@@ -186,10 +201,13 @@ class Harvest:
 
     def _add(self, ended: Mapping[str, Any], files: Mapping[Path, FileContent]) -> None:
         if ended["what"] == SCAN:
-            absent = sorted(set(ended["channels"]) - _endings(files).keys())
+            absent = sorted(set(ended["channels"]) - endings(files).keys())
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
             self._kept["absent"] = absent
+            for ending, file in endings(files).items():
+                scan = files[file].scans[0]
+                self._kept["channels"][ending] = [scan.channel, scan.unit]
         entry = {
             "files": [str(file) for file in files],
             **{key: ended[key] for key in ("what", "frame", "position", "end_ns") if key in ended},
@@ -203,7 +221,7 @@ def _name(entry: Mapping[str, Any]) -> str:
     return f"{entry['files'][0]} ({entry['end_ns']})"
 
 
-def _endings(files: Iterable[Path]) -> dict[str, Path]:
+def endings(files: Iterable[Path]) -> dict[str, Path]:
     """What tells the channels of a scan from each other: what follows the number in a file's name; the last of each."""
     named = ((_NUMBERED.search(file.name), file) for file in files)
     return {match[1]: file for match, file in named if match}

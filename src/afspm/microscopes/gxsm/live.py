@@ -1,0 +1,56 @@
+"""Lines of a running scan, from GXSM's memory: rows from the top, zeros where nothing was scanned yet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from afspm.microscopes.gxsm.frame import ANGSTROM_M
+from afspm.microscopes.gxsm.link import Asking
+from afspm.model import Region, ScanLines
+
+
+def new_lines(
+    ask: Asking,
+    endings: Sequence[str],
+    known: Mapping[str, Sequence[str]],
+    taken: tuple[Region, tuple[int, int]],
+    start: int,
+) -> list[ScanLines]:
+    """The lines beyond the first `start` that all channels have, in the order in which they are scanned.
+
+    GXSM tells neither names nor units of what it hands out: those of the files before are taken.
+
+    Args:
+        endings: of the channels' files, by number.
+        known: name and unit of a channel, by the ending of its files.
+        taken: the frame that is being scanned, and (rows, columns).
+    """
+    region, shape = taken
+    reached = int(ask.number("y_current"))
+    count = min(reached + 1, shape[0]) - start
+    if count < 1:
+        return []
+    images: dict[str, np.ndarray] = {}
+    for channel, ending in enumerate(endings):
+        if ending in known:
+            found = ask.call("get_slice", channel, 0, 0, start, count)
+            # of another shape: somebody has changed the next frame, and this one was found running
+            if isinstance(found, np.ndarray) and found.shape == (count, shape[1]):
+                images[ending] = found.astype(np.float64)
+    images = {ending: image for ending, image in images.items() if image.any()}
+    done = min((_whole(image) for image in images.values()), default=0)
+    lines = []
+    for ending, image in images.items() if done else ():
+        name, unit = known[ending]
+        rows = image[:done][::-1] * (ANGSTROM_M if unit == "m" else 1.0)
+        lines.append(ScanLines(region, shape, name, unit, shape[0] - start - done, rows))
+    return lines
+
+
+def _whole(image: np.ndarray) -> int:
+    """How many lines are complete: the last that is there may not be."""
+    empty = (image == 0.0).all(axis=1)
+    there = int(np.argmax(empty)) if empty.any() else len(image)
+    return max(there - 1, 0)
