@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from afspm.errors import ConfigError
 from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators import Options, Outcome, Report, bench, run
 from afspm.testing.translators.registry import all_checks
@@ -28,6 +29,22 @@ component = true
 class = "Simulator"
 surface = "particles"
 initial = { tip-bias-voltage = "200 mV", scan-angle = "3 deg" }
+"""
+PLAIN = """
+[microscope]
+component = true
+command = ["python", "{script}"]
+role = "translator"
+simulated = true
+heartbeats = false
+"""
+SAMPLE_COORDINATES = """
+[control]
+solved_by_hand = ["thermal-drift"]
+
+[scheduler]
+component = true
+class = "DriftCompensatedScheduler"
 """
 SCHEDULER = """
 router_url = "{router}"
@@ -114,6 +131,25 @@ def test_what_is_not_supported_is_skipped_and_listed(tmp_path: Path) -> None:
     assert report.support.actions["start-spec"] is False
 
 
+def test_a_translator_of_version_1_made_without_afspm_is_checked_just_the_same(tmp_path: Path) -> None:
+    file = tmp_path / "experiment.toml"
+    file.write_text(PLAIN.format(script=Path(__file__).with_name("plain.py").as_posix()), encoding="utf-8")
+    report = run(Options([file], runs=tmp_path / "runs"))
+    assert report.passed, report
+    passed = {result.name for result in report.results if result.outcome is Outcome.PASSED}
+    assert {
+        "scan/cancel",
+        "scan/order",
+        "scan/frame",
+        "scan/time",
+        "frame/set",
+        "refused/nan",
+        "busy/refused",
+    } <= passed
+    assert report.support.actions["start-scan"] is None  # it can't be asked what it supports
+    assert report.support.parameters["tip-bias-voltage"] is None
+
+
 @contextmanager
 def started(*arguments: str, cwd: Path) -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(
@@ -197,6 +233,36 @@ def test_the_command_ends_with_1_where_something_is_wrong_and_says_what(tmp_path
     assert "✗ refused/unknown-action: expected REP_ACTION_NOT_SUPPORTED" in output
     assert "1 passed, 1 failed" in output
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["passed"] is False
+
+
+def test_a_real_microscope_is_not_touched_before_somebody_says_that_the_tip_is_withdrawn(tmp_path: Path) -> None:
+    file = tmp_path / "experiment.toml"
+    file.write_text('[microscope]\ncomponent = true\nclass = "Nanonis"\n', encoding="utf-8")
+    command = [*AFSPM, "test-translator", "experiment.toml"]
+    done = subprocess.run(
+        command, cwd=tmp_path, input="n\n", capture_output=True, text=True, timeout=DEADLINE_S, check=False
+    )
+    assert done.returncode == 1
+    assert "Is the tip so far from the sample that it can't reach it" in done.stdout
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[watcher]\ncomponent = true\nclass = "Metadata"\n', "there is no translator"),
+        (EXPERIMENT + EXPERIMENT.replace("[microscope]", "[another]").split("20.0")[1], "translator"),
+        (EXPERIMENT + SAMPLE_COORDINATES, "in tip coordinates"),
+    ],
+)
+def test_what_can_not_be_checked_is_refused_before_anything_starts(text: str, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "experiment.toml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=said):
+        run(Options([file], runs=tmp_path / "runs"))
+    with pytest.raises(ConfigError, match="there is no check no-such-check"):
+        run(Options([file], runs=tmp_path / "runs", only=["no-such-check"]))
+    assert not (tmp_path / "runs").exists()
 
 
 def test_as_a_pytest_plugin_each_check_is_a_test(file: Path) -> None:

@@ -111,10 +111,6 @@ class Bench:
         expect(response.ok, f"REP_SUCCESS to {what}", answer_in_words(response))
         return response
 
-    def act(self, action: str) -> None:
-        """Have it done; it has to be a success."""
-        self.asked(ControlRequest.ACTION, action, action)
-
     def get(self, name: str, unit: str | None = None) -> Parameter:
         """A parameter's value, as it is told."""
         return value_in(self.asked(ControlRequest.PARAM, Parameter(name, None, unit), f"getting {name}"), name)

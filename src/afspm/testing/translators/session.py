@@ -16,6 +16,7 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.experiment.parts import EMULATED
 from afspm.experiment.wiring import connectable
+from afspm.model import Frame
 from afspm.runtime.component import Component
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
@@ -92,7 +93,7 @@ def prepare(options: Options) -> Experiment:
     """The experiment with the tester in it, and a scheduler if it had none.
 
     Raises:
-        ConfigError: it can't be run, has no translator, or is in sample coordinates.
+        ConfigError: it can't be run, or is in sample coordinates.
     """
     own = load(*options.files)
     overlay = _OVERLAY if own.resolved.with_role(Role.SCHEDULER) else _OVERLAY + _SCHEDULER
@@ -101,9 +102,13 @@ def prepare(options: Options) -> Experiment:
         file.write_text(overlay, encoding="utf-8")
         experiment = load(*options.files, file)
         experiment.require_valid()
-    translators = experiment.resolved.with_role(Role.TRANSLATOR)
-    if len(translators) != 1:
-        raise ConfigError(f"there are {len(translators)} translators, not one", where=str(options.files[0]))
+    schedulers = experiment.resolved.with_role(Role.SCHEDULER)
+    if any(getattr(experiment.resolved.classes.get(part.name), "frame", None) is Frame.SAMPLE for part in schedulers):
+        raise ConfigError(
+            "a translator is checked in tip coordinates, and this scheduler has the sample's",
+            where=str(options.files[0]),
+            hint="give a file with the microscope alone",
+        )
     return experiment
 
 
@@ -172,12 +177,6 @@ def _starts(
         log_level="DEBUG",
     )
     own = next(start.launch for start in starts if start.launch.name == NAME)
-    if own.sample_coordinates:
-        raise ConfigError(
-            "a translator is checked in tip coordinates, and this scheduler has the sample's",
-            where=str(options.files[0]),
-            hint='lay a file over it with [scheduler] class = "Scheduler"',
-        )
     return own, [start for start in starts if start.launch.name != NAME]
 
 

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from afspm.model import (
     ControlRequest,
+    ControlResponse,
     Parameter,
     ProbePosition,
     Region,
@@ -156,10 +157,17 @@ class Taking:
 
     # --- both ---
 
+    def act(self, action: str) -> None:
+        """Have it done. Some microscopes can't be asked what they support: this tells."""
+        response = self.bench.ask(ControlRequest.ACTION, action)
+        if response.code == ControlResponse.ACTION_NOT_SUPPORTED and self.support.actions.get(action) is None:
+            self.support.actions[action] = False
+            raise Skipped(f"not supported: {action}")
+        expect(response.ok, f"REP_SUCCESS to {action}", answer_in_words(response))
+
     def _begin(self, action: str, state: ScopeState) -> int:
         mark = self.bench.story.mark()
-        response = self.bench.ask(ControlRequest.ACTION, action)
-        expect(response.ok, f"REP_SUCCESS to {action} while SS_FREE", answer_in_words(response))
+        self.act(action)
         self.bench.wait_state(state, mark)
         return mark
 

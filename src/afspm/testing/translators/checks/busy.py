@@ -43,7 +43,9 @@ def refused(kit: Taking) -> None:
 def answered(kit: Taking) -> None:
     mark = kit.begin_long_scan(kit.frames.other)
     name = next((one for one, value in kit.support.parameters.items() if value is not None), None)
-    asked: list[tuple[ControlRequest, object, str]] = [(ControlRequest.ACTION_SUPPORT, names.STOP_SCAN, "stop-scan")]
+    asked: list[tuple[ControlRequest, object, str]] = []
+    if kit.support.actions[names.STOP_SCAN] is not None:
+        asked.append((ControlRequest.ACTION_SUPPORT, names.STOP_SCAN, "asking for stop-scan"))
     if name is not None:
         asked.append((ControlRequest.PARAM, Parameter(name), f"getting {name}"))
     for kind, subject, what in asked:

@@ -22,7 +22,7 @@ def broken_off(kit: Taking, mark: int, stop: str, begun: ScopeState) -> list[Hea
     """Stop what runs; what is published from its beginning on, once its states have been found right."""
     bench = kit.bench
     expect(bench.state is begun, f"SS_{begun.name} until it is stopped", told(bench.story.since(mark)))
-    bench.act(stop)
+    kit.act(stop)
     bench.wait_state(ScopeState.INTERRUPTED, mark)
     bench.wait_state(ScopeState.FREE, mark, bench.real_s(60.0))
     heard = bench.settled(mark)
@@ -48,6 +48,6 @@ def cancel(kit: Taking) -> None:
 def stop_nothing(kit: Taking) -> None:
     kit.bench.come_to_rest()
     mark = kit.bench.story.mark()
-    kit.bench.act(names.STOP_SCAN)
+    kit.act(names.STOP_SCAN)
     heard = kit.bench.settled(mark)
     expect(not states(heard), "no state after stopping nothing", told(heard))

@@ -24,6 +24,8 @@ _STEP = 1.02
 def in_force(kit: Taking) -> Feedback:
     """What was published last."""
     feedback = kit.bench.story.newest(Feedback)
+    if feedback is None and not any(map(kit.support.has, _NUMBERS.values())):
+        raise Skipped("the microscope tells nothing of a feedback")
     if feedback is None:
         raise Failed("ZCtrlParameters at the start", told(kit.bench.story.all[:10]))
     return feedback

@@ -24,7 +24,8 @@ def unknown_parameter(kit: Taking) -> None:
 
 @check("refused/unknown-action", "an action that there is not: REP_ACTION_NOT_SUPPORTED")
 def unknown_action(kit: Taking) -> None:
-    for kind in (ControlRequest.ACTION, ControlRequest.ACTION_SUPPORT):
+    can_be_asked = None not in kit.support.actions.values()
+    for kind in (ControlRequest.ACTION, *([ControlRequest.ACTION_SUPPORT] if can_be_asked else [])):
         _require(kit, kind, _UNKNOWN, ControlResponse.ACTION_NOT_SUPPORTED, f"REQ_{kind.name} {_UNKNOWN}")
 
 

@@ -42,7 +42,7 @@ def cancel(kit: Taking) -> None:
 def stop_nothing(kit: Taking) -> None:
     kit.bench.come_to_rest()
     mark = kit.bench.story.mark()
-    kit.bench.act(names.STOP_SPEC)
+    kit.act(names.STOP_SPEC)
     heard = kit.bench.settled(mark)
     expect(not states(heard), "no state after stopping nothing", told(heard))
 
