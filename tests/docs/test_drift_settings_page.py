@@ -1,0 +1,43 @@
+"""The settings of estimators and trackers in the how-to are there, with those defaults."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.drift import estimators, trackers
+from afspm.drift.trackers.references import Choice
+from afspm.drift.trackers.settings import BankSettings
+
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "drift.md"
+ROW = re.compile(r"^\| ((?:`\w+`(?:, )?)+) \| `(\w+)` \| `([^`]+)` \|", re.MULTILINE)
+ROWS = [
+    (owner, setting, default)
+    for owners, setting, default in ROW.findall(PAGE.read_text(encoding="utf-8"))
+    for owner in re.findall(r"`(\w+)`", owners)
+]
+
+
+def defaults(owner: str) -> dict[str, Any]:
+    if owner == "bank":
+        return {field.name: field.default for one in (BankSettings, Choice) for field in dataclasses.fields(one)}
+    path = ({**estimators.READY_MADE, **trackers.READY_MADE})[owner].path
+    module, _, name = path.rpartition(".")
+    parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters
+    return {name: one.default for name, one in parameters.items()}
+
+
+def test_the_table_is_found() -> None:
+    assert {owner for owner, _, _ in ROWS} == {"paper", "bank", "brief", "orb", "sift", "correlation"}
+
+
+@pytest.mark.parametrize(("owner", "setting", "default"), ROWS)
+def test_a_setting_has_the_default_that_is_told(owner: str, setting: str, default: str) -> None:
+    assert defaults(owner)[setting] == tomllib.loads(f"value = {default}")["value"]
