@@ -56,11 +56,15 @@ def drift_row(message: Any) -> list[str]:
     return [
         iso_utc(time_ns),
         message.filename,
-        *(f"{value:.9g}" for value in (-drift_x, -drift_y, *message.rate)),
+        *(_text(value) for value in (-drift_x, -drift_y, *message.rate)),
         "m; m/s",
         message.filename,
         f"{time_ns * 1e-9:.6f}",
-        *(f"{value:.9g}" for value in numbers),
+        *(_text(value) for value in numbers),
         *("yes" if message.matched else "no", message.reason),
         *("yes" if flag else "no" for flag in (message.lost, message.correcting)),
     ]
+
+
+def _text(value: float) -> str:
+    return f"{value + 0.0:.9g}"  # never -0

@@ -37,6 +37,13 @@ def test_a_row_says_offset_rate_and_whether_it_was_matched() -> None:
     assert [row[name] for name in ("matched", "lost", "correcting")] == ["yes", "no", "yes"]
 
 
+def test_nothing_is_zero_and_not_minus_zero() -> None:
+    message = mapping(0)
+    message.matrix[:] = [1.0, 0.0, -0.0, 0.0, 1.0, 0.0]
+    message.rate[:] = [-0.0, 0.0]
+    assert not {"-0", "-0.0"} & set(drift_row(message))
+
+
 def test_a_table_is_written_once_over_restarts_and_can_be_read(tmp_path: Path) -> None:
     for _ in range(2):
         table = DriftTable()
