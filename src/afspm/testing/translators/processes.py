@@ -25,13 +25,21 @@ class Processes:
         woken: called, from any thread, when one of them has ended.
     """
 
-    def __init__(self, starts: Sequence[Start], log: RunLog, clock: Clock, woken: Callable[[], None]) -> None:
+    def __init__(self, log: RunLog, clock: Clock, woken: Callable[[], None]) -> None:
         self._log, self._clock, self._woken = log, clock, woken
-        self._readers = {start.launch.name: LineReader() for start in starts}
+        self._readers: dict[str, LineReader] = {}
         self._exits: SimpleQueue[Exited] = SimpleQueue()
         self._writing = threading.Lock()
         self._ended: dict[str, str] = {}
         self._running: dict[str, ChildProcess] = {}
+
+    def start(self, starts: Sequence[Start]) -> None:
+        """Start these.
+
+        Raises:
+            AfspmError: one can't be started.
+        """
+        self._readers |= {start.launch.name: LineReader() for start in starts}
         for start in starts:
             task = from_start(start)
             self._running[task.name] = ChildProcess(

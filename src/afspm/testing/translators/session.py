@@ -6,7 +6,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -123,39 +123,46 @@ def opened(options: Options) -> Iterator[Session]:
     experiment = prepare(options)
     resolved = experiment.resolved
     (translator,) = resolved.with_role(Role.TRANSLATOR)
-    clock = _clock(experiment, options)
-    folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
-    own, starts = _starts(experiment, options, clock, folder)
-    log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
-    run_folder.write_experiment(folder, experiment.expanded())
-    ports = [open_port(own, clock)]
-    address = _translator_address(experiment, starts)
-    if address is not None and not own.keys:  # with keys a translator obeys the scheduler alone
-        ports.append(open_port(replace(own, sockets=Sockets(control=address), envelopes=()), clock))
-
-    def none_goes_on() -> None:
-        for port in ports:
-            port.wake_up(ParentGone())
-
-    processes = Processes(starts, log, clock, none_goes_on)
-    try:
-        links = [_link(port, own, _logger(log)) for port in ports]
-        bench = Bench(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
-        try:
-            bench.begin()
-        except Lost as lost:
-            raise Lost("; ".join(filter(None, (str(lost), processes.errors)))) from lost
+    with ExitStack() as stack:
+        bench, folder = _bench(experiment, options, stack)
+        stack.callback(bench.end)
         abilities = resolved.abilities(translator)
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
         support = find_out(bench, sorted(actions), sorted(parameters))
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
         yield Session(bench, support, named, resolved.simulated, folder, options)
-        bench.end()
-    finally:
+
+
+def _bench(experiment: Experiment, options: Options, stack: ExitStack) -> tuple[Bench, Path]:
+    """Start what is to be started; in control, and the run's folder. `stack` ends it all."""
+    clock = _clock(experiment, options)
+    folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
+    own, starts = _starts(experiment, options, clock, folder)
+    log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
+    stack.callback(log.close)
+    run_folder.write_experiment(folder, experiment.expanded())
+    launches = [own]
+    address = _translator_address(experiment, starts)
+    if address is not None and not own.keys:  # with keys a translator obeys the scheduler alone
+        launches.append(replace(own, sockets=Sockets(control=address), envelopes=()))
+    ports = [open_port(launch, clock) for launch in launches]
+
+    def none_goes_on() -> None:
         for port in ports:
-            port.close()
-        processes.close()
-        log.close()
+            port.wake_up(ParentGone())
+
+    processes = Processes(log, clock, none_goes_on)
+    stack.callback(processes.close)
+    for port in ports:
+        stack.callback(port.close)
+    processes.start(starts)
+    links = [_link(port, own, _logger(log)) for port in ports]
+    bench = Bench(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
+    try:
+        bench.begin()
+    except Lost as lost:
+        raise Lost("; ".join(filter(None, (str(lost), processes.errors)))) from lost
+    return bench, folder
 
 
 _NOTHING = logging.CRITICAL + 1
