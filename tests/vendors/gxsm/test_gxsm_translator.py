@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gxsm_bench import Bench, Peer, scans, states
 
+from afspm.microscopes.in_force import FRAME
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -220,7 +221,7 @@ def test_the_size_in_x_alone_leaves_that_in_y_as_it_is(bench: Make) -> None:
 
 def test_what_is_set_is_told_to_the_last_digit(bench: Make) -> None:
     peer = bench(user_unit="nm").start()
-    peer.until(FREE)
+    ready(peer)
     for name, value in {
         names.TIP_BIAS_VOLTAGE: 0.123456789,
         names.SCAN_SPEED: 1.23456789e-7,
@@ -235,6 +236,8 @@ def test_what_is_set_is_told_to_the_last_digit(bench: Make) -> None:
     }.items():
         response = peer.set(name, value)
         assert response.ok, (name, response.reason)
+        if name in FRAME:
+            peer.until(FREE)
         assert float(peer.get(name)) == pytest.approx(value, rel=1e-13), name
 
 
@@ -397,6 +400,18 @@ def test_a_spectrum_is_stopped_where_the_hardware_can(bench: Make, settings: dic
     heard = peer.until(FREE)
     assert states(heard) == ["INTERRUPTED", "FREE"]
     assert not any(isinstance(one, Spectrum) for one in heard)
+
+
+def test_a_spectrum_is_stopped_while_the_tip_is_on_its_way_to_it(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = made.start()
+    ready(peer)
+    assert peer.set(names.MOVE_SPEED, "50", "nm/s").ok
+    assert peer.act(names.START_SPEC).ok
+    assert peer.act(names.STOP_SPEC).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
+    assert made.emulator.rig.spectrum is None
 
 
 def test_the_approach_is_a_coarse_motor(bench: Make) -> None:

@@ -128,12 +128,12 @@ def lengths(reach: float, told: Callable[[str], Callable[[float], None]]) -> dic
         return Entry(value, low, high, _ANGSTROM, told=told(ref))
 
     return {
-        "RangeX": length("RangeX", 400.0, 0.0, 2 * reach),
-        "RangeY": length("RangeY", 400.0, 0.0, 2 * reach),
+        "RangeX": length("RangeX", 1e4, 0.0, 2 * reach),
+        "RangeY": length("RangeY", 1e4, 0.0, 2 * reach),
         "PointsX": Entry(64.0, 2.0, 8192.0, whole=True),
         "PointsY": Entry(64.0, 2.0, 8192.0, whole=True),
-        "StepsX": length("StepsX", 6.0, 0.0, 2 * reach),
-        "StepsY": length("StepsY", 6.0, 0.0, 2 * reach),
+        "StepsX": length("StepsX", 1e4 / 63, 0.0, 2 * reach),
+        "StepsY": length("StepsY", 1e4 / 63, 0.0, 2 * reach),
         "OffsetX": length("OffsetX", 0.0, -reach, reach),
         "OffsetY": length("OffsetY", 0.0, -reach, reach),
         "ScanX": length("ScanX", 0.0, -reach, reach),

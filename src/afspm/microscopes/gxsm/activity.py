@@ -126,6 +126,9 @@ class Activity:
             return ScopeStatus(ScopeState.SPEC)
         if doing.measuring:
             return self._measuring(doing)
+        moving = doing.moving or now_s < self._arrives_s
+        if self._stopping and moving:  # a spectrum that was to be taken at the end of the way
+            return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
         what = self._harvest.what
         if what and now_s < self._shows_until_s:
@@ -134,7 +137,7 @@ class Activity:
             self._end(what)
         if doing.approaching:
             return ScopeStatus(ScopeState.COARSE_MOTOR)
-        if doing.moving or now_s < self._arrives_s:
+        if moving:
             return ScopeStatus(ScopeState.MOVING)
         return ScopeStatus(ScopeState.INTERRUPTED if self._harvest.broken_off else ScopeState.FREE)
 
