@@ -49,7 +49,8 @@ class Limits:
             is asked for:
         correlation_gap: like `edges_gap`, of the scans as they are;
         outliers: largest variance of the residual over what is typical of it: of features that one scan alone has. In a
-            lattice, defects are all that tells one place from another.
+            lattice, defects are all that tells one place from another. Not asked where nothing is left to differ, the
+            correlation being `alike`.
         surprise: largest chi² of the shift, given the prior.
     """
 
@@ -64,6 +65,7 @@ class Limits:
     distinct: float = 0.3
     correlation_gap: float = 0.02
     outliers: float = 2.5
+    alike: float = 0.985
     surprise: float = 14.0
 
     def reason(self, found: Evidence, *, expected: bool) -> str:
@@ -80,7 +82,7 @@ class Limits:
         repeats = found.edges_gap < self.distinct
         if found.edges_gap < self.edges_gap or (repeats and found.correlation_gap < self.correlation_gap):
             return "other displacements correlate as well"
-        if repeats and found.outliers > self.outliers:
+        if repeats and found.outliers > self.outliers and found.correlation < self.alike:
             return f"the surface repeats itself, and features differ ({found.outliers:.1f} times the typical residual)"
         if found.surprise > self.surprise:
             return f"far from what was expected (chi² {found.surprise:.0f})"

@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
 GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
+FARTHEST_PX = 8.0  # from where the search has found it
 SURROGATES_PX = 16  # the farthest shift that a match is compared with
 
 
@@ -67,6 +68,8 @@ class LeastSquares:
         if start is None or box is None:
             return Registration.refused("the scans overlap too little")
         theta, total = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
+        if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
+            return Registration.refused("no displacement fits: the scans hold nothing in common")
         found = _evidence(scene, box, theta, total, start[1], expected)
         return self._registration(theta, total, box, grid, found, expected=prior is not None)
 
@@ -109,7 +112,8 @@ def _fine(
 ) -> tuple[Array, Array]:
     """theta and its covariance."""
     fine = FineFilter.of(scene.first.values, scene.second.values)
-    pair = Pair(*scene.splines((fine.applied(scene.first.values), fine.applied(scene.second.values))), box)
+    values = fine.applied(scene.first.values), fine.applied(scene.second.values)
+    pair = Pair(*scene.splines(values, order=5), box)
     believed = _believed(expected)
     fit = generalised_least_squares(pair, theta, believed, fine)
     return shear.averaged(fit.theta, covariance(fit, believed), shears[1], shears[0])

@@ -15,6 +15,7 @@ from afspm.drift.estimators.least_squares.spectra import FineFilter
 
 Array = NDArray[np.float64]
 
+BLOCK_ROWS = 8
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
@@ -44,13 +45,12 @@ def without_lines(values: Array, known: NDArray[np.bool_]) -> Array:
     return seen(values[:, None], known.astype(np.float64), None)[:, 0]
 
 
-def products(one: Array, two: Array, block_rows: int = 8) -> Array:
-    """Sums over blocks of `block_rows` rows and half of their length of the products of columns, [y, column, x] each:
-    (block, columns of one, columns of two)."""
-    half = one.shape[2] // 2
-    parts = [one[:, :, s] @ two[:, :, s].transpose(0, 2, 1) for s in (slice(0, half), slice(half, None))]
+def products(one: Array, two: Array, block_rows: int = BLOCK_ROWS) -> Array:
+    """Sums of the products of columns, [y, column, x] each, over blocks of rows: (block, columns of one, columns
+    of two). Where `one` is `seen` of something the lines of `two` cancel, but in whole rows only."""
     starts = np.arange(0, one.shape[0], block_rows)
-    return np.concatenate([np.add.reduceat(part, starts, axis=0) for part in parts])
+    sums: Array = np.add.reduceat(one @ two.transpose(0, 2, 1), starts, axis=0)
+    return sums
 
 
 def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators.least_squares.prepare import Image
-from afspm.drift.estimators.least_squares.warp import Box, Spline
+from afspm.drift.estimators.least_squares.warp import Box, Order, Spline
 
 Array = NDArray[np.float64]
 
@@ -47,9 +47,9 @@ class Scene:
     def band_splines(self) -> tuple[Spline, Spline]:
         return self.splines(self.band)
 
-    def splines(self, values: Both) -> tuple[Spline, Spline]:
+    def splines(self, values: Both, order: Order = 3) -> tuple[Spline, Spline]:
         """Of values that are known where the images are."""
-        return Spline.of(values[0], self.first.known), Spline.of(values[1], self.second.known)
+        return Spline.of(values[0], self.first.known, order), Spline.of(values[1], self.second.known, order)
 
     def box(self, shift_px: Array) -> Box | None:
         """Where they overlap; see `Box.of_overlap`."""

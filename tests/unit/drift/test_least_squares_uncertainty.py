@@ -1,0 +1,126 @@
+"""The default estimator knows its own error, and uses what is known of the drift velocity."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from afspm.drift.estimators.least_squares import LeastSquares
+from afspm.drift.estimators.least_squares.expected import shear_by_drift
+from afspm.drift.estimators.least_squares.shear import averaged, models
+from afspm.drift.registration import DriftScan, Prior
+from afspm.model import Region
+
+NM = 1e-9
+PIXEL_M = 10 * NM
+REGION = Region((0.0, 0.0), (63 * PIXEL_M, 63 * PIXEL_M))
+
+
+def waves(x_m: NDArray[np.float64], y_m: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    random = np.random.default_rng(seed)
+    height = np.zeros_like(x_m)
+    for _ in range(80):
+        kx, ky = 2 * np.pi * random.uniform(-1, 1, 2) / (8 * PIXEL_M)
+        height += np.cos(kx * x_m + ky * y_m + random.uniform(0, 2 * np.pi)) / (1 + 1e-15 * (kx**2 + ky**2))
+    return height / height.std()
+
+
+def scanned(
+    heights: NDArray[np.float64], noise: float, seed: int, region: Region = REGION, upwards: bool | None = True
+) -> DriftScan:
+    random = np.random.default_rng([seed, 5])
+    values = heights + noise * random.standard_normal(heights.shape)
+    values += 0.3 * random.standard_normal((heights.shape[0], 1))
+    return DriftScan(values, region, 100.0 * seed, 100.0 * seed + 60.0, upwards=upwards)
+
+
+def test_the_truth_lies_in_the_ellipse_as_often_as_it_says() -> None:
+    x, y = REGION.pixels_m((64, 64))
+    chi2 = []
+    for seed in range(40):
+        drift_m = np.random.default_rng([seed, 9]).uniform(-60, 60, 2) * NM
+        first, second = waves(x, y, seed), waves(x - drift_m[0], y - drift_m[1], seed)
+        found = LeastSquares().register(scanned(first, 0.15, 2 * seed), scanned(second, 0.15, 2 * seed + 1))
+        assert found.accepted, found.reason
+        off_m = found.displacement_m - drift_m
+        chi2.append(float(off_m @ np.linalg.solve(found.covariance_m2, off_m)))
+    inside = np.mean(np.array(chi2) < 5.99)
+    assert inside >= 0.85
+    assert 0.4 < np.mean(chi2) < 3.0, "2 is expected of two normal numbers"
+
+
+def test_more_noise_is_more_uncertainty() -> None:
+    x, y = REGION.pixels_m((64, 64))
+    first, second = waves(x, y, 3), waves(x - 22 * NM, y + 13 * NM, 3)
+    sds_m = [LeastSquares().register(scanned(first, noise, 1), scanned(second, noise, 2)).sd_m for noise in (0.03, 0.3)]
+    assert 3.0 < sds_m[1] / sds_m[0] < 30.0
+
+
+def edge(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The end of one bump: shift and shear of it are nearly the same."""
+    along, across = x_m + 100 * NM, y_m - 120 * NM
+    inside = 150 * NM - np.hypot(np.maximum(along, 0.0), across)
+    return 1.0 / (1.0 + np.exp(-inside / (10 * NM)))
+
+
+def test_a_known_drift_velocity_makes_the_shift_more_certain() -> None:
+    x, y = REGION.pixels_m((64, 64))
+    shear = 0.02
+    reference = scanned(edge(x, y), 0.05, 1)
+    scan = scanned(edge(x - 12 * NM - shear * y, y - 7 * NM), 0.05, 2)
+    velocity_m_s = np.array([shear * REGION.size_m[1] / 60.0, 0.0])
+    expected = np.array([12 * NM, 7 * NM]), np.eye(2) * (200 * NM) ** 2
+    guessed = LeastSquares().register(reference, scan, Prior(*expected))
+    known = LeastSquares().register(reference, scan, Prior(*expected, velocity_m_s, 0.002 * velocity_m_s[0]))
+    assert known.sd_m < 0.8 * guessed.sd_m
+    assert known.linear[0, 1] == pytest.approx(shear, abs=0.2 * shear)
+
+
+def prior(velocity_m_s: tuple[float, float], sd_m_s: float | None = 1e-12) -> Prior:
+    return Prior(np.zeros(2), np.eye(2), np.array(velocity_m_s), sd_m_s)
+
+
+def scan_taken(upwards: bool | None, angle_rad: float = 0.0, duration_s: float = 60.0) -> DriftScan:
+    region = Region((0.0, 0.0), (1e-6, 2e-6), angle_rad)
+    return DriftScan(np.zeros((8, 8)), region, 0.0, duration_s, upwards=upwards)
+
+
+@pytest.mark.parametrize(("upwards", "sign"), [(True, 1.0), (False, -1.0)])
+def test_drift_shears_along_the_slow_axis_in_the_direction_of_time(upwards: bool, sign: float) -> None:
+    mean, sd = shear_by_drift(prior((1e-10, -2e-10)), scan_taken(upwards), scan_taken(upwards))
+    assert mean == pytest.approx(sign * np.array([1e-10, -2e-10]) * 60.0 / 2e-6)
+    assert sd == pytest.approx(1e-12 * 60.0 / 2e-6)
+
+
+@pytest.mark.parametrize(
+    ("reference", "scan", "known"),
+    [
+        (scan_taken(True), scan_taken(False), prior((1e-10, 0.0))),
+        (scan_taken(None), scan_taken(None), prior((1e-10, 0.0))),
+        (scan_taken(True), scan_taken(True, math.radians(90.0)), prior((1e-10, 0.0))),
+        (scan_taken(True), scan_taken(True, duration_s=120.0), prior((1e-10, 0.0))),
+        (scan_taken(True), scan_taken(True), prior((1e-10, 0.0), None)),
+    ],
+    ids=["up and down", "directions not known", "turned", "faster", "velocities not known"],
+)
+def test_a_difference_of_velocities_says_nothing_of_scans_taken_differently(
+    reference: DriftScan, scan: DriftScan, known: Prior
+) -> None:
+    mean, sd = shear_by_drift(known, reference, scan)
+    assert (mean == 0.0).all()
+    assert sd is None
+
+
+def test_what_shear_is_plausible_decides_where_shift_and_shear_are_alike() -> None:
+    """A shift of 1 px and a shear of 0.1 found, each uncertain by as much, and one for the other."""
+    theta = np.array([1.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
+    covariance = np.diag([1.01, 1e-4, 1e-6, 0.0101, 1e-6, 1e-6, 1e-4, 1e-4])
+    covariance[0, 3] = covariance[3, 0] = 0.1
+    still, total = averaged(theta, covariance, models(1e-6, 1.0), np.zeros(4))
+    assert abs(still[0]) < 0.1
+    assert total[0, 0] < 0.1
+    drifting, _ = averaged(theta, covariance, models(1.0, 1.0), np.zeros(4))
+    assert drifting[0] == pytest.approx(1.0, abs=0.05)
