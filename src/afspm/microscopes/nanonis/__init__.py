@@ -153,6 +153,8 @@ class Nanonis(Microscope):
 
     def get(self, vendor: str) -> Value:
         """By the name of a pair of functions: "Bias." is Bias.Get."""
+        if vendor == names.CONTROLLER and self._session is not None:
+            return self._session.controller
         value: Value = groups.numbers(self._ask, f"{vendor}Get")[0]
         return value
 

@@ -27,6 +27,7 @@ class Session:
         wake: called, from another thread, when `listener` has heard something.
 
     Attributes:
+        controller: its name and version, for a person.
         opened: the modules that can be used: Nanonis has those that were bought, and they answer once they are open.
 
     Raises:
@@ -47,6 +48,7 @@ class Session:
         self._link = Link(addresses[0], timeout_s, monotonic_s)
         self._listener: Listener | None = None
         try:
+            self.controller = f"Nanonis, release {release}"
             self._link.release = release or self._found_release()
             self.opened = {module for module in (*MODULES.values(), APPROACH) if self._open(module)}
             second = Link(addresses[-1], timeout_s, monotonic_s, self._link.release)
@@ -69,9 +71,11 @@ class Session:
         try:
             product, version, host_release, engine_release = self.ask("Util.VersionGet")
         except NanonisError:
+            self.controller = f"Nanonis, taken as release {_WITHOUT_VERSION}"
             self._log.warning("Nanonis can't tell its release: taken as %d (set release)", _WITHOUT_VERSION)
             return _WITHOUT_VERSION
-        self._log.info("%s %s, release %d (real-time engine %d)", product, version, host_release, engine_release)
+        self.controller = f"{product} {version}, release {host_release}"
+        self._log.info("%s (real-time engine %d)", self.controller, engine_release)
         return int(host_release)
 
     def _open(self, module: str) -> bool:
