@@ -132,3 +132,19 @@ def test_a_missing_library_is_told_with_the_extra_that_brings_it(monkeypatch: py
 
 def test_every_name_brings_its_library_by_an_extra() -> None:
     assert {entry.extra for entry in READY_MADE.values()} == {"drift", "features"}
+
+
+def test_the_limits_of_the_default_may_be_given_as_in_the_experiment_file() -> None:
+    values = np.random.default_rng(3).normal(size=(64, 64)).cumsum(0).cumsum(1)
+    scan = DriftScan(values, Region((0, 0), (1e-6, 1e-6)), 0.0, 1.0)
+    assert estimator("least-squares").register(scan, scan).accepted
+    strict = estimator({"class": "least-squares", "limits": {"information": 1e9}})
+    refused = strict.register(scan, scan)
+    assert not refused.accepted
+    assert "in common" in refused.reason
+
+
+@pytest.mark.parametrize(("limits", "wrong"), [({"overlapp": 0.5}, "overlapp"), ({"overlap": "half"}, "half")])
+def test_limits_without_a_meaning_are_refused(limits: dict[str, Any], wrong: str) -> None:
+    with pytest.raises(ConfigError, match=wrong):
+        estimator({"class": "least-squares", "limits": limits})

@@ -168,3 +168,11 @@ def test_scans_of_different_places_are_refused(seed: int) -> None:
     found = registered(scanned(REGION, seed=seed))
     assert not found.accepted
     assert found.reason
+
+
+def test_a_scan_lies_on_itself_exactly() -> None:
+    values = np.random.default_rng(3).normal(size=(64, 64)).cumsum(0).cumsum(1)
+    scan = DriftScan(values, Region((0, 0), (1e-6, 1e-6)), 0.0, 1.0)
+    found = LeastSquares().register(scan, scan)
+    assert found.accepted, found.reason
+    assert found.displacement_m == pytest.approx([0.0, 0.0], abs=1e-15)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators.least_squares.search import Correlation
+from afspm.errors import ConfigError
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -67,6 +70,21 @@ class Limits:
     outliers: float = 2.5
     alike: float = 0.985
     surprise: float = 14.0
+
+    @classmethod
+    def of(cls, table: Mapping[str, float]) -> Limits:
+        """The usual limits but for what a table says.
+
+        Raises:
+            ConfigError: it names none of them, or gives no number.
+        """
+        known = [field.name for field in fields(cls)]
+        for name, value in table.items():
+            if name not in known:
+                raise ConfigError(f"there is no limit {name!r}", where="limits", hint=f"known: {', '.join(known)}")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise ConfigError(f"{name} = {value!r} is no number", where="limits")
+        return cls(**table)
 
     def reason(self, found: Evidence, *, expected: bool) -> str:
         """Why a match is refused, in words; empty if it isn't."""

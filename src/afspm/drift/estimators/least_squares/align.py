@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators.least_squares.prepare import flatten_rows
-from afspm.drift.estimators.least_squares.rows import noise_metric, products, seen, without_lines
+from afspm.drift.estimators.least_squares.rows import LEAST_NOISE, noise_metric, products, seen, without_lines
 from afspm.drift.estimators.least_squares.shrink import denoised
 from afspm.drift.estimators.least_squares.spectra import FineFilter
 from afspm.drift.estimators.least_squares.warp import COUNT, Pair, derivative
@@ -56,7 +56,7 @@ def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, ste
         columns = pair.columns(derivative(mean, 1), derivative(mean, 0), mean, two - one, free)
         columns_q = seen(columns, known.astype(np.float64), None)
         normal = np.tensordot(columns_q, columns, ((0, 2), (0, 2)))
-        normal *= max(known.sum(), 1) / max(normal[-1, -1], 1e-300)
+        normal *= max(known.sum(), 1) / max(normal[-1, -1], LEAST_NOISE * known.sum(), LEAST_NOISE)
         theta, moved = _stepped(theta, normal[:-1, :-1], normal[:-1, -1], believed, free)
         if moved < 0.01:
             break
@@ -86,7 +86,8 @@ def _round(pair: Pair, theta: Array, believed: Believed, seen_through: FineFilte
     signal = pair.columns(*_signal(gradient, left / 2, known), mean, residual)
     weight = known * _row_weights(left, known)[:, None]
     signal_q = seen(signal, weight, noise_metric(left, known, seen_through))
-    signal_q *= max(weight.sum(), 1.0) / max(float(np.vdot(signal_q[:, -1], residual)), 1e-300)
+    left_over = float(np.vdot(signal_q[:, -1], residual))
+    signal_q *= max(weight.sum(), 1.0) / max(left_over, LEAST_NOISE * weight.sum(), LEAST_NOISE)
     signal_q, signal = signal_q[:, :-1], signal[:, :-1]
     curvature = products(signal_q, pair.columns(*gradient, mean, residual)[:, :-1])
     slope = products(signal_q, residual[:, None])[:, :, 0]

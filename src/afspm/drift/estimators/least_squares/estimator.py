@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 
 import numpy as np
@@ -47,11 +48,14 @@ class LeastSquares:
     5. `acceptance`: is it a match at all?
 
     Args:
-        limits: what a match must reach.
+        limits: what a match must reach; as a table, some of the values of `Limits`.
+
+    Raises:
+        ConfigError: a limit that there is not, or that is no number.
     """
 
-    def __init__(self, limits: Limits | None = None):
-        self._limits = limits or Limits()
+    def __init__(self, limits: Limits | Mapping[str, float] | None = None):
+        self._limits = limits if isinstance(limits, Limits) else Limits.of(limits or {})
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         """See `afspm.drift.registration.Estimator`."""

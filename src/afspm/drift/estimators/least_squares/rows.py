@@ -16,6 +16,8 @@ from afspm.drift.estimators.least_squares.spectra import FineFilter
 Array = NDArray[np.float64]
 
 BLOCK_ROWS = 8
+LEAST_NOISE = 1e-8
+"""Variance, where that of the scan is 1: digits end somewhere, and two scans that agree beyond are not known better."""
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
@@ -70,6 +72,8 @@ def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFi
     f = np.arange(spectrum.shape[1]) / width
     used = (f < HIGHEST_FREQUENCY) & (f > 1.5 / width)
     power = np.median(spectrum[:, used], axis=0) / np.log(2.0) / seen_through.along_rows(f[used])
+    if not power.max() > LEAST_NOISE:
+        return None
     model = np.stack([np.ones(used.sum()), 1.0 / f[used]], axis=1)
     expected = power
     for _ in range(3):  # the scatter of a spectrum is in proportion to what is expected of it
