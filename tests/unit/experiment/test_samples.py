@@ -12,7 +12,11 @@ from afspm.experiment.graph import draw
 from afspm.transport.keys import generate
 
 EXPERIMENTS = Path(__file__).parents[3] / "experiments"
-SAMPLES = sorted(folder.name for folder in EXPERIMENTS.iterdir() if (folder / "experiment.toml").exists())
+WITHOUT_A_MICROSCOPE = "every_microscope"  # its second file has it
+SECOND_FILES = sorted(p.name for p in (EXPERIMENTS / WITHOUT_A_MICROSCOPE).glob("*.toml") if p.stem != "experiment")
+NAMES = sorted(folder.name for folder in EXPERIMENTS.iterdir() if (folder / "experiment.toml").exists())
+SAMPLES = [(name,) for name in NAMES if name != WITHOUT_A_MICROSCOPE]
+SAMPLES += [(WITHOUT_A_MICROSCOPE, second) for second in SECOND_FILES]
 
 
 def sample(name: str, *overlays: str) -> Experiment:
@@ -20,17 +24,17 @@ def sample(name: str, *overlays: str) -> Experiment:
     return load(folder / "experiment.toml", *(folder / overlay for overlay in overlays))
 
 
-@pytest.mark.parametrize("name", SAMPLES)
-def test_a_sample_has_nothing_wrong(name: str) -> None:
-    experiment = sample(name)
+@pytest.mark.parametrize("files", SAMPLES, ids=" ".join)
+def test_a_sample_has_nothing_wrong(files: tuple[str, ...]) -> None:
+    experiment = sample(*files)
     assert experiment.check() == []
-    assert experiment.name == name
-    assert (EXPERIMENTS / name / "README.md").exists()
+    assert experiment.name == files[0]
+    assert (EXPERIMENTS / files[0] / "README.md").exists()
 
 
-@pytest.mark.parametrize("name", SAMPLES)
-def test_a_sample_can_be_drawn_and_started(name: str) -> None:
-    experiment = sample(name)
+@pytest.mark.parametrize("files", SAMPLES, ids=" ".join)
+def test_a_sample_can_be_drawn_and_started(files: tuple[str, ...]) -> None:
+    experiment = sample(*files)
     assert all(part in draw(experiment) for part in experiment.component_names)
     ports = itertools.count(20000)
     starts = experiment.launches(take_address=lambda: f"tcp://127.0.0.1:{next(ports)}")

@@ -7,7 +7,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from asylum_bench import Bench, Emulated, Peer, states
+from asylum_bench import Bench, Emulated
+from vendor_bench import Peer, scans, small, states
 
 from afspm.emulators.faults import Fault
 from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
@@ -16,21 +17,6 @@ Make = Callable[..., Bench]
 FREE = ScopeState.FREE
 UNDEFINED = ScopeState.UNDEFINED
 SOON = {"reply_timeout_s": 0.4}
-
-
-def small(made: Bench, **settings: object) -> Peer:
-    """A translator that has found the microscope, with a frame of few pixels in force."""
-    peer = made.start(**settings)
-    peer.until(FREE)
-    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
-    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
-    peer.until(lambda one: getattr(one, "shape", None) == (8, 16))
-    peer.until(FREE)
-    return peer
-
-
-def scans(heard: list[object]) -> list[Scan]:
-    return [one for one in heard if isinstance(one, Scan)]
 
 
 def scans_again(peer: Peer) -> list[Scan]:

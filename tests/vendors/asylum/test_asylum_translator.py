@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from asylum_bench import Bench, Emulated, Peer, states
+from asylum_bench import Bench, Emulated
+from vendor_bench import FLAT, SHAPE, TURNED, Peer, moved, ready, scanned, states
 
 from afspm.files import read
 from afspm.model import (
@@ -27,36 +28,10 @@ from afspm.model import (
 Make = Callable[..., Bench]
 
 FREE = ScopeState.FREE
-TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
-SHAPE = (12, 32)
-FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
 
 
-def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
-    """A small frame is in force, and all that comes of it was heard."""
-    peer.until(FREE)
-    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, ""))
-    assert response.ok, response.reason
-    peer.until(lambda one: isinstance(one, ScanParameters) and one.region == region and one.shape == shape)
-    peer.until(FREE)
-
-
-def scanned(peer: Peer) -> dict[str, Scan]:
-    response = peer.act(names.START_SCAN)
-    assert response.ok, response.reason
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    scans = [one for one in heard if isinstance(one, Scan)]
-    assert heard[-1 - len(scans) : -1] == scans, "the scans come before FREE, and nothing in between"
-    return {scan.channel: scan for scan in scans}
-
-
-def moved(peer: Peer, x_m: float, y_m: float) -> None:
-    response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m)))
-    assert response.ok, response.reason
-    heard = peer.until(FREE)
-    assert states(heard) == ["MOVING", "FREE"]
-    assert ProbePosition((x_m, y_m)) in heard
+def moved_exactly(peer: Peer, x_m: float, y_m: float) -> None:
+    assert ProbePosition((x_m, y_m)) in moved(peer, x_m, y_m)
 
 
 # --- scans ---
@@ -188,7 +163,7 @@ def test_a_scan_that_outlives_the_translator_is_published_by_the_next(bench: Mak
     ready(peer)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
-    made.process.kill()
+    made.kill()
     peer = made.start()
     scans = [one for one in peer.until(FREE) if isinstance(one, Scan)]
     assert {(scan.region, Path(scan.filename).name) for scan in scans} == {(TURNED, "Image0000.ibw")}
@@ -350,7 +325,7 @@ def test_the_probe_goes_where_it_is_sent_also_on_a_turned_image(bench: Make) -> 
     peer = made.start()
     ready(peer)
     scanned(peer)
-    moved(peer, 70e-9, 10e-9)
+    moved_exactly(peer, 70e-9, 10e-9)
     assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
 
 
@@ -358,7 +333,7 @@ def test_the_probe_stays_where_it_is_when_the_image_changes(bench: Make) -> None
     made = bench()
     peer = made.start()
     ready(peer)
-    moved(peer, 70e-9, 10e-9)
+    moved_exactly(peer, 70e-9, 10e-9)
     scanned(peer)
     assert float(peer.get(names.PROBE_POS_X)) == pytest.approx(70e-9)
     assert float(peer.get(names.PROBE_POS_Y)) == pytest.approx(10e-9)
@@ -368,7 +343,7 @@ def test_a_force_curve_comes_with_the_place_where_it_was_taken(bench: Make) -> N
     made = bench()
     peer = made.start()
     ready(peer)
-    moved(peer, 70e-9, 10e-9)
+    moved_exactly(peer, 70e-9, 10e-9)
     response = peer.act(names.START_SPEC)
     assert response.ok, response.reason
     heard = peer.until(FREE)

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gxsm_bench import Bench, Peer, Process, scans, states
+from gxsm_bench import Bench
+from vendor_bench import Peer, TranslatorProcess, scans, states
 
 from afspm.clock import ExperimentClock
 from afspm.model import ControlRequest, ControlResponse, Region, ScanParameters, ScopeState, names
@@ -41,7 +42,8 @@ def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
             address = os.environ.get(REAL)
             if not address:
                 pytest.skip(f"{REAL} is not set: no real GXSM to ask")
-            found = Process(tmp_path, stack, ExperimentClock.real(), {"address": address}).peer
+            clock = ExperimentClock.real()
+            found = TranslatorProcess(Bench.translator, {"address": address}, tmp_path, stack, clock).peer
         heard = found.until(FREE)
         before = next(one for one in heard if isinstance(one, ScanParameters))
         rate = found.get_response("x-pixel-rate")

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gxsm_bench import Bench, Peer, scans, states
+from gxsm_bench import Bench
+from vendor_bench import Peer, scans, states
 
 from afspm.emulators.gxsm.program import Program
 from afspm.model import ControlResponse, ScopeState, Spectrum, names
@@ -286,7 +287,7 @@ def test_a_spectrum_that_takes_its_time_is_waited_for(bench: Make, kind: str) ->
 def test_a_spectrum_whose_name_was_there_already_is_the_new_one(bench: Make) -> None:
     """GXSM overwrites it."""
     made = bench(speed=20.0)
-    (made.files / "scan001-VP001-VP.vpdata").write_text("of last year")
+    (made.data / "scan001-VP001-VP.vpdata").write_text("of last year")
     peer = small(made)
     assert peer.act(names.START_SPEC).ok
     (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))

@@ -112,7 +112,7 @@ def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
     """And in the first moments of a scan those of the scan before."""
     made = bench(speed=10.0)
     for name in ("scan001-M-Xp-ZSmTopo.nc", "scan002-M-Xp-ZSmTopo.nc"):
-        (made.files / name).write_bytes(b"of last year")
+        (made.data / name).write_bytes(b"of last year")
     with calling(made) as gxsm:
         small(gxsm)
 
@@ -125,7 +125,7 @@ def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
         until(made, lambda: not bits(gxsm) & 2)
         until(made, lambda: name(0) == "scan003-M-Xp-ZSmTopo.nc")
         assert name(2) == "scan001-Xp-ImTunnel.nc", "each channel counts by itself"
-        until(made, lambda: len(list(made.files.glob("*.nc"))) == 6)
+        until(made, lambda: len(list(made.data.glob("*.nc"))) == 6)
         gxsm.call("startscan")
         saved = name(0)
         started = made.emulator.program.last
@@ -143,7 +143,7 @@ def test_a_scan_that_is_stopped_is_saved_with_zeros(bench: Make) -> None:
         until(made, lambda: gxsm.call("y_current") >= 3)
         gxsm.call("stopscan")
         assert not bits(gxsm) & 2, "free at once"
-        path = made.files / "scan001-M-Xp-ZSmTopo.nc"
+        path = made.data / "scan001-M-Xp-ZSmTopo.nc"
         until(made, lambda: path.exists() and _readable(path))
         (scan,) = read(path).scans
         there = np.isfinite(scan.values).all(axis=1)
@@ -241,7 +241,7 @@ def test_a_spectrum_and_its_event(bench: Make) -> None:
         gxsm.call("action", "DSP_VP_IV_EXECUTE")
         until(made, lambda: bool(bits(gxsm) & 8))
         until(made, lambda: not bits(gxsm) & 8)
-        path = made.files / "scan001-VP001-VP.vpdata"
+        path = made.data / "scan001-VP001-VP.vpdata"
         until(made, lambda: path.exists() and b"END OF HEADER" in path.read_bytes())
         content = read(path)
         assert content.header["GXSM-Main-Offset"].startswith("X0=70 Ang"), "the offset, and not where it was taken"

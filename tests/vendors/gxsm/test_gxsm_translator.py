@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gxsm_bench import Bench, Peer, scans, states
+from gxsm_bench import Bench
+from vendor_bench import FLAT, SHAPE, TURNED, moved, ready, scanned, scans, states
 
 from afspm.microscopes.in_force import FRAME
 from afspm.model import (
@@ -17,7 +18,6 @@ from afspm.model import (
     Feedback,
     ProbePosition,
     Region,
-    Scan,
     ScanLines,
     ScanParameters,
     ScopeState,
@@ -28,9 +28,6 @@ from afspm.model import (
 Make = Callable[..., Bench]
 
 FREE = ScopeState.FREE
-TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
-SHAPE = (12, 32)
-FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
 KINDS: list[dict[str, Any]] = [
     {"version": 3},
     {"version": 4},
@@ -38,30 +35,6 @@ KINDS: list[dict[str, Any]] = [
     {"version": 4, "card": "RPSPMC", "user_unit": "nm"},
 ]
 KIND_IDS = ["gxsm3", "gxsm4", "gxsm4-shm", "rpspmc-nm"]
-
-
-def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
-    """A small frame is in force, and all that comes of it was heard."""
-    peer.until(FREE)
-    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, ""))
-    assert response.ok, response.reason
-    peer.until(lambda one: isinstance(one, ScanParameters) and one.region == region and one.shape == shape)
-    peer.until(FREE)
-
-
-def scanned(peer: Peer) -> dict[str, Scan]:
-    assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    found = scans(heard)
-    assert heard[-1 - len(found) : -1] == found, "the scans come before FREE, and nothing in between"
-    return {scan.channel: scan for scan in found}
-
-
-def moved(peer: Peer, x_m: float, y_m: float) -> None:
-    response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m)))
-    assert response.ok, response.reason
-    assert states(peer.until(FREE)) == ["MOVING", "FREE"]
 
 
 # --- scans ---
@@ -80,7 +53,7 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make, kind: dic
     for scan in found.values():
         assert scan.region == TURNED
         assert scan.shape == SHAPE
-        assert scan.filename.startswith(str(made.files / "scan001-"))
+        assert scan.filename.startswith(str(made.data / "scan001-"))
         assert scan.time_ns is not None
         assert abs(scan.time_ns / 1e9 - made.clock.now_s()) < 600.0
 
@@ -130,15 +103,15 @@ def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
     found = [scanned(peer)["ZS-Topo"] for _ in range(3)]
     assert [scan.filename[-19:] for scan in found] == [f"00{n}-M-Xp-ZSmTopo.nc" for n in (1, 2, 3)]
     assert not np.array_equal(found[0].values, found[1].values)
-    assert len(list(made.files.glob("*.nc"))) == 12, "none was saved twice"
+    assert len(list(made.data.glob("*.nc"))) == 12, "none was saved twice"
 
 
 def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
     """GXSM begins at 001 with each start: it names what is there already, and then counts each channel by itself."""
     made = bench()
-    (made.files / "scan001-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
-    (made.files / "scan002-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
-    (made.files / "scan001-Xp-dFreq.nc").write_bytes(b"of last year")
+    (made.data / "scan001-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
+    (made.data / "scan002-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
+    (made.data / "scan001-Xp-dFreq.nc").write_bytes(b"of last year")
     peer = made.start()
     ready(peer)
     found = scanned(peer)
@@ -165,7 +138,7 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
     found = [scanned(peer)["ZS-Topo"] for _ in range(2)]
     assert [scan.filename[-19:-16] for scan in found] == ["001", "002"]
     assert made.emulator.program.auto_save
-    assert len(list(made.files.glob("*.nc"))) == 8
+    assert len(list(made.data.glob("*.nc"))) == 8
 
 
 @pytest.mark.parametrize("version", [3, 4])
@@ -463,4 +436,4 @@ def test_a_scan_that_ends_while_the_translator_is_down_is_published_by_the_next(
     peer = made.start()
     heard = peer.until(FREE)
     assert {scan.region for scan in scans(heard)} == {TURNED}
-    assert len(list(made.files.glob("*.nc"))) == 4
+    assert len(list(made.data.glob("*.nc"))) == 4

@@ -6,34 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from nanonis_bench import Bench, Peer, states
+from nanonis_bench import Bench
+from vendor_bench import scans, small, states
 
-from afspm.emulators.faults import Fault
-from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
+from afspm.model import ControlResponse, ScopeState, Spectrum, names
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
 UNDEFINED = ScopeState.UNDEFINED
-
-
-def small(made: Bench, **settings: object) -> Peer:
-    """A translator that has found the controller, with a frame of few pixels in force."""
-    peer = made.start(**settings)
-    peer.until(FREE)
-    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
-    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
-    peer.until(lambda one: getattr(one, "shape", None) == (8, 16))
-    peer.until(FREE)
-    return peer
-
-
-def strike(made: Bench, kind: str, count: int = 1, duration_s: float = 1.0) -> None:
-    fault = Fault(kind, 0.0, count, duration_s)
-    made.at_panel(lambda emulator: emulator.faults.demand(fault, made.clock.now_s()))
-
-
-def scans(heard: list[object]) -> list[Scan]:
-    return [one for one in heard if isinstance(one, Scan)]
 
 
 @pytest.mark.parametrize(
@@ -52,7 +32,7 @@ def scans(heard: list[object]) -> list[Scan]:
 def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, kind: str, told: str) -> None:
     made = bench()
     peer = small(made, reply_timeout_s=0.3)
-    strike(made, kind)
+    made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
     assert told in made.said()
@@ -63,7 +43,7 @@ def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, k
 def test_a_dialog_on_its_screen_silences_it_until_it_is_answered(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = small(made, reply_timeout_s=0.3)
-    strike(made, "dialog", duration_s=1.5)
+    made.strike("dialog", duration_s=1.5)
     peer.until(UNDEFINED)
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
@@ -75,7 +55,7 @@ def test_a_dialog_on_its_screen_silences_it_until_it_is_answered(bench: Make) ->
 def test_a_slow_reply_is_waited_for(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = small(made)
-    strike(made, "slow", duration_s=0.5)
+    made.strike("slow", duration_s=0.5)
     assert peer.get(names.TIP_BIAS_VOLTAGE) is not None
     assert "can't be reached" not in made.said()
 
@@ -83,11 +63,11 @@ def test_a_slow_reply_is_waited_for(bench: Make) -> None:
 def test_what_it_refuses_is_refused_with_its_own_words(bench: Make) -> None:
     made = bench()
     peer = small(made)
-    strike(made, "refused")
+    made.strike("refused")
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.ACTION_ERROR
     assert "it is not possible now" in response.reason
-    strike(made, "refused")
+    made.strike("refused")
     response = peer.set(names.TIP_BIAS_VOLTAGE, 0.3)
     assert response.code == ControlResponse.PARAM_ERROR
     assert "it is not possible now" in response.reason
@@ -107,7 +87,7 @@ def test_a_spectrum_that_is_refused_is_an_error_at_once(bench: Make) -> None:
 def test_fields_of_another_release_than_it_says_are_named(bench: Make) -> None:
     made = bench()
     peer = small(made)
-    strike(made, "wrong-release", duration_s=1e9)
+    made.strike("wrong-release", duration_s=1e9)
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the reply to Scan.PropsGet is not what it should be" in response.reason
@@ -125,7 +105,7 @@ def test_a_release_can_be_set_where_it_is_told_wrong(bench: Make) -> None:
 def test_texts_that_are_not_utf8_are_read(bench: Make) -> None:
     made = bench()
     peer = small(made)
-    strike(made, "not-utf8", count=3)
+    made.strike("not-utf8", count=3)
     assert peer.act(names.START_SCAN).ok
     assert scans(peer.until(FREE))
 
@@ -137,7 +117,7 @@ def test_texts_that_are_not_utf8_are_read(bench: Make) -> None:
 def test_a_file_that_takes_its_time_is_waited_for(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made)
-    strike(made, kind, duration_s=3.0)
+    made.strike(kind, duration_s=3.0)
     assert peer.act(names.START_SCAN).ok
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith("unnamed001.sxm")
@@ -147,7 +127,7 @@ def test_a_file_that_takes_its_time_is_waited_for(bench: Make, kind: str) -> Non
 def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made)
-    strike(made, kind, duration_s=1e6)
+    made.strike(kind, duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith("nanonis-0001.npz")
@@ -159,7 +139,7 @@ def test_the_name_of_an_older_file_is_not_believed(bench: Make) -> None:
     peer = small(made)
     assert peer.act(names.START_SCAN).ok
     older = scans(peer.until(FREE))[0]
-    strike(made, "stale-name")
+    made.strike("stale-name")
     assert peer.set(names.SCAN_TOP_LEFT_X, "5", "um").ok
     peer.until(FREE)
     assert peer.act(names.START_SCAN).ok
@@ -172,7 +152,7 @@ def test_the_name_of_an_older_file_is_not_believed(bench: Make) -> None:
 def test_a_spectrum_that_is_not_saved_is_fetched(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
-    strike(made, "autosave-off", duration_s=1e6)
+    made.strike("autosave-off", duration_s=1e6)
     assert peer.act(names.START_SPEC).ok
     (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))
     assert spectrum.filename.endswith(".npz")
@@ -181,7 +161,7 @@ def test_a_spectrum_that_is_not_saved_is_fetched(bench: Make) -> None:
 def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
-    strike(made, "autosave-off", duration_s=1e6)
+    made.strike("autosave-off", duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
     ends_s = made.clock.now_s()
     found = scans(peer.until(FREE))
@@ -197,7 +177,7 @@ def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make) -> None:
     peer = small(made)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
-    strike(made, "panel-stop")
+    made.strike("panel-stop")
     heard = peer.until(FREE)
     assert states(heard) == ["INTERRUPTED", "FREE"]
     assert not scans(heard)
@@ -206,7 +186,7 @@ def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make) -> None:
 def test_after_the_safe_tip_nothing_is_measured_until_the_tip_is_brought_back(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
-    strike(made, "safe-tip")
+    made.strike("safe-tip")
     for action in (names.START_SCAN, names.START_SPEC, names.CRASH):
         response = peer.act(action)
         assert response.code in (ControlResponse.ACTION_ERROR, ControlResponse.NOT_FREE), action
@@ -225,7 +205,7 @@ def test_a_scan_that_ended_while_the_connection_was_lost_is_not_lost(bench: Make
     peer = small(made)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
-    strike(made, "cut", count=2)
+    made.strike("cut", count=2)
     peer.until(UNDEFINED)
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith("unnamed001.sxm")
@@ -236,8 +216,7 @@ def test_a_translator_that_was_killed_publishes_what_ended_meanwhile(bench: Make
     peer = small(made)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
-    made.process.kill()
-    made.process.wait(10)
+    made.kill()
     assert made.emulator.scan_ended.wait(30)
     again = made.start()
     found = scans(again.until(FREE))
@@ -247,7 +226,7 @@ def test_a_translator_that_was_killed_publishes_what_ended_meanwhile(bench: Make
 def test_software_that_vanishes_and_is_started_again_is_found_with_what_is_in_force_then(bench: Make) -> None:
     made = bench()
     peer = small(made)
-    strike(made, "crash")
+    made.strike("crash")
     peer.until(UNDEFINED)
     made.start_controller_again()
     peer.until(lambda one: getattr(one, "shape", None) == (128, 128))

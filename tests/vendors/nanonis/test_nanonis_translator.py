@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from nanonis_bench import Bench, Peer, states
+from nanonis_bench import Bench
+from vendor_bench import FLAT, SHAPE, TURNED, moved, ready, scanned, states
 
 from afspm.files import read
 from afspm.model import (
@@ -27,32 +28,6 @@ from afspm.model import (
 Make = Callable[..., Bench]
 
 FREE = ScopeState.FREE
-TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
-SHAPE = (12, 32)
-FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
-
-
-def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
-    """A small frame is in force, and all that comes of it was heard."""
-    peer.until(FREE)
-    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, ""))
-    assert response.ok, response.reason
-    peer.until(lambda one: isinstance(one, ScanParameters) and one.region == region and one.shape == shape)
-    peer.until(FREE)
-
-
-def scanned(peer: Peer) -> dict[str, Scan]:
-    assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    scans = [one for one in heard if isinstance(one, Scan)]
-    assert heard[-1 - len(scans) : -1] == scans, "the scans come before FREE, and nothing in between"
-    return {scan.channel: scan for scan in scans}
-
-
-def moved(peer: Peer, x_m: float, y_m: float) -> None:
-    assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m))).ok
-    assert states(peer.until(FREE)) == ["MOVING", "FREE"]
 
 
 # --- scans ---
@@ -67,7 +42,7 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
     for scan in scans.values():
         assert scan.region == TURNED
         assert scan.shape == SHAPE
-        assert scan.filename == str(made.session / "unnamed001.sxm")
+        assert scan.filename == str(made.data / "unnamed001.sxm")
         assert scan.time_ns is not None
         assert abs(scan.time_ns / 1e9 - made.clock.now_s()) < 600.0
 
@@ -361,9 +336,9 @@ def test_every_release(bench: Make, release: str) -> None:
 
 def test_a_session_folder_that_has_another_name_over_there(bench: Make) -> None:
     made = bench(session_path="D:\\Data\\2026")
-    peer = made.start(session_dir=str(made.session))
+    peer = made.start(session_dir=str(made.data))
     ready(peer)
-    assert scanned(peer)["Z Forward"].filename == str(made.session / "unnamed001.sxm")
+    assert scanned(peer)["Z Forward"].filename == str(made.data / "unnamed001.sxm")
 
 
 def test_ports_that_serve_one_client_each(bench: Make) -> None:
