@@ -1,0 +1,9 @@
+"""For the tests of all vendors."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+# vendor_bench is shared by the folders of the vendors
+sys.path.insert(0, str(Path(__file__).parent))

@@ -1,0 +1,291 @@
+"""What the tests of all vendors share: a translator as a real process, an emulated microscope, and a raw peer."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Event
+from typing import Any, ClassVar, Generic, TypeVar
+
+import zmq
+
+from afspm import wire
+from afspm.clock import ExperimentClock
+from afspm.emulators.emulator import Emulator
+from afspm.emulators.faults import Fault
+from afspm.model import (
+    ControlRequest,
+    Parameter,
+    ProbePosition,
+    Region,
+    Request,
+    Response,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
+    names,
+)
+from afspm.runtime.launch import Launch, Sockets
+from afspm.supervisor.ports import FreePorts
+
+DEADLINE_S = 30.0
+TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
+"""A frame that is no square, not in the middle and not straight: what is mistaken for something else shows."""
+
+SHAPE = (12, 32)
+FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
+"""A microscope without noise."""
+
+
+class Peer:
+    """What a scheduler is to the translator."""
+
+    def __init__(self, serve: str, publish: str) -> None:
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._request = self._context.socket(zmq.REQ)
+        self._request.connect(serve)
+        self._packets = self._context.socket(zmq.SUB)
+        self._packets.subscribe(b"")
+        self._packets.connect(publish)
+        for socket in (self._request, self._packets):
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
+
+    def ask(self, kind: int, subject: Any) -> Response:
+        request = Request(kind, subject, wire.frames.encode_subject(subject))
+        self._request.send_multipart(wire.encode_request(request))
+        return wire.decode_response(self._request.recv_multipart())
+
+    def act(self, action: str) -> Response:
+        return self.ask(ControlRequest.ACTION, action)
+
+    def set(self, name: str, value: object, unit: str | None = None) -> Response:
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        return self.ask(ControlRequest.PARAM, Parameter(name, text, unit))
+
+    def get_response(self, name: str) -> Response:
+        return self.ask(ControlRequest.PARAM, Parameter(name))
+
+    def get(self, name: str) -> str:
+        response = self.get_response(name)
+        assert response.ok, response.reason
+        value = wire.frames.decode_parameter(response.payload).value
+        assert value is not None
+        return value
+
+    def next(self) -> Any:
+        """The next thing that is published."""
+        envelope, payload, *_ = self._packets.recv_multipart()
+        return wire.decode(envelope.decode(), payload)
+
+    def until(self, wanted: Callable[[Any], bool] | ScopeState) -> list[Any]:
+        """All that is published up to the first that is wanted."""
+        heard: list[Any] = []
+        deadline_s = time.monotonic() + DEADLINE_S
+        while time.monotonic() < deadline_s:
+            try:
+                heard.append(self.next())
+            except zmq.Again:
+                break
+            newest = heard[-1]
+            if newest == ScopeStatus(wanted) if isinstance(wanted, ScopeState) else wanted(newest):
+                return heard
+        raise AssertionError(f"waited for {wanted}, heard {heard}")
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
+
+
+class TranslatorProcess:
+    """A translator as a process of its own, and the peer that it has; both end with the stack."""
+
+    def __init__(
+        self, class_: str, settings: dict[str, Any], folder: Path, stack: ExitStack, clock: ExperimentClock
+    ) -> None:
+        ports = FreePorts()
+        serve, publish = f"tcp://127.0.0.1:{ports.take()}", f"tcp://127.0.0.1:{ports.take()}"
+        launch = Launch(
+            "translator",
+            class_,
+            settings,
+            Sockets(publish=publish, serve=serve),
+            clock=clock.as_dict(),
+            run_dir=str(folder),
+            state_dir=str(folder / "state"),
+            simulated=clock.real_s(1.0) != 1.0,
+        )
+        with (folder / "log.txt").open("ab") as log:
+            command = [sys.executable, "-m", "afspm.runtime.host"]
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log)
+        stack.callback(self._end)
+        assert self._process.stdin is not None
+        self._process.stdin.write(launch.to_json().encode() + b"\n")
+        self._process.stdin.flush()
+        self.peer = Peer(serve, publish)
+        stack.callback(self.peer.close)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(DEADLINE_S)
+
+    def _end(self) -> None:
+        self.kill()
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+
+
+class AtPanel(Emulator):
+    """An emulator with somebody at its panel."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.to_do: SimpleQueue[Callable[[], None]] = SimpleQueue()
+
+    def tick(self, now_s: float) -> float | None:
+        while not self.to_do.empty():
+            self.to_do.get()()
+        return super().tick(now_s)
+
+
+Emulated = TypeVar("Emulated", bound=AtPanel)
+
+
+class VendorBench(Generic[Emulated]):
+    """An emulator and a translator of it. Each vendor's says which they are::
+
+        class Bench(VendorBench[Emulated]):
+            emulated = Emulated
+            translator = "afspm.microscopes.mine.Mine"
+            data_name = "mine"
+            settings = {"reply_timeout_s": 2.0}
+
+    Attributes:
+        emulated: the class of the emulator.
+        translator: the class of the translator, as in an experiment file.
+        data_name: of the folder that the emulator saves in.
+        settings: of the translator, besides the address, where a test gives no others.
+    """
+
+    emulated: type[Emulated]
+    translator: ClassVar[str]
+    data_name: ClassVar[str]
+    settings: Mapping[str, Any]
+
+    def __init__(self, folder: Path, stack: ExitStack, speed: float, emulator: dict[str, Any]) -> None:
+        self.folder, self._stack = folder, stack
+        self.clock = ExperimentClock.starting_now(speed=speed)
+        self.data = folder / self.data_name
+        self._emulator_settings: dict[str, Any] = {"port": 0, "surface": "steps", **emulator}
+        self._start_controller()
+
+    def _start_controller(self) -> None:
+        self.emulator = self.emulated(**self._emulator_settings)
+        self.address = self._stack.enter_context(self.emulator.running(self.data, self.clock))
+
+    def start_controller_again(self) -> None:
+        """Another one where the last was, which knows nothing of it."""
+        self._emulator_settings["port"] = int(self.address.rpartition(":")[2])
+        self._start_controller()
+
+    def at_panel(self, do: Callable[[Emulated], object]) -> None:
+        """Do something in the emulator's own thread; returns when it is done."""
+        done = Event()
+
+        def job() -> None:
+            do(self.emulator)
+            done.set()
+
+        self.emulator.to_do.put(job)
+        self.emulator.woken.post()
+        assert done.wait(DEADLINE_S)
+
+    def strike(self, kind: str, count: int = 1, duration_s: float = 1.0) -> None:
+        """Have something go wrong from now on."""
+        fault = Fault(kind, 0.0, count, duration_s)
+        self.at_panel(lambda emulator: emulator.faults.demand(fault, self.clock.now_s()))
+
+    def start(self, **settings: Any) -> Peer:
+        """The translator, as a process of its own."""
+        given = {"address": self.address, **self.settings, **settings}
+        self._process = TranslatorProcess(self.translator, given, self.folder, self._stack, self.clock)
+        return self._process.peer
+
+    def kill(self) -> None:
+        """The translator."""
+        self._process.kill()
+
+    def said(self) -> str:
+        """The translator's log."""
+        return (self.folder / "log.txt").read_text()
+
+
+OneBench = TypeVar("OneBench", bound=VendorBench[Any])
+
+
+def benches(kind: type[OneBench], folder: Path) -> Iterator[Callable[..., OneBench]]:
+    """The `bench` fixture of a vendor: makes benches that end with the test."""
+    with ExitStack() as stack:
+
+        def make(speed: float = 100.0, **emulator: Any) -> OneBench:
+            return kind(folder, stack, speed, emulator)
+
+        yield make
+
+
+# --- what was heard, and what a test begins with ---
+
+
+def states(heard: Sequence[Any]) -> list[str]:
+    """The states among what was heard, in words."""
+    return [one.state.name for one in heard if isinstance(one, ScopeStatus)]
+
+
+def scans(heard: Sequence[Any]) -> list[Scan]:
+    return [one for one in heard if isinstance(one, Scan)]
+
+
+def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
+    """A small frame is in force, and all that comes of it was heard."""
+    peer.until(ScopeState.FREE)
+    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, ""))
+    assert response.ok, response.reason
+    peer.until(lambda one: isinstance(one, ScanParameters) and one.region == region and one.shape == shape)
+    peer.until(ScopeState.FREE)
+
+
+def small(made: VendorBench[Any], **settings: object) -> Peer:
+    """A translator that has found the microscope, with a frame of few pixels in force."""
+    peer = made.start(**settings)
+    peer.until(ScopeState.FREE)
+    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
+    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
+    peer.until(lambda one: getattr(one, "shape", None) == (8, 16))
+    peer.until(ScopeState.FREE)
+    return peer
+
+
+def scanned(peer: Peer) -> dict[str, Scan]:
+    """A scan, by channel."""
+    response = peer.act(names.START_SCAN)
+    assert response.ok, response.reason
+    heard = peer.until(ScopeState.FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    found = scans(heard)
+    assert heard[-1 - len(found) : -1] == found, "the scans come before FREE, and nothing in between"
+    return {scan.channel: scan for scan in found}
+
+
+def moved(peer: Peer, x_m: float, y_m: float) -> list[Any]:
+    """The probe is there; returns all that was heard on the way."""
+    response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m)))
+    assert response.ok, response.reason
+    heard = peer.until(ScopeState.FREE)
+    assert states(heard) == ["MOVING", "FREE"]
+    return heard
