@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Event
+from threading import Event, Thread
 from typing import Any, ClassVar, Generic, TypeVar
 
 import zmq
@@ -54,9 +55,9 @@ class Peer:
         self._packets = self._context.socket(zmq.SUB)
         self._packets.subscribe(b"")
         self._packets.connect(publish)
-        for socket in (self._request, self._packets):
-            socket.setsockopt(zmq.LINGER, 0)
-            socket.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
+        for each in (self._request, self._packets):
+            each.setsockopt(zmq.LINGER, 0)
+            each.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
 
     def ask(self, kind: int, subject: Any) -> Response:
         request = Request(kind, subject, wire.frames.encode_subject(subject))
@@ -289,3 +290,26 @@ def moved(peer: Peer, x_m: float, y_m: float) -> list[Any]:
     heard = peer.until(ScopeState.FREE)
     assert states(heard) == ["MOVING", "FREE"]
     return heard
+
+
+@contextmanager
+def answering(*replies: bytes, silent: bool = False) -> Iterator[tuple[str, int]]:
+    """The address of somebody who answers each request with the next of these bytes, and then hangs up (or not)."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        ended = Thread(target=_answer, args=(listener, replies, silent))
+        ended.start()
+        try:
+            yield listener.getsockname()
+        finally:
+            ended.join()
+
+
+def _answer(listener: socket.socket, replies: tuple[bytes, ...], silent: bool) -> None:
+    client, _ = listener.accept()
+    with client, suppress(OSError):
+        for reply in replies:
+            client.recv(1000)
+            client.sendall(reply)
+        client.settimeout(10.0)
+        while silent and client.recv(1000):
+            pass

@@ -13,13 +13,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vendor_bench import answering
 
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm import pickles
@@ -143,26 +143,12 @@ def test_damaged_pickles_are_a_value_or_refused(content: bytes, at: int, damage:
 @contextmanager
 def talking(*replies: bytes, silent: bool = False) -> Iterator[BridgeLink]:
     """A link to somebody who answers each call with the next of these bytes, and then hangs up (or not)."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        ended = Thread(target=_talk, args=(listener, replies, silent))
-        ended.start()
-        link = BridgeLink(listener.getsockname(), 0.3 if silent else 10.0, time.monotonic)
+    with answering(*replies, silent=silent) as address:
+        link = BridgeLink(address, 0.3 if silent else 10.0, time.monotonic)
         try:
             yield link
         finally:
             link.close()
-            ended.join()
-
-
-def _talk(listener: socket.socket, replies: tuple[bytes, ...], silent: bool) -> None:
-    client, _ = listener.accept()
-    with client, suppress(OSError):
-        for reply in replies:
-            client.recv(1000)
-            client.sendall(reply)
-        client.settimeout(10.0)
-        while silent and client.recv(1000):
-            pass
 
 
 def test_an_error_in_gxsm_leaves_the_connection_as_it_is() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import struct
 import time
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ from threading import Thread
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vendor_bench import answering
 
 from afspm.emulators.nanonis import wire
 from afspm.microscopes.microscope import ControllerLost
@@ -24,26 +24,12 @@ GOOD = wire.reply("Bias.Get", wire.body("Bias.Get", [0.5], 0))
 @contextmanager
 def talking(*replies: bytes, silent: bool = False) -> Iterator[Link]:
     """A link to somebody who answers each request with the next of these bytes, and then hangs up (or not)."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        ended = Thread(target=_talk, args=(listener, replies, silent))
-        ended.start()
-        link = Link(listener.getsockname(), 0.3 if silent else 10.0, time.monotonic)
+    with answering(*replies, silent=silent) as address:
+        link = Link(address, 0.3 if silent else 10.0, time.monotonic)
         try:
             yield link
         finally:
             link.close()
-            ended.join()
-
-
-def _talk(listener: socket.socket, replies: tuple[bytes, ...], silent: bool) -> None:
-    client, _ = listener.accept()
-    with client, suppress(OSError):
-        for reply in replies:
-            client.recv(1000)
-            client.sendall(reply)
-        client.settimeout(10.0)
-        while silent and client.recv(1000):
-            pass
 
 
 def test_a_reply_in_many_parts_is_one() -> None:
