@@ -125,6 +125,13 @@ class CancelIgnored(Broken):
         """Nothing comes of it."""
 
 
+class CancelledSpectrumUntold(Broken):
+    """A spectrum that is stopped is free at once, as if it had come to its end."""
+
+    def spoil(self) -> None:
+        sequence.Sequence.interrupt = lambda self: self._say(ScopeStatus(ScopeState.FREE))  # type: ignore[method-assign]
+
+
 class WrongUnit(Broken):
     """The speed in another unit than the controller's, there and back."""
 

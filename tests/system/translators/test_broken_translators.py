@@ -49,6 +49,7 @@ def checked(folder: Path, name: str, *only: str) -> Report:
         ("WrongUnit", "scan/duration", "as scan-speed says .is its unit right"),
         ("FreeBeforeTheScan", "scan/order", "SS_SCANNING, Scan2d …, SS_FREE; came SS_SCANNING, SS_FREE, Scan2d"),
         ("CancelIgnored", "scan/cancel", "expected .*SS_FREE.*; came "),
+        ("CancelledSpectrumUntold", "spectrum/cancel", "expected SS_INTERRUPTED.*; came SS_SPEC, SS_FREE"),
         ("SpectrumElsewhere", "spectrum/position", r"expected a spectrum at .*; came \(0, 0\) nm"),
         ("NotOnlyWhatWasAsked", "frame/position-only", "a size of .* instead of"),
         ("NeverFreeAgain", "frame/set", "expected SS_FREE within"),

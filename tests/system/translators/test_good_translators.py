@@ -131,6 +131,13 @@ def test_what_is_not_supported_is_skipped_and_listed(tmp_path: Path) -> None:
     assert report.support.actions["start-spec"] is False
 
 
+def test_a_spectrum_too_short_to_be_stopped_is_said_to_be(file: Path) -> None:
+    report = run(Options([file], runs=file.parent / "runs", speed=5000.0, only=["spectrum/cancel", "spectrum/order"]))
+    outcomes = {result.name: (result.outcome, result.line) for result in report.results}
+    assert outcomes["spectrum/cancel"] == (Outcome.SKIPPED, "a spectrum is over sooner than it could be stopped")
+    assert outcomes["spectrum/order"] == (Outcome.PASSED, "")
+
+
 def test_a_translator_of_version_1_made_without_afspm_is_checked_just_the_same(tmp_path: Path) -> None:
     file = tmp_path / "experiment.toml"
     file.write_text(PLAIN.format(script=Path(__file__).with_name("plain.py").as_posix()), encoding="utf-8")
