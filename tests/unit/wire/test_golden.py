@@ -15,7 +15,16 @@ from afspm.model import ControlRequest, ControlResponse
 from afspm.wire.messages import message_type
 
 GOLDEN = json.loads((Path(__file__).parents[3] / "proto" / "golden.json").read_text(encoding="utf-8"))
-AS_MODEL = {"Scan2d", "Spec1d", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ScopeStateMsg", "ControlState"}
+AS_MODEL = {
+    "Scan2d",
+    "Spec1d",
+    "ScanParameters2d",
+    "ZCtrlParameters",
+    "ProbePosition",
+    "ScopeStateMsg",
+    "ControlState",
+    "ScanLines",
+}
 
 
 def each(kind: str) -> Any:
