@@ -149,8 +149,6 @@ class Emulator(ABC):
         self.faults = Faults(self._faults, self.fault_kinds, clock.now_s())
         folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()
-        if self._stop.is_set():
-            self.woken.post()
         self.rig.wake = self.woken.post
         try:
             listening(self.open())
@@ -164,7 +162,10 @@ class Emulator(ABC):
     def stop(self) -> None:
         """End `run` soon. From any thread, also before it began."""
         self._stop.set()
-        if hasattr(self, "woken"):
+        self._wake()
+
+    def _wake(self) -> None:
+        if hasattr(self, "woken"):  # it is made when it runs
             self.woken.post()
 
     @contextmanager
@@ -228,7 +229,7 @@ class Emulator(ABC):
         while not any(isinstance(incoming, Killed) for incoming in port.poll(None)):
             pass
         self._leave_at_s = context.clock.monotonic_s() + FAREWELL_S
-        self.woken.post()
+        self._wake()
         port.close()
 
     def _wait_s(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import socket
+import threading
 from typing import Any, ClassVar
 
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
@@ -34,3 +35,13 @@ class Echo(Emulator):
 
     def close(self) -> None:
         self._listener.close()
+
+
+class Late(Echo):
+    """Begins when the experiment is over."""
+
+    def run(self, *arguments: Any) -> None:
+        for thread in threading.enumerate():
+            if thread.name == "experiment":
+                thread.join()
+        super().run(*arguments)

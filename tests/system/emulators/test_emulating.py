@@ -72,10 +72,10 @@ def test_a_fault_that_it_does_not_have_is_refused_before_it_listens(tmp_path: Pa
     assert "did you mean 'crash'?" in err
 
 
-def launched(settings: dict[str, object], subscribe: str, run_dir: Path) -> str:
+def launched(settings: dict[str, object], subscribe: str, run_dir: Path, class_: str) -> str:
     launch = Launch(
         name="controller",
-        class_="echo.Echo",
+        class_=class_,
         settings={"port": 0, **settings},
         sockets=Sockets(subscribe=(subscribe,)),
         envelopes=(),
@@ -86,20 +86,38 @@ def launched(settings: dict[str, object], subscribe: str, run_dir: Path) -> str:
 
 
 @contextmanager
-def in_an_experiment(
-    settings: dict[str, object], tmp_path: Path
-) -> Iterator[tuple[subprocess.Popen[str], str, zmq.Socket[bytes]]]:
+def beginning(
+    settings: dict[str, object], tmp_path: Path, class_: str = "echo.Echo"
+) -> Iterator[tuple[subprocess.Popen[str], zmq.Socket[bytes]]]:
+    """The process, told how to begin, and the scheduler that it subscribes to."""
     with zmq.Context() as context, context.socket(zmq.XPUB) as scheduler:
         scheduler.setsockopt(zmq.LINGER, 0)
         port = scheduler.bind_to_random_port("tcp://127.0.0.1")
         with started("afspm.runtime.host", cwd=tmp_path) as process:
             assert process.stdin is not None
-            assert process.stderr is not None
-            process.stdin.write(launched(settings, f"tcp://127.0.0.1:{port}", tmp_path))
+            process.stdin.write(launched(settings, f"tcp://127.0.0.1:{port}", tmp_path, class_))
             process.stdin.flush()
-            line = process.stderr.readline()
-            assert line.startswith("WARNING SIMULATED: an emulated Echo controller"), line
-            yield process, line.split(WORDS)[1].strip(), scheduler
+            yield process, scheduler
+
+
+@contextmanager
+def in_an_experiment(
+    settings: dict[str, object], tmp_path: Path
+) -> Iterator[tuple[subprocess.Popen[str], str, zmq.Socket[bytes]]]:
+    with beginning(settings, tmp_path) as (process, scheduler):
+        assert process.stderr is not None
+        line = process.stderr.readline()
+        assert line.startswith("WARNING SIMULATED: an emulated Echo controller"), line
+        yield process, line.split(WORDS)[1].strip(), scheduler
+
+
+def test_an_experiment_that_ends_before_it_listens_is_heard_of_too(tmp_path: Path) -> None:
+    with beginning({}, tmp_path, "echo.Late") as (process, scheduler):
+        assert scheduler.poll(int(DEADLINE_S * 1000))
+        scheduler.send(b"KILL")
+        assert process.wait(DEADLINE_S) == ExitCode.ENDED
+        assert process.stderr is not None
+        assert "Traceback" not in process.stderr.read()
 
 
 def test_in_an_experiment_it_has_its_clock_and_ends_with_it(tmp_path: Path) -> None:
