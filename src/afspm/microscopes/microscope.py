@@ -121,7 +121,8 @@ class Microscope(ABC):
             parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`).
         poll_period_s: the controller is looked at this often, in real seconds, when nothing is about to happen; its
             state more often when a measurement is about to end, as learned from those before.
-        result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds.
+        result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds (see
+            `patience_s`).
         live_lines_s: how often the lines of a running scan are published, in experiment seconds; None: not at all.
 
     Attributes:
@@ -140,6 +141,10 @@ class Microscope(ABC):
     """No tip can break: the experiment's clock may go at another speed than the real one."""
     memory_is_all: ClassVar[bool] = False
     """The microscope has no state outside of `memory` (a simulated one): nothing was done that is not in there."""
+
+    program_s: ClassVar[float] = 0.0
+    """Real seconds that the controller's program may need for whatever it does beside measuring, such as to save a
+    file, however fast the experiment's time passes."""
 
     clock: Clock
     log: logging.Logger
@@ -165,6 +170,11 @@ class Microscope(ABC):
         self.poll_period_s = poll_period_s
         self.result_timeout_s = result_timeout_s
         self.live_lines_s = live_lines_s
+
+    def patience_s(self, of_s: float) -> float:
+        """How long to wait, in experiment seconds, for what takes the controller `of_s` at most on its own computer:
+        longer where so much passes while a program draws breath (an emulated controller at sixty times the speed)."""
+        return max(of_s, self.program_s / self.clock.real_s(1.0))
 
     @abstractmethod
     def connect(self) -> None:

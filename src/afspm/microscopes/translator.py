@@ -70,7 +70,7 @@ class Translator:
         microscope.memory = memory.setdefault("microscope", {})
         self._kept: dict[str, Any] = memory.setdefault("translator", {"said": 0, "ledger": {}, "outbox": {}})
         said = ScopeStatus(ScopeState(self._kept["said"]))
-        self._sequence = StateSequence(said, microscope.result_timeout_s)
+        self._sequence = StateSequence(said, 2 * microscope.patience_s(microscope.result_timeout_s / 2))
         self._ledger = Ledger(self._kept["ledger"], all_or_nothing=microscope.memory_is_all)
         self._outbox = Outbox(microscope, self._kept["outbox"], self._stamp, log)
         self._service = Service(microscope, self._sequence, self._about_to_act, log)
@@ -163,6 +163,9 @@ class Translator:
             return False
         self.microscope.connect()
         self._connected = True
+        if self._complaint:
+            self._complaint = ""
+            self._log.info("the controller answers")
         if not self._started:
             self._started = True
             for packet in self._outbox.start():

@@ -44,6 +44,7 @@ class Asylum(Microscope):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0
 
     def __init__(
         self,

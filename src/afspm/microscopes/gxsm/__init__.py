@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes.gxsm.activity import Activity
+from afspm.microscopes.gxsm.activity import SHOWS_S, Activity
 from afspm.microscopes.gxsm.frame import REFNAMES, Frame, number, send, user_unit_m
 from afspm.microscopes.gxsm.hardware import ABORT, APPROACH, AUTOSAVE_OFF, Hardware, available, execute, recognised
-from afspm.microscopes.gxsm.harvest import Harvest
+from afspm.microscopes.gxsm.harvest import SOON_S, Harvest
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
 from afspm.microscopes.gxsm.live import new_lines
 from afspm.microscopes.in_force import FRAME, POSITION, frame
@@ -41,6 +41,7 @@ class Gxsm(Microscope):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0
 
     def __init__(
         self,
@@ -95,7 +96,13 @@ class Gxsm(Microscope):
         if self._saves and AUTOSAVE_OFF in self._actions:
             ask.call("action", AUTOSAVE_OFF)
         self._kept: dict[str, Any] = self.memory.setdefault("kept", {names.SPEC_KIND: "IV", "probe": None})
-        self._harvest = Harvest(self.memory, self.result_timeout_s / 2, self.log, rewritten=not self._saves)
+        self._harvest = Harvest(
+            self.memory,
+            self.patience_s(self.result_timeout_s / 2),
+            self.patience_s(SOON_S),
+            self.log,
+            rewritten=not self._saves,
+        )
         self._activity = Activity(
             ask,
             self._hardware,
@@ -104,6 +111,7 @@ class Gxsm(Microscope):
             self.clock,
             self.log,
             set_frame=lambda: frame(self.read(FRAME)),
+            shows_s=self.patience_s(SHOWS_S),
             saves=self._saves,
             scan_dir=self._scan_dir,
             probe_dir=self._probe_dir,

@@ -15,8 +15,8 @@ from afspm.microscopes.gxsm.harvest import SCAN, Harvest, endings
 from afspm.microscopes.gxsm.link import Asking
 from afspm.model import Region, ScopeState, ScopeStatus
 
-_SHOWS_S: Final = 1.0
-"""So long, in experiment time, what was begun may take to be seen running; 0.3 s were measured."""
+SHOWS_S: Final = 1.0
+"""So long what was begun may take to be seen running; 0.3 s were measured."""
 _CHANNELS: Final = 40
 _NO_CHANNEL: Final = "EE:"
 
@@ -27,6 +27,7 @@ class Activity:
     Args:
         ask: GXSM.
         frame: of the next scan; `set_frame` gives the same, as it was set, and (rows, columns).
+        shows_s: how long what was begun may take to be seen running, in experiment time.
         saves: whether GXSM is told to save a scan at its end; if not, it does so by itself.
         scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
     """
@@ -41,6 +42,7 @@ class Activity:
         log: logging.Logger,
         *,
         set_frame: Callable[[], tuple[Region, tuple[int, int]]],
+        shows_s: float,
         saves: bool,
         scan_dir: Path | None,
         probe_dir: Path | None,
@@ -52,6 +54,7 @@ class Activity:
         self._harvest = harvest
         self._clock = clock
         self._log = log
+        self._shows_s = shows_s
         self._saves = saves
         self._scan_dir, self._probe_dir = scan_dir, probe_dir
         self._stopping = False
@@ -64,7 +67,7 @@ class Activity:
     def start_scan(self) -> None:
         """Scan the frame."""
         self._begin_scan(self._clock.now_ns())
-        self._shows_until_s = self._clock.now_s() + _SHOWS_S
+        self._shows_until_s = self._clock.now_s() + self._shows_s
         self._ask.call("startscan")
 
     def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
@@ -153,7 +156,7 @@ class Activity:
 
     def _take_curve(self, now_s: float) -> None:
         action, self._execute = self._execute, ""
-        self._shows_until_s = now_s + _SHOWS_S
+        self._shows_until_s = now_s + self._shows_s
         self._ask.call("action", action)
 
     def _begin_scan(self, begun_ns: int) -> None:

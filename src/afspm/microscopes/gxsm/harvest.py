@@ -29,8 +29,8 @@ _STORED: Final = 1e-5
 """Relative: what is lost of a length in a file."""
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Files tell the second in which a scan began."""
-_SOON_S: Final = 1.0
-"""After so long, in experiment time, a channel that did not come before will not come; 0.3 s were measured."""
+SOON_S: Final = 1.0
+"""After so long a channel that did not come before will not come; 0.3 s were measured."""
 
 
 class Harvest:
@@ -39,12 +39,16 @@ class Harvest:
     Args:
         kept: JSON-able, and lasts.
         patience_s: how long all files may take, in experiment time.
+        soon_s: how long those of channels may that did not come before.
         rewritten: files may be there before the scan is over, and be written again.
     """
 
-    def __init__(self, kept: dict[str, Any], patience_s: float, log: logging.Logger, *, rewritten: bool) -> None:
+    def __init__(
+        self, kept: dict[str, Any], patience_s: float, soon_s: float, log: logging.Logger, *, rewritten: bool
+    ) -> None:
         self._kept = kept
         self._patience_s = patience_s
+        self._soon_s = soon_s
         self._rewritten = rewritten
         self._log = log
         self._sizes: dict[Path, tuple[int, int]] = {}
@@ -181,7 +185,7 @@ class Harvest:
     def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
         """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
         missing = set(ended["channels"]) - endings(files).keys()
-        soon_s = ended["end_ns"] / NS_PER_S + _SOON_S
+        soon_s = ended["end_ns"] / NS_PER_S + self._soon_s
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= soon_s)
 
     def _missing(self, ended: Mapping[str, Any]) -> str:

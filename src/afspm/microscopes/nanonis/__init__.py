@@ -49,6 +49,7 @@ class Nanonis(Microscope):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     max_pixels: ClassVar[int] = 8192 * 8192
+    program_s: ClassVar[float] = 2.0
 
     def __init__(
         self,
@@ -101,7 +102,7 @@ class Nanonis(Microscope):
             on = groups.FeedbackOn(self.clock.monotonic_s, self._reply_timeout_s)
             self._groups = [*groups.OTHERS, self._probe, on, kept]
             own_folder = (self.run_dir / "scans").resolve()
-            patience_s = self.result_timeout_s / 2
+            patience_s = self.patience_s(self.result_timeout_s / 2)
             self._harvest = Harvest(self.memory, self._session_dir, own_folder, patience_s, self.log)
         self._activity = Activity(session, self._harvest, self._probe, self.clock, self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
