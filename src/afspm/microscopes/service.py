@@ -15,7 +15,7 @@ from afspm.microscopes.in_force import FRAME, MOVES, check_together, of_message
 from afspm.microscopes.microscope import LOST, Action, Microscope
 from afspm.microscopes.parameters import ParameterTable, Value, refuse_value
 from afspm.microscopes.sequence import Sequence, Step
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
 from afspm.wire import encode
 
 _ANNOUNCED = {
@@ -77,7 +77,7 @@ class Service:
             raise
         except Exception as error:
             # an error of the controller, or of its own translator, must not end the process: it is the reason
-            self._log.exception("%s failed", _named(request.kind))
+            self._log.exception("%s failed", request_name(request.kind))
             code = _failure(request)
             return Answer(Response(code, reason=f"{type(error).__name__}: {error}", id=request.id))
 
@@ -94,7 +94,7 @@ class Service:
             if request.kind == ControlRequest.PARAM:
                 return Answer(self._told(request))
             return Answer(Response(ControlResponse.SUCCESS, id=request.id))
-        reason = f"{_named(request.kind)} is not for a translator"
+        reason = f"{request_name(request.kind)} is not for a translator"
         raise Refused(ControlResponse.CMD_NOT_SUPPORTED, reason)
 
     def _told(self, request: Request) -> Response:
@@ -120,7 +120,8 @@ class Service:
         Raises:
             Refused: PARAM_ERROR: they do not fit together, or the controller made something else of them.
         """
-        before = self._microscope.read({*values, *(name for name in FRAME if name in self._table)})
+        framed = FRAME if not values.keys().isdisjoint(FRAME) else ()
+        before = self._microscope.read({*values, *(name for name in framed if name in self._table)})
         check_together({**before, **values}, self._table, self._microscope.max_pixels)
         former = {name: before[name] for name in values}
         about_to_act()
@@ -191,11 +192,6 @@ def _bound(function: Callable[..., None], *arguments: Any) -> Callable[[], None]
 
 def _already_said() -> None:
     """The request behind an action was written down before the action began."""
-
-
-def _named(kind: int) -> str:
-    """A request in words; there are some beyond the numbers of the wire format."""
-    return next((known.name for known in ControlRequest if known == kind), f"request {kind}")
 
 
 def _failure(request: Request) -> ControlResponse:

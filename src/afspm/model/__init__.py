@@ -5,13 +5,27 @@ from __future__ import annotations
 from afspm.model.control import Parameter, Request, Response
 from afspm.model.enums import (
     CLOCK_REQUEST,
+    RESTART_REQUEST,
+    TELL_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
     Problem,
     ScopeState,
+    request_name,
 )
 from afspm.model.geometry import Frame, Region, RegionChange
+from afspm.model.journal import (
+    JournalEntries,
+    JournalEntry,
+    LogLine,
+    LogLines,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    Told,
+    component_of,
+)
 from afspm.model.lines import ScanLines
 from afspm.model.packet import Packet, PacketHeader
 from afspm.model.problems import ProblemNames
@@ -21,12 +35,18 @@ from afspm.model.state import ControlState, Feedback, PositionChange, ProbePosit
 
 __all__ = [
     "CLOCK_REQUEST",
+    "RESTART_REQUEST",
+    "TELL_REQUEST",
     "ControlMode",
     "ControlRequest",
     "ControlResponse",
     "ControlState",
     "Feedback",
     "Frame",
+    "JournalEntries",
+    "JournalEntry",
+    "LogLine",
+    "LogLines",
     "Packet",
     "PacketHeader",
     "Parameter",
@@ -34,6 +54,9 @@ __all__ = [
     "ProbePosition",
     "Problem",
     "ProblemNames",
+    "ProcessCondition",
+    "ProcessState",
+    "ProcessStates",
     "Region",
     "RegionChange",
     "Request",
@@ -46,4 +69,7 @@ __all__ = [
     "ScopeStatus",
     "ShapeChange",
     "Spectrum",
+    "Told",
+    "component_of",
+    "request_name",
 ]

@@ -56,6 +56,18 @@ class ControlRequest(IntEnum):
 
 CLOCK_REQUEST = 101
 """A request of ours, not in version 1: what time it is in the experiment."""
+TELL_REQUEST = 102
+"""A request of ours, not in version 1: a supervisor has something to publish; its answer are orders to it."""
+RESTART_REQUEST = 103
+"""A request of ours, not in version 1: a process is to be started anew; its subject is the process's name."""
+
+_OURS = {CLOCK_REQUEST: "CLOCK", TELL_REQUEST: "TELL", RESTART_REQUEST: "RESTART"}
+
+
+def request_name(kind: int) -> str:
+    """A request in words."""
+    known = next((request.name for request in ControlRequest if request == kind), None)
+    return known or _OURS.get(kind, f"request {kind}")
 
 
 class ControlResponse(IntEnum):

@@ -18,6 +18,7 @@ from afspm.wire.frames import (
     encode_subject,
     encode_time,
 )
+from afspm.wire.journal import decode_orders, encode_orders
 from afspm.wire.messages import known_messages, message_of, message_type, register
 from afspm.wire.places import encode_place, place_in, relocated
 
@@ -28,11 +29,13 @@ __all__ = [
     "KILL",
     "Buffer",
     "decode",
+    "decode_orders",
     "decode_packet",
     "decode_parameter",
     "decode_request",
     "decode_response",
     "encode",
+    "encode_orders",
     "encode_packet",
     "encode_place",
     "encode_request",

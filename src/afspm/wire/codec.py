@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 from afspm import model
 from afspm.errors import AfspmError, InvalidValue, UnitError, WireError
 from afspm.units import convert as convert_unit
-from afspm.wire import convert
+from afspm.wire import convert, journal
 from afspm.wire.generated import analysis_pb2, control_pb2, feedback_pb2, lines_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.messages import message_type, parse
 from afspm.wire.split import doubles, nested, packed, split
@@ -230,6 +230,10 @@ _ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
     model.ScopeStatus: _plain_encoder("ScopeStateMsg", convert.status_to_wire),
     model.ControlState: _plain_encoder("ControlState", convert.control_state_to_wire),
     model.Parameter: _plain_encoder("ParameterMsg", convert.parameter_to_wire),
+    model.JournalEntries: _plain_encoder("JournalEntries", journal.entries_to_wire),
+    model.ProcessStates: _plain_encoder("ProcessStates", journal.processes_to_wire),
+    model.LogLines: _plain_encoder("LogLines", journal.log_to_wire),
+    model.Told: _plain_encoder("Told", journal.told_to_wire),
 }
 
 _DECODERS: dict[str, Callable[[Buffer], Any]] = {
@@ -242,6 +246,9 @@ _DECODERS: dict[str, Callable[[Buffer], Any]] = {
     "ScopeStateMsg": lambda payload: convert.status_from_wire(parse(control_pb2.ScopeStateMsg, payload)),
     "ControlState": lambda payload: convert.control_state_from_wire(parse(control_pb2.ControlState, payload)),
     "ParameterMsg": lambda payload: convert.parameter_from_wire(parse(control_pb2.ParameterMsg, payload)),
+    "JournalEntries": journal.entries_from_wire,
+    "ProcessStates": journal.processes_from_wire,
+    "LogLines": journal.log_from_wire,
 }
 
 _HEADERS: dict[str, Callable[[Buffer], model.PacketHeader]] = {

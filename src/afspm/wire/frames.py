@@ -10,8 +10,19 @@ from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from afspm.errors import AfspmError, WireError
-from afspm.model import CLOCK_REQUEST, ControlRequest, ControlResponse, Packet, Parameter, Request, Response
-from afspm.wire import convert
+from afspm.model import (
+    CLOCK_REQUEST,
+    RESTART_REQUEST,
+    TELL_REQUEST,
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    Parameter,
+    Request,
+    Response,
+    request_name,
+)
+from afspm.wire import convert, journal
 from afspm.wire.codec import Buffer, encode
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.messages import parse
@@ -121,7 +132,7 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
         return Request(kind, subject_of(payload), payload, request_id)
     except AfspmError as error:
         response = error.response if isinstance(error, WireError) else ControlResponse.PARAM_ERROR
-        raise WireError(f"{ControlRequest(kind).name}: {error}", response=response) from error
+        raise WireError(f"{request_name(kind)}: {error}", response=response) from error
 
 
 def _request_id(frame: Buffer) -> str:
@@ -204,5 +215,7 @@ _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     ControlRequest.SET_CONTROL_MODE: _number,
     ControlRequest.END_EXPERIMENT: _nothing,
     CLOCK_REQUEST: lambda p: None,
+    TELL_REQUEST: journal.told_from_wire,
+    RESTART_REQUEST: _action,
     ControlRequest.ACTION_SUPPORT: _action,
 }

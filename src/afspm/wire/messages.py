@@ -28,6 +28,16 @@ from afspm.wire.generated.geometry_pb2 import (
     Size2u,
     Size3u,
 )
+from afspm.wire.generated.journal_pb2 import (
+    JournalEntries,
+    JournalEntry,
+    LogLine,
+    LogLines,
+    Orders,
+    ProcessState,
+    ProcessStates,
+    Told,
+)
 from afspm.wire.generated.lines_pb2 import ScanLines
 from afspm.wire.generated.scan_pb2 import DataAspects, Scan2d, ScanParameters2d, SpatialAspects
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition, Spec1d, SpecData
@@ -37,10 +47,12 @@ M = TypeVar("M", bound=Message)
 _messages: dict[str, type[Message]] = {
     message.DESCRIPTOR.name: message
     for message in (
-        ActionMsg, ControlState, DataAspects, DriftMapping, DriftRescan, FeedbackAnalysis, ParameterMsg, Point2d,
-        Point2u, ProbePosition, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d, ScanLines, ScanParameters2d,
-        ScopeStateMsg, Size2d, Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore,
-        SpatialPointWithScoreList, SpatialROIWithScore, SpatialROIWithScoreList, Spec1d, SpecData, ZCtrlParameters,
+        ActionMsg, ControlState, DataAspects, DriftMapping, DriftRescan, FeedbackAnalysis,
+        JournalEntries, JournalEntry, LogLine, LogLines, Orders, ParameterMsg, Point2d,
+        Point2u, ProbePosition, ProcessState, ProcessStates, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d,
+        ScanLines, ScanParameters2d, ScopeStateMsg, Size2d, Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore,
+        SpatialPointWithScoreList, SpatialROIWithScore, SpatialROIWithScoreList,
+        Spec1d, SpecData, Told, ZCtrlParameters,
     )
 }  # fmt: skip
 

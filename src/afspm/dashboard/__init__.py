@@ -1,0 +1,1 @@
+"""The experiment in the browser: seen by everybody, steered by those who may."""

@@ -1,0 +1,121 @@
+"""What happens beside what is measured: who asked for what, who runs, what was said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+PERSON = ":"
+"""Between a component and the person that it acts for: "dashboard:Ada"."""
+
+
+def component_of(who: str) -> str:
+    """The component in whose name something was asked; the same without a person."""
+    return who.partition(PERSON)[0]
+
+
+class ProcessCondition(IntEnum):
+    """How it is with a process; the numbers of the wire."""
+
+    UNDEFINED = 0
+    STARTING = 1
+    ALIVE = 2
+    BUSY = 3
+    """It works on a step."""
+    SILENT = 4
+    """It should have been heard of."""
+    RESTARTING = 5
+    ENDED = 6
+    GIVEN_UP = 7
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntry:
+    """Something that happened.
+
+    Attributes:
+        time_ns: experiment time, ns since the Unix epoch.
+        kind: "request", "control" (holder, mode or problems changed) or "order" (of a person, to start anew …).
+        who: the component; "component:person" where it acts for one.
+        what: in words, with units.
+        response: the number of a ControlResponse; None where nothing was asked.
+        reason: why it was refused, or why it happened.
+        took_s: real, from the question to the answer; None where nothing was asked.
+    """
+
+    time_ns: int
+    kind: str
+    who: str
+    what: str
+    response: int | None = None
+    reason: str = ""
+    took_s: float | None = None
+
+    @property
+    def refused(self) -> bool:
+        """Whether it was asked for and not done."""
+        return bool(self.response)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessState:
+    """How it is with one process.
+
+    Attributes:
+        role: "scheduler", "translator", "component" …
+        since_ns: since when it is in this condition, experiment time.
+        step_age_s: real, for how long it has been working on its step.
+        starts: how often it was started.
+        pid: of the operating system; 0 if there is none.
+        last_exit: how it ended last, in words.
+    """
+
+    name: str
+    role: str
+    condition: ProcessCondition
+    since_ns: int
+    step_age_s: float = 0.0
+    starts: int = 1
+    pid: int = 0
+    last_exit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStates:
+    """All processes of one supervisor, of which there is one on each computer."""
+
+    time_ns: int
+    supervisor: str
+    processes: tuple[ProcessState, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LogLine:
+    """Something that a process said; `level` is a name of the logging module."""
+
+    time_ns: int
+    name: str
+    level: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntries:
+    """Some that happened, oldest first; what a scheduler publishes at a time."""
+
+    entries: tuple[JournalEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LogLines:
+    """Some that were said, oldest first; what a supervisor tells at a time."""
+
+    lines: tuple[LogLine, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A packet that a supervisor has the scheduler publish: one of ProcessStates or LogLines."""
+
+    message: str
+    payload: bytes
