@@ -47,12 +47,11 @@ M = TypeVar("M", bound=Message)
 _messages: dict[str, type[Message]] = {
     message.DESCRIPTOR.name: message
     for message in (
-        ActionMsg, ControlState, DataAspects, DriftMapping, DriftRescan, FeedbackAnalysis,
-        JournalEntries, JournalEntry, LogLine, LogLines, Orders, ParameterMsg, Point2d,
-        Point2u, ProbePosition, ProcessState, ProcessStates, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d,
-        ScanLines, ScanParameters2d, ScopeStateMsg, Size2d, Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore,
-        SpatialPointWithScoreList, SpatialROIWithScore, SpatialROIWithScoreList,
-        Spec1d, SpecData, Told, ZCtrlParameters,
+        ActionMsg, ControlState, DataAspects, DriftMapping, DriftRescan, FeedbackAnalysis, JournalEntries,
+        JournalEntry, LogLine, LogLines, Orders, ParameterMsg, Point2d, Point2u, ProbePosition, ProcessState,
+        ProcessStates, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d, ScanLines, ScanParameters2d, ScopeStateMsg,
+        Size2d, Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore, SpatialPointWithScoreList,
+        SpatialROIWithScore, SpatialROIWithScoreList, Spec1d, SpecData, Told, ZCtrlParameters,
     )
 }  # fmt: skip
 
