@@ -1,0 +1,340 @@
+"""`Overview`: what an experiment has come to, from all that is published. Terminal, dashboard and report show it."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from afspm.drift.record import drift_at
+from afspm.model import (
+    ControlMode,
+    ControlState,
+    Feedback,
+    Frame,
+    JournalEntries,
+    JournalEntry,
+    LogLine,
+    LogLines,
+    ProbePosition,
+    ProblemNames,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    Region,
+    Scan,
+    ScanLines,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
+    Spectrum,
+)
+from afspm.model.geometry import XY
+from afspm.record.lanes import Lane, Span
+from afspm.record.running import RunningScan
+
+__all__ = ["DriftPoint", "Lane", "Overview", "Restart", "RunningScan", "ScanTaken", "Span", "SpectrumTaken"]
+
+MOST_LINES = 2_000
+MOST_ENTRIES = 5_000
+MOST_MEASURED = 100_000
+SOON_NS = 1_000_000_000
+NOBODY = None
+
+
+@dataclass(frozen=True, slots=True)
+class ScanTaken:
+    """One channel of a scan, without its values.
+
+    Attributes:
+        time_ns: when it was finished, or interrupted.
+        began_ns: None if that was not seen.
+        shape: (rows, columns).
+        holder: who was in control; None if nobody was, or it is not known.
+        interrupted: only a part of it was taken.
+    """
+
+    time_ns: int
+    began_ns: int | None
+    channel: str
+    unit: str
+    region: Region
+    shape: tuple[int, int]
+    filename: str = ""
+    holder: str | None = None
+    interrupted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SpectrumTaken:
+    """A spectrum, without its values. `position_m` is (x, y) in `frame`; None if it is not known."""
+
+    time_ns: int
+    kind: str
+    position_m: XY | None
+    frame: Frame
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    filename: str = ""
+    holder: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DriftPoint:
+    """What was known of drift after one scan.
+
+    Attributes:
+        translation_m: (x, y) displacement of the sample under the tip since the start, in tip coordinates.
+        rate_m_s: (x, y) velocity of the sample then.
+        matched: whether the scan was registered; else this is a prediction.
+        lost: it is not known any more where the sample is.
+        correcting: whether components were given sample coordinates.
+    """
+
+    time_ns: int
+    translation_m: XY
+    rate_m_s: XY
+    matched: bool = True
+    lost: bool = False
+    correcting: bool = False
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Restart:
+    """A process was started anew: the `starts`-th time, after it had ended as `last_exit` says."""
+
+    time_ns: int
+    name: str
+    starts: int
+    last_exit: str
+
+
+class Overview:
+    """Reduces packets to what is so and what has happened. Nothing of it depends on clocks, sockets or files.
+
+    A packet that was taken already changes nothing, so that replays can be given to it as they come; of each
+    envelope the packets are to come in the order of their times.
+
+    Args:
+        problems: their names, by which it is found in the journal who flagged them.
+
+    Attributes:
+        newest_ns: the time of the newest packet; 0 before the first.
+        status, control, scan_parameters, feedback, probe_position: the newest of each; None before the first.
+        processes, progress: by name; progress as (done, of).
+        log, entries, refusals: newest last, bounded.
+        controls: lane of who was in control; `modes`, `states`: lanes of mode and scope state, in lower case.
+        problem_lanes: by number; `process_lanes`: by name. A process that is busy counts as alive.
+        running: the scan that is being taken; None if none is.
+    """
+
+    def __init__(self, problems: ProblemNames | None = None, *, most_entries: int = MOST_ENTRIES) -> None:
+        self.problems = problems or ProblemNames()
+        self.newest_ns = 0
+        self.status: ScopeStatus | None = None
+        self.control: ControlState | None = None
+        self.scan_parameters: ScanParameters | None = None
+        self.feedback: Feedback | None = None
+        self.probe_position: ProbePosition | None = None
+        self.processes: dict[str, ProcessState] = {}
+        self.progress: dict[str, tuple[int, int]] = {}
+        self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
+        self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
+        self.refusals: deque[JournalEntry] = deque(maxlen=most_entries)
+        self.controls, self.modes, self.states = Lane(), Lane(), Lane()
+        self.problem_lanes: defaultdict[int, Lane] = defaultdict(Lane)
+        self.process_lanes: defaultdict[str, Lane] = defaultdict(Lane)
+        self.restarts: deque[Restart] = deque(maxlen=most_entries)
+        self.running: RunningScan | None = None
+        self._scans: dict[tuple[object, ...], ScanTaken] = {}
+        self._spectra: dict[tuple[object, ...], SpectrumTaken] = {}
+        self._drift: dict[int, DriftPoint] = {}
+        self._taken_ns: dict[str, int] = {}
+
+    @property
+    def scans(self) -> Sequence[ScanTaken]:
+        """One for each channel of each scan, in the order in which they came."""
+        return tuple(self._scans.values())
+
+    @property
+    def spectra(self) -> Sequence[SpectrumTaken]:
+        """In the order in which they came."""
+        return tuple(self._spectra.values())
+
+    @property
+    def drift(self) -> Sequence[DriftPoint]:
+        """In the order in which they came."""
+        return tuple(self._drift.values())
+
+    @property
+    def control_since_ns(self) -> int | None:
+        """Since when whoever is in control is, or nobody is; None if nothing is known."""
+        return self.controls.changed_ns
+
+    @property
+    def recent_scans(self) -> list[ScanTaken]:
+        """The channels of some scans before, newest first; costs little however many there are."""
+        return list(islice(reversed(self._scans.values()), 40))
+
+    def take(self, message: str, thing: Any, time_ns: int, envelope: str = "") -> None:
+        """Take in what was published.
+
+        Args:
+            message: its name, e.g. "Scan2d".
+            thing: as `wire.decode` gives it. What is not known is passed over.
+            time_ns: of the packet.
+            envelope: of the packet; without it, the name of the message.
+        """
+        key = envelope or message
+        # a scheduler stamps each packet anew: of one envelope, what is not newer came before
+        if time_ns <= self._taken_ns.get(key, -1):
+            return
+        self._taken_ns[key] = time_ns
+        self.newest_ns = max(self.newest_ns, time_ns)
+        if (taker := _TAKERS.get(message)) is not None:
+            taker(self, thing, time_ns)
+
+    def _take_status(self, status: ScopeStatus, time_ns: int) -> None:
+        before, self.status = self.status, status
+        self.states.change(status.state.name.lower(), time_ns)
+        if status.state is ScopeState.SCANNING:
+            if before is None or before.state is not ScopeState.SCANNING or self.running is None:
+                holder = self.control.holder if self.control else None
+                self.running = RunningScan(time_ns if before else None, holder, self.scan_parameters)
+            return
+        if status.state is ScopeState.INTERRUPTED and self.running is not None:
+            self._take_interrupted(self.running, time_ns)
+        if status.state in (ScopeState.FREE, ScopeState.INTERRUPTED):
+            self.running = None
+
+    def _take_interrupted(self, running: RunningScan, time_ns: int) -> None:
+        for channel, lines in running.channels.items():
+            self._add_scan(
+                ScanTaken(
+                    time_ns, running.began_ns, channel, lines.unit, lines.region, lines.shape,
+                    holder=running.holder, interrupted=True,
+                )
+            )  # fmt: skip
+
+    def _take_lines(self, lines: ScanLines, time_ns: int) -> None:
+        if self.running is not None:
+            self.running.take(lines)
+
+    def _take_scan(self, scan: Scan, time_ns: int) -> None:
+        began_ns, holder = None, self.control.holder if self.control else None
+        if self.running is not None:
+            began_ns, holder = self.running.began_ns, self.running.holder
+        self._add_scan(
+            ScanTaken(
+                scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename,
+                holder,
+            )
+        )  # fmt: skip
+
+    def _add_scan(self, taken: ScanTaken) -> None:
+        _keep(self._scans, (taken.time_ns, taken.channel, taken.region, taken.interrupted), taken)
+
+    def _take_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
+        taken_ns, holder = spectrum.time_ns or time_ns, self.control.holder if self.control else None
+        taken = SpectrumTaken(
+            taken_ns, spectrum.kind, spectrum.position_m, spectrum.frame, spectrum.names, spectrum.units,
+            spectrum.filename, holder,
+        )  # fmt: skip
+        _keep(self._spectra, (taken_ns, spectrum.kind, spectrum.position_m), taken)
+
+    def _take_control(self, control: ControlState, time_ns: int) -> None:
+        self.control = control
+        self.controls.change(control.holder or NOBODY, time_ns)
+        self.modes.change(control.mode.name.lower() if control.mode is not ControlMode.UNDEFINED else None, time_ns)
+        for number in {*control.problems, *self.problem_lanes}:
+            lane = self.problem_lanes[number]
+            if number in control.problems and lane.now is None:
+                lane.change(self.problems.name(number), time_ns, by=self._flagger(number, time_ns))
+            elif number not in control.problems:
+                lane.change(None, time_ns)
+
+    def _flagger(self, number: int, time_ns: int) -> str:
+        """Who asked for a problem to be flagged just before."""
+        for entry in reversed(self.entries):
+            if entry.time_ns < time_ns - SOON_NS:
+                break
+            if self._flags(entry, number):
+                return entry.who
+        return ""
+
+    def _flags(self, entry: JournalEntry, number: int) -> bool:
+        is_success = entry.kind == "request" and entry.response == 0
+        return is_success and entry.what.startswith("flag") and self.problems.name(number) in entry.what
+
+    def _take_entries(self, entries: JournalEntries, time_ns: int) -> None:
+        for entry in entries.entries:
+            self.entries.append(entry)
+            if entry.refused:
+                self.refusals.append(entry)
+            for number, lane in self.problem_lanes.items():
+                # the batch comes a moment after the control state that it explains
+                if lane.spans and not lane.spans[-1].by and self._flags(entry, number):
+                    lane.name_last(entry.who)
+
+    def _take_processes(self, states: ProcessStates, time_ns: int) -> None:
+        for state in states.processes:
+            before, self.processes[state.name] = self.processes.get(state.name), state
+            condition = state.condition
+            if condition is ProcessCondition.BUSY:
+                condition = ProcessCondition.ALIVE
+            lane = self.process_lanes[state.name]
+            lane.change(condition.name.lower().replace("_", " "), max(state.since_ns, lane.changed_ns or 0))
+            if state.starts > (before.starts if before else 1):
+                self.restarts.append(Restart(state.since_ns, state.name, state.starts, state.last_exit))
+
+    def _take_log(self, lines: LogLines, time_ns: int) -> None:
+        self.log.extend(lines.lines)
+
+    def _take_mapping(self, message: Any, time_ns: int) -> None:
+        if len(message.matrix) != 6 or len(message.center) != 2:
+            return
+        drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
+        rate = tuple(message.rate) if len(message.rate) == 2 else (0.0, 0.0)
+        at_ns = message.timestamp.ToNanoseconds()
+        point = DriftPoint(
+            at_ns, (float(drift_x), float(drift_y)), rate, message.matched, message.lost, message.correcting,
+            message.reason,
+        )  # fmt: skip
+        _keep(self._drift, at_ns, point)
+
+    def _take_parameters(self, parameters: ScanParameters, time_ns: int) -> None:
+        self.scan_parameters = parameters
+
+    def _take_feedback(self, feedback: Feedback, time_ns: int) -> None:
+        self.feedback = feedback
+
+    def _take_position(self, position: ProbePosition, time_ns: int) -> None:
+        self.probe_position = position
+
+
+def _keep(kept: dict[Any, Any], key: object, thing: object) -> None:
+    """Add what is not there yet; the oldest goes where there are too many."""
+    kept.setdefault(key, thing)
+    if len(kept) > MOST_MEASURED:
+        del kept[next(iter(kept))]
+
+
+_TAKERS: dict[str, Callable[[Overview, Any, int], None]] = {
+    "ScopeStateMsg": Overview._take_status,
+    "ControlState": Overview._take_control,
+    "ScanParameters2d": Overview._take_parameters,
+    "ZCtrlParameters": Overview._take_feedback,
+    "ProbePosition": Overview._take_position,
+    "ScanLines": Overview._take_lines,
+    "Scan2d": Overview._take_scan,
+    "Spec1d": Overview._take_spectrum,
+    "JournalEntries": Overview._take_entries,
+    "ProcessStates": Overview._take_processes,
+    "LogLines": Overview._take_log,
+    "DriftMapping": Overview._take_mapping,
+}

@@ -1,0 +1,200 @@
+"""What an experiment has come to, from its packets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from afspm import model, wire
+from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
+from afspm.record.overview import MOST_LINES, Overview
+
+S = 1_000_000_000
+REGION = model.Region((0.0, 0.0), (1e-6, 1e-6))
+TIP = int(model.Problem.TIP_SHAPE_CHANGED)
+
+
+def status(state: ScopeState) -> model.ScopeStatus:
+    return model.ScopeStatus(state)
+
+
+def control(holder: str | None, *problems: int, mode: ControlMode = ControlMode.AUTOMATED) -> ControlState:
+    return ControlState(mode, holder, problems)
+
+
+def scan(channel: str, time_s: int, rows: int = 4) -> model.Scan:
+    return model.Scan(REGION, channel, "m", np.zeros((rows, rows)), time_s * S)
+
+
+def lines(first_row: int, count: int, began_s: int = 10) -> model.ScanLines:
+    return model.ScanLines(REGION, (4, 4), "Height", "m", first_row, np.zeros((count, 4)), began_s * S)
+
+
+def process(condition: ProcessCondition, since_s: int, starts: int = 1, last_exit: str = "") -> model.ProcessState:
+    return model.ProcessState("series", "component", condition, since_s * S, starts=starts, last_exit=last_exit)
+
+
+def entry(time_s: float, what: str, response: int | None = 0, who: str = "classifier", reason: str = "") -> object:
+    return model.JournalEntries((model.JournalEntry(round(time_s * S), "request", who, what, response, reason),))
+
+
+NIGHT: list[tuple[str, object, int]] = [
+    ("ScopeStateMsg", status(ScopeState.FREE), 1),
+    ("ControlState", control("series"), 2),
+    ("ScanParameters2d", model.ScanParameters(REGION, (4, 4)), 3),
+    ("ScopeStateMsg", status(ScopeState.SCANNING), 10),
+    ("ScanLines", lines(0, 2), 12),
+    ("Scan2d", scan("Height", 14), 14),
+    ("ScopeStateMsg", status(ScopeState.FREE), 15),
+    ("ScopeStateMsg", status(ScopeState.SCANNING), 20),
+    ("ScanLines", lines(0, 1, began_s=20), 21),
+    ("ControlState", control(None, TIP), 22),
+    ("JournalEntries", entry(22, "flags tip-shape-changed"), 23),
+    ("ScopeStateMsg", status(ScopeState.INTERRUPTED), 24),
+    ("ScopeStateMsg", status(ScopeState.FREE), 25),
+    ("ControlState", control("corrector", TIP), 26),
+    ("ProcessStates", model.ProcessStates(30 * S, "lab", (process(ProcessCondition.BUSY, 29),)), 30),
+    ("JournalEntries", entry(31, "sets scan-speed to 1 m/s", 9, "series", "at most 1e-5 m/s"), 31),
+    ("LogLines", model.LogLines((model.LogLine(32 * S, "series", "WARNING", "the tip is blunt"),)), 32),
+    ("ControlState", control("corrector"), 35),
+    ("ControlState", control(None, mode=ControlMode.MANUAL), 40),
+]
+
+
+def seen(*packets: tuple[str, object, int]) -> Overview:
+    overview = Overview()
+    for message, thing, time_s in packets:
+        overview.take(message, thing, time_s * S)
+    return overview
+
+
+def test_newest_of_each_state_is_kept() -> None:
+    night = seen(*NIGHT)
+    assert night.status == status(ScopeState.FREE)
+    assert night.control == control(None, mode=ControlMode.MANUAL)
+    assert night.scan_parameters == model.ScanParameters(REGION, (4, 4))
+    assert night.newest_ns == 40 * S
+
+
+def test_control_lies_in_spans_with_its_holder() -> None:
+    spans = [(s.label, s.start_ns // S, s.end_ns and s.end_ns // S) for s in seen(*NIGHT).controls.spans]
+    assert spans == [("series", 2, 22), ("corrector", 26, 40)]
+
+
+def test_mode_is_a_lane_too_and_the_present_has_no_end() -> None:
+    now = seen(*NIGHT).modes.now
+    assert now is not None
+    assert (now.label, now.start_ns, now.end_ns) == ("manual", 40 * S, None)
+
+
+def test_a_problem_is_told_with_who_flagged_it() -> None:
+    (span,) = seen(*NIGHT).problem_lanes[TIP].spans
+    assert (span.label, span.start_ns, span.end_ns) == ("tip-shape-changed", 22 * S, 35 * S)
+    assert span.by == "classifier"
+
+
+def test_a_scan_has_its_beginning_and_who_was_in_control() -> None:
+    whole = seen(*NIGHT).scans[0]
+    assert (whole.began_ns, whole.time_ns, whole.holder, whole.interrupted) == (10 * S, 14 * S, "series", False)
+
+
+def test_an_interrupted_scan_is_kept_and_marked_where_lines_came() -> None:
+    part = seen(*NIGHT).scans[1]
+    assert part.interrupted
+    assert (part.began_ns, part.time_ns, part.shape, part.holder) == (20 * S, 24 * S, (4, 4), "series")
+
+
+def test_channels_of_a_scan_are_entries_of_their_own() -> None:
+    night = Overview()
+    night.take("Scan2d", scan("Height", 5), 6 * S, "Scan2d_1000.0_Height")
+    night.take("Scan2d", scan("Phase", 5), 7 * S, "Scan2d_1000.0_Phase")
+    assert [one.channel for one in night.scans] == ["Height", "Phase"]
+
+
+def test_what_was_taken_before_changes_nothing() -> None:
+    once, twice = seen(*NIGHT), seen(*NIGHT, *NIGHT)
+    for _ in range(2):
+        for message, thing, time_s in NIGHT[::3]:
+            twice.take(message, thing, time_s * S)
+    assert facts(twice) == facts(once)
+
+
+def facts(night: Overview) -> list[object]:
+    lanes = [night.controls, night.modes, night.states, *night.problem_lanes.values(), *night.process_lanes.values()]
+    told = [night.scans, night.spectra, night.drift, list(night.log), list(night.entries), list(night.refusals)]
+    return [*told, night.control, night.status, night.processes, [list(lane.spans) for lane in lanes]]
+
+
+def test_a_refusal_is_kept_with_its_reason() -> None:
+    (refused,) = seen(*NIGHT).refusals
+    assert (refused.who, refused.reason) == ("series", "at most 1e-5 m/s")
+
+
+def test_log_is_bounded() -> None:
+    night = Overview()
+    for k in range(3):
+        batch = tuple(model.LogLine(i, "series", "INFO", f"{k} {i}") for i in range(MOST_LINES))
+        night.take("LogLines", model.LogLines(batch), k + 1)
+    assert len(night.log) == MOST_LINES
+    assert night.log[-1].text == f"2 {MOST_LINES - 1}"
+
+
+def test_busy_is_alive_in_the_time_line_but_not_in_the_present() -> None:
+    night = seen(
+        ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.ALIVE, 1),)), 1),
+        ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.BUSY, 3),)), 3),
+    )
+    assert [span.label for span in night.process_lanes["series"].spans] == ["alive"]
+    assert night.processes["series"].condition is ProcessCondition.BUSY
+
+
+def test_a_restart_is_told_once_with_how_it_had_ended() -> None:
+    again = process(ProcessCondition.ALIVE, 5, 2, "killed")
+    night = seen(
+        ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.ALIVE, 1),)), 1),
+        ("ProcessStates", model.ProcessStates(5 * S, "lab", (again,)), 5),
+        ("ProcessStates", model.ProcessStates(7 * S, "lab", (again,)), 7),
+    )
+    assert [(one.name, one.starts, one.last_exit) for one in night.restarts] == [("series", 2, "killed")]
+
+
+def test_a_running_scan_tells_how_far_it_is_by_its_lines() -> None:
+    night = seen(*NIGHT[:5])
+    assert night.running is not None
+    assert night.running.rows == (2, 4)
+    assert night.running.progress(12 * S) == (0.5, 2 * S)
+
+
+def test_a_running_scan_without_lines_is_compared_with_those_before() -> None:
+    night = seen(*[one for one in NIGHT[:8] if one[0] != "ScanLines"])
+    assert night.running is not None
+    assert night.running.progress(22 * S) is None
+    assert night.running.progress(22 * S, night.recent_scans) == (0.5, 2 * S)
+
+
+def test_a_running_scan_is_none_when_it_is_over() -> None:
+    assert seen(*NIGHT).running is None
+
+
+def test_drift_is_the_displacement_of_the_sample() -> None:
+    message = wire.message_type("DriftMapping")(
+        matrix=[1, 0, -2e-9, 0, 1, 3e-9], center=[0, 0], rate=[1e-12, 0], matched=True, lost=False
+    )
+    message.timestamp.FromNanoseconds(5 * S)
+    night = Overview()
+    night.take("DriftMapping", message, 6 * S)
+    (point,) = night.drift
+    assert point.time_ns == 5 * S
+    assert point.translation_m == pytest.approx((2e-9, -3e-9))
+    assert point.rate_m_s == (1e-12, 0.0)
+
+
+def test_a_spectrum_is_told_with_its_place() -> None:
+    curve = model.Spectrum((1e-9, 2e-9), "IV", ("V", "I"), ("V", "A"), np.zeros((3, 2)), 4 * S)
+    (told,) = seen(("ControlState", control("grid"), 1), ("Spec1d", curve, 5)).spectra
+    assert (told.time_ns, told.position_m, told.kind, told.holder) == (4 * S, (1e-9, 2e-9), "IV", "grid")
+
+
+def test_unknown_messages_are_passed_over() -> None:
+    night = seen(("Own", object(), 1))
+    assert night.newest_ns == S
