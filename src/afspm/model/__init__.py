@@ -23,6 +23,7 @@ from afspm.model.journal import (
     ProcessCondition,
     ProcessState,
     ProcessStates,
+    Progress,
     Told,
     component_of,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "ProcessCondition",
     "ProcessState",
     "ProcessStates",
+    "Progress",
     "Region",
     "RegionChange",
     "Request",

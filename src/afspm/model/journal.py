@@ -114,8 +114,21 @@ class LogLines:
 
 
 @dataclass(frozen=True, slots=True)
+class Progress:
+    """How far the component `name` is with what it set out to do: `done` of `of`, of whatever it counts."""
+
+    time_ns: int
+    name: str
+    done: int
+    of: int
+
+
+@dataclass(frozen=True, slots=True)
 class Told:
-    """A packet that a supervisor has the scheduler publish: one of ProcessStates or LogLines."""
+    """What the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress of a component.
+
+    Its envelope is the message's name, for ProcessStates and Progress followed by "_" and whose it is.
+    """
 
     message: str
     payload: bytes

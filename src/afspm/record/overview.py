@@ -25,6 +25,7 @@ from afspm.model import (
     ProcessCondition,
     ProcessState,
     ProcessStates,
+    Progress,
     Region,
     Scan,
     ScanLines,
@@ -292,6 +293,9 @@ class Overview:
             if state.starts > (before.starts if before else 1):
                 self.restarts.append(Restart(state.since_ns, state.name, state.starts, state.last_exit))
 
+    def _take_progress(self, progress: Progress, time_ns: int) -> None:
+        self.progress[progress.name] = (progress.done, progress.of)
+
     def _take_log(self, lines: LogLines, time_ns: int) -> None:
         self.log.extend(lines.lines)
 
@@ -336,5 +340,6 @@ _TAKERS: dict[str, Callable[[Overview, Any, int], None]] = {
     "JournalEntries": Overview._take_entries,
     "ProcessStates": Overview._take_processes,
     "LogLines": Overview._take_log,
+    "Progress": Overview._take_progress,
     "DriftMapping": Overview._take_mapping,
 }

@@ -233,6 +233,7 @@ _ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
     model.JournalEntries: _plain_encoder("JournalEntries", journal.entries_to_wire),
     model.ProcessStates: _plain_encoder("ProcessStates", journal.processes_to_wire),
     model.LogLines: _plain_encoder("LogLines", journal.log_to_wire),
+    model.Progress: _plain_encoder("Progress", journal.progress_to_wire),
     model.Told: _plain_encoder("Told", journal.told_to_wire),
 }
 
@@ -249,6 +250,7 @@ _DECODERS: dict[str, Callable[[Buffer], Any]] = {
     "JournalEntries": journal.entries_from_wire,
     "ProcessStates": journal.processes_from_wire,
     "LogLines": journal.log_from_wire,
+    "Progress": journal.progress_from_wire,
 }
 
 _HEADERS: dict[str, Callable[[Buffer], model.PacketHeader]] = {

@@ -98,6 +98,16 @@ def log_from_wire(payload: Buffer) -> model.LogLines:
     )
 
 
+def progress_to_wire(progress: model.Progress) -> journal_pb2.Progress:
+    stamp = timestamp(progress.time_ns)
+    return journal_pb2.Progress(timestamp=stamp, name=progress.name, done=progress.done, of=progress.of)
+
+
+def progress_from_wire(payload: Buffer) -> model.Progress:
+    message = parse(journal_pb2.Progress, payload)
+    return model.Progress(time_ns(message.timestamp), message.name, message.done, message.of)
+
+
 def told_to_wire(told: model.Told) -> journal_pb2.Told:
     return journal_pb2.Told(message=told.message, payload=told.payload)
 

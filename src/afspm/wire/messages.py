@@ -36,6 +36,7 @@ from afspm.wire.generated.journal_pb2 import (
     Orders,
     ProcessState,
     ProcessStates,
+    Progress,
     Told,
 )
 from afspm.wire.generated.lines_pb2 import ScanLines
@@ -49,9 +50,10 @@ _messages: dict[str, type[Message]] = {
     for message in (
         ActionMsg, ControlState, DataAspects, DriftMapping, DriftRescan, FeedbackAnalysis, JournalEntries,
         JournalEntry, LogLine, LogLines, Orders, ParameterMsg, Point2d, Point2u, ProbePosition, ProcessState,
-        ProcessStates, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d, ScanLines, ScanParameters2d, ScopeStateMsg,
-        Size2d, Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore, SpatialPointWithScoreList,
-        SpatialROIWithScore, SpatialROIWithScoreList, Spec1d, SpecData, Told, ZCtrlParameters,
+        ProcessStates, Progress, Rect2d, Rect2i, RotRect2d, RotRect2i, Scan2d, ScanLines, ScanParameters2d,
+        ScopeStateMsg, Size2d, Size2u, Size3u, SpatialAspects, SpatialPoint, SpatialPointWithScore,
+        SpatialPointWithScoreList, SpatialROIWithScore, SpatialROIWithScoreList, Spec1d, SpecData, Told,
+        ZCtrlParameters,
     )
 }  # fmt: skip
 

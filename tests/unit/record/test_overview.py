@@ -198,3 +198,10 @@ def test_a_spectrum_is_told_with_its_place() -> None:
 def test_unknown_messages_are_passed_over() -> None:
     night = seen(("Own", object(), 1))
     assert night.newest_ns == S
+
+
+def test_progress_is_the_newest_of_each_component() -> None:
+    night = Overview()
+    for name, done, time_s in (("series", 3, 1), ("grid", 1, 2), ("series", 4, 3)):
+        night.take("Progress", model.Progress(time_s * S, name, done, 9), time_s * S, f"Progress_{name}")
+    assert night.progress == {"series": (4, 9), "grid": (1, 9)}
