@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.rows import MEASUREMENTS, Row
 
-MODULES = ("codec", "control", "scans", "late_joiner", "translator", "experiment")
+MODULES = ("codec", "control", "scans", "late_joiner", "translator", "controllers", "reading", "experiment")
 RESULT = Path("build/bench.json")
 
 

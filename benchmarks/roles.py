@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
+from pathlib import Path
 from typing import Any
 
 import zmq
 
 from afspm import wire
 from afspm.clock import ExperimentClock
+from afspm.emulators import known
 from afspm.errors import WireError
 from afspm.model import Response
 from afspm.transport.network import Network
@@ -61,6 +64,12 @@ def translator() -> None:
                 except WireError as error:
                     response = Response(error.response, reason=str(error))
                 port.reply(wire.encode_response(response))
+
+
+def emulator(vendor: str, folder: str) -> None:
+    """An emulated controller."""
+    made = known.emulator(vendor)(port=0)
+    made.run(ExperimentClock.real(), Path(folder), logging.getLogger(vendor), ready)
 
 
 def bare_packet_proxy(publisher: str, queue: int) -> None:

@@ -1,0 +1,138 @@
+"""What the translators of vendors' controllers add of their own to a request: all but the wait for the controller.
+
+The emulated controllers are processes of their own, and what they take is not counted.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import wraps
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+from afspm import wire
+from afspm.microscopes.asylum import Asylum
+from afspm.microscopes.asylum.link import Link as AsylumLink
+from afspm.microscopes.gxsm import Gxsm
+from afspm.microscopes.gxsm.bridge_client import BridgeLink
+from afspm.microscopes.microscope import Microscope
+from afspm.microscopes.nanonis import Nanonis
+from afspm.microscopes.nanonis.link import Link as NanonisLink
+from afspm.microscopes.translator import Translator
+from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
+from afspm.runtime.memory import Memory
+from afspm.transport.port import RequestReceived, Served
+from benchmarks.processes import CLOCK, Roles, roles
+from benchmarks.rows import Row, measurement
+
+REQUESTS = 200
+AT_MOST_MS = 1.0
+VENDORS: dict[str, tuple[type[Microscope], type]] = {
+    "asylum": (Asylum, AsylumLink),
+    "nanonis": (Nanonis, NanonisLink),
+    "gxsm": (Gxsm, BridgeLink),
+}
+"""The microscope, and its link to the controller, of which `_exchange` waits for the answer."""
+FRAME = ScanParameters(Region((1e-7, -5e-8), (4e-7, 3e-7), 0.1), (48, 64), "m")
+
+
+class Waiting:
+    """How long was waited for a controller."""
+
+    def __init__(self) -> None:
+        self.s = 0.0
+
+    @contextmanager
+    def counted(self, link: Any) -> Iterator[None]:
+        plainly = link._exchange
+
+        @wraps(plainly)
+        def timed(*arguments: Any) -> Any:
+            began = perf_counter()
+            try:
+                return plainly(*arguments)
+            finally:
+                self.s += perf_counter() - began
+
+        link._exchange = timed
+        try:
+            yield
+        finally:
+            link._exchange = plainly
+
+
+class Answers:
+    """A network that nothing is lost in and that takes no time. It knows when it was given the last answer, and how
+    long was waited for the controller until then."""
+
+    def __init__(self, waiting: Waiting) -> None:
+        self.clock = CLOCK
+        self.last: Sequence[bytes] = ()
+        self.at_s = self.waited_s = 0.0
+        self._waiting = waiting
+
+    def poll(self, timeout_s: float | None) -> list[Served]:
+        return []
+
+    def reply(self, frames: Sequence[bytes] | None) -> None:
+        self.at_s, self.waited_s, self.last = perf_counter(), self._waiting.s, frames or ()
+
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None: ...
+
+    def wake_up(self, incoming: Served | None = None) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def translator(vendor: str, processes: Roles, folder: Path, port: Answers) -> Translator:
+    """A translator in this process, connected to an emulated controller in another."""
+    address = processes.start("emulator", vendor=vendor, folder=str(folder / "files"))
+    microscope: Any = VENDORS[vendor][0]
+    memory = Memory(folder / "state.json", synced=False)
+    made = Translator(microscope(address=address), port, memory, folder, logging.getLogger("benchmark"))
+    made.look()
+    return made
+
+
+def own_s(made: Translator, port: Answers, waiting: Waiting, request: Request) -> float:
+    """From a request to its answer, less the wait for the controller."""
+    frames = wire.encode_request(request)
+    waiting.s, began = 0.0, perf_counter()
+    made.handle(RequestReceived(frames))
+    response = wire.decode_response(port.last)
+    assert response.ok, response.reason
+    return port.at_s - began - port.waited_s
+
+
+@measurement
+def controllers() -> Iterator[Row]:
+    bias = [Parameter(names.TIP_BIAS_VOLTAGE, text, "V") for text in ("0.1", "0.2")]
+    speed = [Parameter(names.SCAN_SPEED, text, "m/s") for text in ("1e-6", "2e-6")]
+    frames = [FRAME, ScanParameters(FRAME.region.moved_to((0.0, 0.0)), FRAME.shape, "m")]  # type: ignore[union-attr]
+    for vendor, (_, link) in VENDORS.items():
+        port = Answers(waiting := Waiting())
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(TemporaryDirectory()))
+            made = translator(vendor, stack.enter_context(roles()), folder, port)
+            stack.callback(made.microscope.close)
+            stack.enter_context(waiting.counted(link))
+            asked = [Parameter(names.SCAN_SPEED, None, None)]
+            set_ = bias if names.TIP_BIAS_VOLTAGE in made.microscope.table else speed
+            for what, kind, subjects in (
+                ("a value asked for", ControlRequest.PARAM, asked),
+                ("a value set", ControlRequest.PARAM, set_),
+                ("a frame set", ControlRequest.SET_SCAN_PARAMS, frames),
+            ):
+                times = []
+                for number in range(REQUESTS):
+                    request = Request(kind, subjects[number % len(subjects)], id=f"{what}/{number}")  # type: ignore[index]
+                    times.append(own_s(made, port, waiting, request))
+                    while made.microscope.status().state is not ScopeState.FREE:
+                        pass
+                    made.look()
+                yield Row(f"{vendor}'s translator, {what}", "ms", median(times) * 1e3, None, AT_MOST_MS)
