@@ -45,10 +45,9 @@ class BridgeLink:
 
     def call(self, method: str, *arguments: str | int | float) -> Any:
         """Call a function of GXSM (see `Link`)."""
+        message = json.dumps([method, *arguments]).encode() + b"\n"
         try:
-            self._socket.settimeout(self._timeout_s)
-            self._socket.sendall(json.dumps([method, *arguments]).encode() + b"\n")
-            reply = _reply(self._line(method))
+            reply = _reply(self._exchange(method, message))
         except TimeoutError as error:
             self.close()
             what = f"no answer to {method} within {self._timeout_s:g} s"
@@ -70,8 +69,11 @@ class BridgeLink:
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
-    def _line(self, method: str) -> bytes:
+    def _exchange(self, method: str, message: bytes) -> bytes:
+        """The line that is replied."""
         until_s = self._monotonic_s() + self._timeout_s
+        self._socket.settimeout(self._timeout_s)
+        self._socket.sendall(message)
         parts: list[bytes] = []
         size = 0
         while not (parts and parts[-1].endswith(b"\n")):
@@ -92,7 +94,7 @@ class BridgeLink:
 
 def _reply(line: bytes) -> dict[str, Any]:
     try:
-        reply = json.loads(line, object_hook=_unpacked)
+        reply = _REPLY.decode(line.decode())
     except (ValueError, RecursionError) as error:
         raise BadReply(f"the bridge replied what is none: {error}") from error
     if not isinstance(reply, dict) or len(reply) != 1 or not reply.keys() <= {"value", "error"}:
@@ -110,3 +112,6 @@ def _unpacked(found: dict[str, Any]) -> Any:
     if len(content) != math.prod(shape) * np.dtype(kind).itemsize:
         raise BadReply(f"the bridge replied {len(content)} bytes for an array of shape {shape!r:.100}")
     return np.frombuffer(content, kind).reshape(shape)
+
+
+_REPLY: Final = json.JSONDecoder(object_hook=_unpacked)

@@ -76,8 +76,9 @@ class Frame:
 
     def write(self, values: Mapping[str, Value]) -> None:
         """Change what is given. X goes before Y: setting one in x, GXSM changes that in y."""
-        region, (rows, columns) = frame({**self.read(), **values})
         asked = values.keys()
+        before = {} if asked >= set(FRAME) else self.read()
+        region, (rows, columns) = frame({**before, **values})
         if asked & _PIXELS:
             self._send("PointsX", columns)
             self._send("PointsY", rows)
