@@ -1,0 +1,81 @@
+"""A controller crashes in the middle of a scan: that is a malfunction, and the night goes on when it is back."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from experiment_lab import AFSPM, WITNESS, AfspmRun
+
+from afspm.supervisor.ports import FreePorts
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+
+FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
+ADDRESSES = {"nanonis": "127.0.0.1:{port}", "asylum": "tcp://127.0.0.1:{port}", "gxsm": "127.0.0.1:{port}"}
+SCANS = 3
+OVERLAY = """
+[clock]
+speed = 30.0
+
+[control]
+malfunction_after = "0.2 s"
+
+[controller]
+port = {port}
+
+[microscope]
+address = "{address}"
+reply_timeout_s = "1 s"
+
+[details]
+end_when_done = false
+
+[witness]
+component = true
+class = "witness.Witness"
+scans = 3
+
+[cache]
+history = {{ Scan2d = 20 }}
+"""
+
+
+@pytest.fixture(params=sorted(ADDRESSES))
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[AfspmRun]:
+    (tmp_path / "witness.py").write_text(WITNESS, encoding="utf-8")
+    port = FreePorts().take()
+    address = ADDRESSES[request.param].format(port=port)
+    (tmp_path / "overlay.toml").write_text(OVERLAY.format(port=port, address=address), encoding="utf-8")
+    files = (str(FILES / "experiment.toml"), str(FILES / f"{request.param}.toml"), str(tmp_path / "overlay.toml"))
+    command = (*AFSPM, "run", *files, "--runs", str(tmp_path / "runs"), "--verbose")
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=tmp_path
+    )
+    yield AfspmRun(process)
+    process.kill()
+    process.wait()
+
+
+def test_a_controller_that_is_killed_while_it_scans_is_a_malfunction_until_it_is_back(run: AfspmRun) -> None:
+    run.wait_for("details .*scan 1 of 3 at")
+    run.wait_for_next(" witness ", "state SCANNING")
+    cleared_before = run.output.count("device-malfunction is cleared")
+    run.signal("controller", signal.SIGKILL)
+    run.wait_for_next("ERROR the controller can't be reached or trusted, it is tried again: ")
+    run.wait_for_next("device-malfunction is flagged by translator; details is no longer in control")
+    run.wait_up("controller", times=2)
+    run.wait_for("device-malfunction is cleared by translator", count=cleared_before + 1)
+    assert run.end() == 0, run.output
+    run.wait_for(" microscope ", "the controller answers")
+    run.wait_for("controller was restarted once")
+    run.wait_for(f"measured: {SCANS} scans")
+    seen = run.witnessed()
+    assert set(seen.values()) == {1}, run.output
+    channels = {channel for channel, _, _ in seen}
+    for channel in channels:
+        assert len([key for key in seen if key[0] == channel]) == SCANS, run.output
