@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+from afspm.clock import NS_PER_S
 from afspm.components.plan import XY, Rhythm, ScanPlan, Step, grid_centers, rounds_within, squares
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region, names
@@ -88,6 +89,8 @@ class PlannedScans(Component):
         self.memory.save()
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted and taken again: %s", step.key, interruption)
+        if self.plan.total is not None:
+            self.scope.progress(step.index + 1, self.plan.total, began_ns=round(self.memory["start_s"] * NS_PER_S))
         self.log.info("scan %d%s %s", step.index + 1, self._of_total(), _told(scans.time))
 
     def _of_total(self) -> str:

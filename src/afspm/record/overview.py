@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ from afspm.model import (
 )
 from afspm.model.geometry import XY
 from afspm.record.lanes import Lane, Span
-from afspm.record.running import RunningScan
+from afspm.record.running import DoneScan, RunningScan
 
 __all__ = ["DriftPoint", "Lane", "Overview", "Restart", "RunningScan", "ScanTaken", "Span", "SpectrumTaken"]
 
@@ -44,6 +44,7 @@ MOST_LINES = 2_000
 MOST_ENTRIES = 5_000
 MOST_MEASURED = 100_000
 SOON_NS = 1_000_000_000
+COMPARED = 5  # scans before, by which it is told how long one takes
 NOBODY = None
 
 
@@ -127,7 +128,7 @@ class Overview:
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
         status, control, scan_parameters, feedback, probe_position: the newest of each; None before the first.
-        processes, progress: by name; progress as (done, of).
+        processes, told_progress: by name.
         log, entries, refusals: newest last, bounded.
         controls: lane of who was in control; `modes`, `states`: lanes of mode and scope state, in lower case.
         problem_lanes: by number; `process_lanes`: by name. A process that is busy counts as alive.
@@ -143,7 +144,7 @@ class Overview:
         self.feedback: Feedback | None = None
         self.probe_position: ProbePosition | None = None
         self.processes: dict[str, ProcessState] = {}
-        self.progress: dict[str, tuple[int, int]] = {}
+        self.told_progress: dict[str, Progress] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
         self.refusals: deque[JournalEntry] = deque(maxlen=most_entries)
@@ -152,6 +153,7 @@ class Overview:
         self.process_lanes: defaultdict[str, Lane] = defaultdict(Lane)
         self.restarts: deque[Restart] = deque(maxlen=most_entries)
         self.running: RunningScan | None = None
+        self._done: deque[DoneScan] = deque(maxlen=20)
         self._scans: dict[tuple[object, ...], ScanTaken] = {}
         self._spectra: dict[tuple[object, ...], SpectrumTaken] = {}
         self._drift: dict[int, DriftPoint] = {}
@@ -173,14 +175,21 @@ class Overview:
         return tuple(self._drift.values())
 
     @property
+    def progress(self) -> dict[str, tuple[int, int]]:
+        """(done, of) of each component that says how far it is."""
+        return {name: (told.done, told.of) for name, told in self.told_progress.items()}
+
+    @property
     def control_since_ns(self) -> int | None:
         """Since when whoever is in control is, or nobody is; None if nothing is known."""
         return self.controls.changed_ns
 
-    @property
-    def recent_scans(self) -> list[ScanTaken]:
-        """The channels of some scans before, newest first; costs little however many there are."""
-        return list(islice(reversed(self._scans.values()), 40))
+    def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
+        """Of the running scan: (the part that is done, 0 to 1, and how many ns remain); None if that is not known."""
+        if self.running is None:
+            return None
+        took_ns = [scan.took_ns for scan in reversed(self._done) if scan.resembles(self.running)][:COMPARED]
+        return self.running.progress(now_ns, round(median(took_ns)) if took_ns else None)
 
     def take(self, message: str, thing: Any, time_ns: int, envelope: str = "") -> None:
         """Take in what was published.
@@ -208,6 +217,8 @@ class Overview:
                 holder = self.control.holder if self.control else None
                 self.running = RunningScan(time_ns if before else None, holder, self.scan_parameters)
             return
+        if status.state is ScopeState.FREE and self.running is not None and self.running.began_ns is not None:
+            self._done.append(DoneScan(self.running.parameters, time_ns - self.running.began_ns))
         if status.state is ScopeState.INTERRUPTED and self.running is not None:
             self._take_interrupted(self.running, time_ns)
         if status.state in (ScopeState.FREE, ScopeState.INTERRUPTED):
@@ -294,7 +305,7 @@ class Overview:
                 self.restarts.append(Restart(state.since_ns, state.name, state.starts, state.last_exit))
 
     def _take_progress(self, progress: Progress, time_ns: int) -> None:
-        self.progress[progress.name] = (progress.done, progress.of)
+        self.told_progress[progress.name] = progress
 
     def _take_log(self, lines: LogLines, time_ns: int) -> None:
         self.log.extend(lines.lines)

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from afspm.model import Region, ScanLines, ScanParameters
-
-COMPARED = 5  # scans before, by which it is told how long one takes
 
 
 @dataclass(slots=True)
@@ -22,19 +17,17 @@ class Lines:
     rows: set[int] = field(default_factory=set)
 
 
-class Taken(Protocol):
-    """A scan taken before."""
+@dataclass(frozen=True, slots=True)
+class DoneScan:
+    """How long a scan took, with the parameters that were in force; None if they were not known."""
 
-    @property
-    def time_ns(self) -> int: ...
-    @property
-    def began_ns(self) -> int | None: ...
-    @property
-    def shape(self) -> tuple[int, int]: ...
-    @property
-    def region(self) -> Region: ...
-    @property
-    def interrupted(self) -> bool: ...
+    parameters: ScanParameters | None
+    took_ns: int
+
+    def resembles(self, other: RunningScan) -> bool:
+        """Whether both are of the same size and pixels, as far as is known."""
+        ours, theirs = _extent(self.parameters), _extent(other.parameters)
+        return ours is None or theirs is None or ours == theirs
 
 
 @dataclass(slots=True)
@@ -70,34 +63,24 @@ class RunningScan:
         lines = max(self.channels.values(), key=lambda one: len(one.rows))
         return len(lines.rows), lines.shape[0]
 
-    def expected_ns(self, before: Iterable[Taken]) -> int | None:
-        """How long it should take: as those before of the same size and pixels did. None if there were none.
+    def progress(self, now_ns: int, expected_ns: int | None = None) -> tuple[float, int] | None:
+        """(the part that is done, 0 to 1, and how many ns remain); None if nothing is known to tell it by.
 
         Args:
-            before: newest first.
+            expected_ns: how long such a scan takes; None: told by its lines.
         """
-        if self.parameters is None or not isinstance(self.parameters.region, Region):
-            return None
-        size_m, shape = self.parameters.region.size_m, self.parameters.shape
-        took = {
-            scan.time_ns: scan.time_ns - scan.began_ns
-            for scan in before
-            if scan.began_ns is not None
-            and not scan.interrupted
-            and (scan.region.size_m, scan.shape) == (size_m, shape)
-        }
-        durations = list(took.values())[:COMPARED]
-        return round(statistics.median(durations)) if durations else None
-
-    def progress(self, now_ns: int, before: Iterable[Taken] = ()) -> tuple[float, int] | None:
-        """(the part that is done, 0 to 1, and how many ns remain); None if nothing is known to tell it by."""
         if self.began_ns is None:
             return None
         gone_ns, rows = max(0, now_ns - self.began_ns), self.rows
-        expected_ns = self.expected_ns(before)
         if expected_ns:
             return min(1.0, gone_ns / expected_ns), max(0, expected_ns - gone_ns)
         if rows is None or not rows[0]:
             return None
         part = rows[0] / rows[1]
         return part, round(gone_ns * (1.0 - part) / part)
+
+
+def _extent(parameters: ScanParameters | None) -> tuple[object, object] | None:
+    if parameters is None or not isinstance(parameters.region, Region):
+        return None
+    return parameters.region.size_m, parameters.shape

@@ -10,7 +10,7 @@ from typing import Any
 from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
-from afspm.model import ControlRequest, Packet, Request, Response
+from afspm.model import TELL_REQUEST, ControlRequest, Packet, Request, Response, Told
 from afspm.runtime.process import Activity
 from afspm.runtime.stopping import StopRequested
 from afspm.runtime.view import KEPT, View
@@ -200,6 +200,12 @@ class Link:
     def send_only(self, kind: ControlRequest, subject: Any = None) -> None:
         """Ask without waiting for the answer, for what is done on the way out."""
         self.port.send(wire.encode_request(Request(kind, subject, id=self.next_id())))
+
+    def tell(self, thing: Any) -> None:
+        """Have the scheduler publish something of ours, and don't wait for it."""
+        if self._ids_are_echoed:  # else its answer could be taken for that to the next request
+            told = Told(*wire.encode(thing))
+            self.port.send(wire.encode_request(Request(TELL_REQUEST, told, id=self.next_id())))
 
     def until(self, timeout_s: float | None) -> float | None:
         """A timeout as the moment, in monotonic time, when it is over."""

@@ -20,6 +20,7 @@ from afspm.model import (
     ProbePosition,
     Problem,
     ProblemNames,
+    Progress,
     Region,
     Response,
     ScanParameters,
@@ -226,6 +227,15 @@ class Scope:
         self._link.wait_caught_up()  # else the signal might pass before we listen
         with suppress(ExperimentEnded):  # it may come before the answer
             self._tell(ControlRequest.END_EXPERIMENT, None)
+
+    def progress(self, done: int, of: int, *, began_ns: int | None = None) -> None:
+        """Say how far one is with what one set out to do, for those who look on. Costs nothing, and waits for nobody.
+
+        Args:
+            done, of: how many of how many, of whatever is counted.
+            began_ns: experiment time of the first, from which it is told how long the rest will take.
+        """
+        self._link.tell(Progress(self._link.clock.now_ns(), self._link.name, done, of, began_ns))
 
     # --- looking ---
 

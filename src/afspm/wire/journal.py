@@ -99,13 +99,19 @@ def log_from_wire(payload: Buffer) -> model.LogLines:
 
 
 def progress_to_wire(progress: model.Progress) -> journal_pb2.Progress:
-    stamp = timestamp(progress.time_ns)
-    return journal_pb2.Progress(timestamp=stamp, name=progress.name, done=progress.done, of=progress.of)
+    return journal_pb2.Progress(
+        timestamp=timestamp(progress.time_ns),
+        name=progress.name,
+        done=progress.done,
+        of=progress.of,
+        began=None if progress.began_ns is None else timestamp(progress.began_ns),
+    )
 
 
 def progress_from_wire(payload: Buffer) -> model.Progress:
     message = parse(journal_pb2.Progress, payload)
-    return model.Progress(time_ns(message.timestamp), message.name, message.done, message.of)
+    began_ns = time_ns(message.began) if message.HasField("began") else None
+    return model.Progress(time_ns(message.timestamp), message.name, message.done, message.of, began_ns)
 
 
 def told_to_wire(told: model.Told) -> journal_pb2.Told:

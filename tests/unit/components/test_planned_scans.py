@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 from runtime_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
 
+from afspm import wire
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
-from afspm.model import ControlRequest, Problem
+from afspm.model import TELL_REQUEST, ControlRequest, Problem
 from afspm.runtime.component import Component
 from afspm.runtime.exit_codes import ExitCode
 
@@ -113,3 +114,38 @@ def test_a_spectrum_is_taken_at_each_point_of_a_grid() -> None:
     run(SpectroscopyGrid(counts=(2, 2), spacing=(1e-7, 1e-7), repeats=2, end_when_done=True), lab)
     assert lab.begun_scans == 8
     assert lab.control.ended
+
+
+def told_progress(lab: Lab) -> list[tuple[str, int, int]]:
+    told = [request.subject for request in lab.requests if request.kind == TELL_REQUEST]
+    progress = [wire.decode(one.message, one.payload) for one in told]
+    return [(one.name, one.done, one.of) for one in progress]
+
+
+def test_those_who_look_on_are_told_how_far_it_is() -> None:
+    lab = Lab("series")
+    run(series(), lab)
+    assert told_progress(lab) == [("series", 1, 3), ("series", 2, 3), ("series", 3, 3)]
+
+
+def test_a_series_without_end_tells_no_progress() -> None:
+    lab = Lab("series")
+    lab.at(2000.0, lab.kill)
+    run(ScanSeries(size=(1e-6, 1e-6), pixels=(8, 8), every=900.0), lab)
+    assert len(lab.finished) == 3
+    assert told_progress(lab) == []
+
+
+def test_a_scheduler_of_version_1_is_told_nothing() -> None:
+    """It would answer without an id, and the answer be taken for that to the next request."""
+    lab = Lab("series")
+    lab.echoes_ids = False
+    run(series(), lab)
+    assert len(lab.finished) == 3
+    assert told_progress(lab) == []
+
+
+def test_a_grid_of_spectra_tells_its_progress() -> None:
+    lab = Lab("grid")
+    run(SpectroscopyGrid(counts=(2, 1), spacing=(1e-9, 1e-9), end_when_done=True), lab)
+    assert told_progress(lab) == [("grid", 1, 2), ("grid", 2, 2)]

@@ -162,14 +162,19 @@ def test_a_running_scan_tells_how_far_it_is_by_its_lines() -> None:
     night = seen(*NIGHT[:5])
     assert night.running is not None
     assert night.running.rows == (2, 4)
-    assert night.running.progress(12 * S) == (0.5, 2 * S)
+    assert night.scan_progress(12 * S) == (0.5, 2 * S)
 
 
 def test_a_running_scan_without_lines_is_compared_with_those_before() -> None:
-    night = seen(*[one for one in NIGHT[:8] if one[0] != "ScanLines"])
-    assert night.running is not None
-    assert night.running.progress(22 * S) is None
-    assert night.running.progress(22 * S, night.recent_scans) == (0.5, 2 * S)
+    without_lines = [one for one in NIGHT[:8] if one[0] != "ScanLines"]
+    assert seen(*without_lines[:4]).scan_progress(12 * S) is None
+    assert seen(*without_lines).scan_progress(22 * S) == (0.4, 3 * S)  # the one before took 5 s
+
+
+def test_a_scan_of_other_pixels_is_not_compared_with() -> None:
+    wide = ("ScanParameters2d", model.ScanParameters(REGION, (400, 400)), 16)
+    without_lines = [*NIGHT[:4], *NIGHT[5:7], wide, NIGHT[7]]
+    assert seen(*without_lines).scan_progress(22 * S) is None
 
 
 def test_a_running_scan_is_none_when_it_is_over() -> None:
@@ -205,3 +210,11 @@ def test_progress_is_the_newest_of_each_component() -> None:
     for name, done, time_s in (("series", 3, 1), ("grid", 1, 2), ("series", 4, 3)):
         night.take("Progress", model.Progress(time_s * S, name, done, 9), time_s * S, f"Progress_{name}")
     assert night.progress == {"series": (4, 9), "grid": (1, 9)}
+
+
+def test_what_remains_is_told_by_the_pace_so_far() -> None:
+    told = model.Progress(20 * S, "series", 2, 10, began_ns=10 * S)
+    assert told.remaining_ns(25 * S) == 35 * S
+    assert told.remaining_ns(500 * S) == 0
+    assert model.Progress(20 * S, "series", 0, 10, 10 * S).remaining_ns(20 * S) is None
+    assert model.Progress(20 * S, "series", 2, 10).remaining_ns(20 * S) is None

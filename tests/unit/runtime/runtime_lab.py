@@ -14,6 +14,7 @@ import numpy as np
 from afspm import wire
 from afspm.logic import arbitration as a
 from afspm.model import (
+    TELL_REQUEST,
     ControlRequest,
     ControlResponse,
     ControlState,
@@ -102,6 +103,7 @@ class Lab:
         self._inbox: list[Incoming] = []
         self._newest_ns = 0
         self.open = True
+        self.echoes_ids = True
         self.connect()
         self.publish(ScopeStatus(self.state))
         self.publish(self.parameters)
@@ -118,7 +120,7 @@ class Lab:
         if answer == "go on":
             answer = self._answer_once(request)
         if isinstance(answer, Response):
-            answer.id = request.id
+            answer.id = request.id if self.echoes_ids else ""
             self.at(0.01, lambda: self._inbox.append(ReplyReceived(answer)))
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
@@ -258,6 +260,8 @@ class Lab:
         }
         if request.kind in asks:
             return self.does(asks[request.kind], self.name, request.subject or 0)
+        if request.kind == TELL_REQUEST:
+            return Response(ControlResponse.SUCCESS)
         reads = request.kind == ControlRequest.PARAM and request.subject.value is None
         if self.control.holder != self.name and not reads and request.kind != ControlRequest.ACTION_SUPPORT:
             return Response(ControlResponse.NOT_IN_CONTROL, reason="you are not in control")
