@@ -275,23 +275,40 @@ class Overview:
         for entry in reversed(self.entries):
             if entry.time_ns < time_ns - SOON_NS:
                 break
-            if self._flags(entry, number):
+            if not entry.refused and self._flags(entry, number):
                 return entry.who
         return ""
 
     def _flags(self, entry: JournalEntry, number: int) -> bool:
-        is_success = entry.kind == "request" and entry.response == 0
-        return is_success and entry.what.startswith("flag") and self.problems.name(number) in entry.what
+        words = entry.what.split()
+        return len(words) >= 2 and words[0] in ("flags", "flagged") and words[1] == self.problems.name(number)
 
     def _take_entries(self, entries: JournalEntries, time_ns: int) -> None:
         for entry in entries.entries:
             self.entries.append(entry)
             if entry.refused:
                 self.refusals.append(entry)
+                continue
+            if entry.kind == "control":
+                self._take_change(entry)
             for number, lane in self.problem_lanes.items():
                 # the batch comes a moment after the control state that it explains
-                if lane.spans and not lane.spans[-1].by and self._flags(entry, number):
+                is_near = bool(lane.spans) and abs(lane.spans[-1].start_ns - entry.time_ns) <= SOON_NS
+                if is_near and self._flags(entry, number):
                     lane.name_last(entry.who)
+
+    def _take_change(self, entry: JournalEntry) -> None:
+        """Control, mode or problems changed: who comes late was not there when it did, and has it from the journal."""
+        verb, _, rest = entry.what.partition(" ")
+        if entry.what.startswith("in control"):
+            self.controls.change(entry.who, entry.time_ns)
+        elif entry.what.startswith("no longer in control"):
+            self.controls.change(None, entry.time_ns)
+        elif verb == "mode":
+            self.modes.change(rest.lower(), entry.time_ns)
+        elif verb in ("flagged", "cleared") and rest in self.problems:
+            label = self.problems.name(self.problems[rest]) if verb == "flagged" else None
+            self.problem_lanes[self.problems[rest]].change(label, entry.time_ns, by=entry.who)
 
     def _take_processes(self, states: ProcessStates, time_ns: int) -> None:
         for state in states.processes:

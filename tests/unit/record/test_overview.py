@@ -218,3 +218,46 @@ def test_what_remains_is_told_by_the_pace_so_far() -> None:
     assert told.remaining_ns(500 * S) == 0
     assert model.Progress(20 * S, "series", 0, 10, 10 * S).remaining_ns(20 * S) is None
     assert model.Progress(20 * S, "series", 2, 10).remaining_ns(20 * S) is None
+
+
+def change(time_s: int, who: str, what: str) -> tuple[str, object, int]:
+    entry = model.JournalEntry(time_s * S, "control", who, what)
+    return "JournalEntries", model.JournalEntries((entry,)), time_s
+
+
+STORY = [
+    change(2, "series", "in control"),
+    change(22, "classifier", "flagged tip-shape-changed"),
+    change(23, "series", "no longer in control"),
+    change(26, "corrector", "in control to solve tip-shape-changed"),
+    change(35, "corrector", "cleared tip-shape-changed"),
+    change(36, "corrector", "no longer in control"),
+    change(40, "terminal:ada", "mode MANUAL"),
+]
+
+
+def test_who_comes_late_has_the_past_from_the_journal() -> None:
+    late = seen(*STORY, ("ControlState", control(None, mode=ControlMode.MANUAL), 41))
+    assert [(s.label, s.start_ns // S) for s in late.controls.spans] == [("series", 2), ("corrector", 26)]
+    assert late.control_since_ns == 36 * S
+    (flagged,) = late.problem_lanes[TIP].spans
+    assert (flagged.by, flagged.start_ns, flagged.end_ns) == ("classifier", 22 * S, 35 * S)
+    assert late.modes.now is not None
+    assert late.modes.now.start_ns == 40 * S
+
+
+def test_what_the_journal_says_of_what_was_seen_changes_nothing() -> None:
+    states = [one for one in NIGHT if one[0] == "ControlState"]
+    with_journal = seen(
+        *states,
+        (
+            "JournalEntries",
+            model.JournalEntries(
+                tuple(  # a batch comes a moment later
+                    entry for _, batch, _ in STORY for entry in batch.entries
+                )
+            ),
+            41,
+        ),
+    )  # type: ignore[attr-defined]
+    assert [list(seen(*states).controls.spans)] == [list(with_journal.controls.spans)]
