@@ -206,6 +206,11 @@ class Rig:
         self.occupy("crash", 2.0 * depth_m / speed_m_s)
         return outcome
 
+    def follow(self, velocity_m_per_s: tuple[float, float]) -> None:
+        """From now on the scanner moves along with the sample by itself, with this velocity (x, y)."""
+        self._wait_for_picture()
+        self.world.compensate(velocity_m_per_s, self.clock.now_s())
+
     def engage(self) -> None:
         """Bring the tip to the sample."""
         self._free_now_s()
@@ -228,14 +233,18 @@ class Rig:
     # -- inside
 
     def _free_now_s(self) -> float:
-        """The time. Raises RigBusy; waits for what is left of a picture that nobody wants any more."""
+        """The time. Raises RigBusy."""
         now_s = self.clock.now_s()
         doing = self.doing(now_s)
         if doing:
             raise RigBusy(f"the instrument is busy with a {doing}")
+        self._wait_for_picture()
+        return now_s
+
+    def _wait_for_picture(self) -> None:
+        """The world is one thread's at a time."""
         if self.scan is not None:
             wait([self.scan._drawn])
-        return now_s
 
     def _drawer(self, scan: RunningScan) -> Callable[[], Drawn]:
         direction, slope = ("up" if scan.upwards else "down"), self.slope

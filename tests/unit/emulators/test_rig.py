@@ -176,3 +176,18 @@ def test_a_picture_drawn_in_the_background_is_the_same_and_wakes_the_emulator(cl
     meanwhile.stop_scan()
     meanwhile.start_scan().channels()
     assert woken
+
+
+def test_it_follows_the_sample_with_the_velocity_that_it_is_told(rig: Rig, clock: Any) -> None:
+    rig.start_scan()
+    rig.follow((2e-9, -1e-9))
+    clock.t_s = 1100.0
+    ours = rig.start_scan().channels()["Height"][1]
+    world = World.from_settings({}, 3, 1000.0)
+    world.scan(rig.region, (8, 16), 0.5, 1000.0, rig.feedback, 0.1)
+    world.compensate((2e-9, -1e-9), 1000.0)
+    theirs = world.scan(rig.region, (8, 16), 0.5, 1100.0, rig.feedback, 0.1)
+    assert np.array_equal(ours, theirs.channels()["Height"][1])
+    world.compensate((0.0, 0.0), 1200.0)
+    elsewhere = world.scan(rig.region, (8, 16), 0.5, 1300.0, rig.feedback, 0.1).channels()["Height"][1]
+    assert np.corrcoef(ours.ravel(), elsewhere.ravel())[0, 1] < 0.999

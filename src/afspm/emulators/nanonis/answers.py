@@ -37,7 +37,6 @@ HANDLERS: Final[dict[str, Handler]] = {}
 REGISTERS_AT_FIRST: Final[dict[str, Results]] = {
     "ZCtrl.SwitchOffDelay": (0.05,),
     "ZCtrl.ZPos": (0.0,),
-    "BiasSpectr.Limits": (-1.5, 1.5),
     "BiasSpectr.Timing": (0.05, 0.0, 0.005, math.inf, 0.002, 0.001, 0.005, 0.2),
     "BiasSpectr.AdvProps": (1, 1, 0, 0),
     "ZSpectr.Range": (0.0, 120e-9),
@@ -80,8 +79,9 @@ def answer(panel: Panel, name: str, arguments: list[Any], zeros: Results) -> Ans
         panel.registers[register] = tuple(arguments)
         return ()
     if name.endswith("Get"):
-        kept = panel.registers.get(register, REGISTERS_AT_FIRST.get(register, ()))
-        return kept if len(kept) == len(zeros) else zeros
+        at_first = REGISTERS_AT_FIRST.get(register, zeros)
+        kept = panel.registers.get(register, ())
+        return (*kept, *at_first[len(kept) :])  # some tell more than can be set
     return zeros
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from afspm.emulators.nanonis.answers import Answer, Later, Nope, Results, answers, chosen
@@ -52,22 +50,53 @@ def _stop_curve(panel: Panel, name: str) -> Answer:
     return ()
 
 
-@answers("BiasSpectr.PropsSet", "ZSpectr.PropsSet")
-def _curve_props_set(panel: Panel, name: str, *props: Any) -> Answer:
-    module = _module(panel, name)
-    autosave = props[5] if module == "BiasSpectr" else props[3]
-    panel.autosave_curves[module] = bool(chosen(autosave, panel.autosave_curves[module], 1, 0))
-    panel.registers[f"{module}.Props"] = props
+@answers("BiasSpectr.PropsSet")
+def _bias_props_set(
+    panel: Panel, save_all: int, sweeps: int, backward: int, points: int, z_off_m: float, autosave: int, dialog: int
+) -> Answer:
+    return _props_set(panel, "BiasSpectr", backward, points, autosave)
+
+
+@answers("ZSpectr.PropsSet")
+def _z_props_set(
+    panel: Panel, backward: int, points: int, sweeps: int, autosave: int, dialog: int, save_all: int
+) -> Answer:
+    return _props_set(panel, "ZSpectr", backward, points, autosave)
+
+
+def _props_set(panel: Panel, module: str, backward: int, points: int, autosave: int) -> Answer:
+    sweep = panel.sweeps[_module(panel, module)]
+    on = 1
+    changed = (chosen(backward, sweep.backward, on, 0), chosen(autosave, sweep.saves, on, 0))
+    if points < 0 or points == 1:
+        raise Nope(f"a spectrum of {points} points")
+    sweep.backward, sweep.saves = map(bool, changed)
+    sweep.points = points or sweep.points
     return ()
 
 
 @answers("BiasSpectr.PropsGet", "ZSpectr.PropsGet")
 def _curve_props_get(panel: Panel, name: str) -> Answer:
-    fixed, parameters = ["X (m)", "Y (m)"], ["Sweep Start (V)"]
-    channels = ["Current (A)"]
-    if _module(panel, name) == "BiasSpectr":
-        return 0, 1, 1, 256, channels, parameters, fixed
-    return 1, 512, parameters, fixed, 1, 0
+    module = _module(panel, name)
+    sweep = panel.sweeps[module]
+    fixed, parameters, channels = ["X (m)", "Y (m)"], ["Sweep Start (V)"], ["Current (A)"]
+    if module == "BiasSpectr":
+        points = sweep.points or panel.rig.world.settings.iv.points
+        return 0, 1, int(sweep.backward), points, channels, parameters, fixed
+    points = sweep.points or panel.rig.world.settings.force.points
+    return int(sweep.backward), points, parameters, fixed, 1, 0
+
+
+@answers("BiasSpectr.LimitsSet")
+def _limits_set(panel: Panel, first_v: float, last_v: float) -> Answer:
+    panel.sweeps["BiasSpectr"].limits = (first_v, last_v)
+    return ()
+
+
+@answers("BiasSpectr.LimitsGet")
+def _limits_get(panel: Panel) -> Answer:
+    range_v = panel.rig.world.settings.iv.range_v
+    return panel.sweeps["BiasSpectr"].limits or (-range_v, range_v)
 
 
 @answers("BiasSpectr.ChsGet", "ZSpectr.ChsGet")

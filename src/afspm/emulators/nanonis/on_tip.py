@@ -164,11 +164,19 @@ def _range(panel: Panel) -> Answer:
     return panel.range_m
 
 
+@answers("Piezo.RangeSet")
+def _range_set(panel: Panel, *range_m: float) -> Answer:
+    panel.range_m = (range_m[0], range_m[1], range_m[2])
+    return ()
+
+
 @answers("Piezo.DriftCompSet")
 def _drift_set(panel: Panel, on: int, *rest: float) -> Answer:
     was_on, *_ = panel.registers.get("drift", (0,))
     x, y, z, *limit = rest
-    panel.registers["drift"] = (chosen(on, was_on, 1, 0), x, y, z, limit[0] if limit else 10.0)
+    now_on = chosen(on, was_on, 1, 0)
+    panel.rig.follow((x, y) if now_on else (0.0, 0.0))
+    panel.registers["drift"] = (now_on, x, y, z, limit[0] if limit else 10.0)
     return ()
 
 

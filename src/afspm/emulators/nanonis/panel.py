@@ -13,6 +13,7 @@ import numpy as np
 from afspm.clock import Clock
 from afspm.emulators.faults import Faults
 from afspm.emulators.nanonis import files
+from afspm.emulators.nanonis.sweeps import Sweep
 from afspm.emulators.rig import Rig
 from afspm.emulators.running import RunningScan, RunningSpectrum
 from afspm.model import Region
@@ -85,7 +86,7 @@ class Panel:
         self.last: Scanning | None = None
         self.curve: RunningSpectrum | None = None
         self.curve_name, self.curves_ended = "", 0
-        self.autosave_curves = {"BiasSpectr": True, "ZSpectr": True}
+        self.sweeps = {module: Sweep() for module in MODULES}
         self.curve_names = dict(_BASE_NAMES)
         self.ends, self.last_path = 0, ""
         self.z_controller = "on" if rig.feedback.on else "off"
@@ -149,7 +150,7 @@ class Panel:
         """Raises RigBusy."""
         kind = MODULES[module]
         self.curve_names[kind] = base_name or self.curve_names[kind]
-        self.curve = self.rig.start_spectrum(kind)
+        self.curve = self.sweeps[module].of(self.rig.start_spectrum(kind))
 
     def stop_curve(self) -> None:
         if self.curve is not None:
@@ -161,7 +162,7 @@ class Panel:
         self.curve = None
         self.curves_ended += 1
         module = next(name for name, kind in MODULES.items() if kind == curve.kind)
-        if self.autosave_curves[module] and not self.faults.lasts("autosave-off", now_s):
+        if self.sweeps[module].saves and not self.faults.lasts("autosave-off", now_s):
             content = files.dat(self._curve_header(curve, now_s), curve_columns(curve), curve.values)
             self._save(self._next_name(self.curve_names[curve.kind], 5, ".dat"), content, now_s)
 

@@ -1,0 +1,45 @@
+"""What a spectrum sweeps, had from the simulated curve, which goes over a range of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from afspm.emulators.running import RunningSpectrum
+
+
+@dataclass
+class Sweep:
+    """As the panel of a module of spectra has it.
+
+    Attributes:
+        points: how many; None: as many as the simulated curve has.
+        limits: first and last value of what is swept; None: those of the simulated curve. Beyond it nothing changes
+            any more.
+        backward: whether it is swept back, too.
+        saves: whether a file is written.
+    """
+
+    points: int | None = None
+    limits: tuple[float, float] | None = None
+    backward: bool = True
+    saves: bool = True
+
+    def of(self, curve: RunningSpectrum) -> RunningSpectrum:
+        """The same curve, swept like this."""
+        values = curve.values
+        if self.points is not None or self.limits is not None:
+            swept = values[:, 0]
+            first, last = self.limits or (swept[0], swept[-1])
+            asked = np.linspace(first, last, self.points or len(swept))
+            ascending = values[np.argsort(swept)]
+            columns = (np.interp(asked, ascending[:, 0], column) for column in ascending.T[1:])
+            values = np.stack([asked, *columns], axis=1)
+        kept = [k for k, name in enumerate(curve.names) if self.backward or not name.endswith(" Retrace")]
+        return replace(
+            curve,
+            values=values[:, kept],
+            names=tuple(curve.names[k] for k in kept),
+            units=tuple(curve.units[k] for k in kept),
+        )
