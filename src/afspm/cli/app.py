@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from afspm.cli import check, drift, emulate, graph, keys, new, run, test_translator
+from afspm.cli import check, drift, emulate, graph, keys, new, run, status, steer, test_translator
 
 app = typer.Typer(
     name="afspm",
@@ -15,6 +15,12 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run)
+app.command("status")(status.status)
+app.command("watch")(status.watch)
+app.command("pause")(steer.pause)
+app.command("resume")(steer.resume)
+app.command("end")(steer.end)
+app.command("problems")(steer.problems)
 app.command("check")(check.check)
 app.command("graph")(graph.graph)
 app.command("keys")(keys.keys)

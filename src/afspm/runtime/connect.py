@@ -22,6 +22,8 @@ from afspm.transport.launching import open_port
 RUN_FILE = "run.json"
 LATEST_FILE = "latest"
 GUEST = "guest"
+ENDED = "ended"
+"""What run.json says once a run is over: how it ended, in words."""
 JOINED_WITHIN_S = 5.0
 
 
@@ -122,7 +124,13 @@ def _newest(runs: Path, name: str, file: Path) -> Path | None:
     """The newest run of the experiment `name` in the folder `runs`."""
     name = _name_in(file) or name
     found = [run for run in runs.glob(f"*/{RUN_FILE}") if (_facts(run.parent) or {}).get("name") == name]
-    return max(found, key=lambda run: run.stat().st_mtime_ns).parent if found else None
+    return max(found, key=_started).parent if found else None
+
+
+def _started(run: Path) -> tuple[float, int]:
+    """By what the newest run is found: when its clock was set, else when its facts were written."""
+    clock = (_facts(run.parent) or {}).get("clock") or {}
+    return float(clock.get("origin_s", 0.0)), run.stat().st_mtime_ns
 
 
 def _name_in(file: Path) -> str | None:

@@ -13,7 +13,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
 from afspm.experiment.wiring import connectable
-from afspm.runtime.connect import GUEST, guest_facts
+from afspm.runtime.connect import ENDED, GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor import common_clock, run_folder, summary
 from afspm.supervisor.log import SUPERVISOR, RunLog
@@ -66,10 +66,12 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     try:
         starts = _starts(experiment, options, clock, FreePorts(), folder)
         run_folder.write_experiment(folder, experiment.expanded())
-        run_folder.write_run(folder, run_facts(experiment.name, starts, clock))
+        facts = run_facts(experiment.name, starts, clock)
+        run_folder.write_run(folder, facts)
         log.write(SUPERVISOR, logging.INFO, f"{experiment.name}: {len(starts)} processes, into {folder}")
         supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy())
         outcome = supervisor.run()
+        run_folder.write_run(folder, {**facts, ENDED: outcome.text})
         for line in summary.lines(outcome, folder):
             log.write(SUPERVISOR, logging.INFO, line)
     finally:

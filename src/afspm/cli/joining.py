@@ -1,0 +1,125 @@
+"""How the commands of the terminal find a running experiment, and in whose name they speak there."""
+
+from __future__ import annotations
+
+import getpass
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from afspm.cli.telling import About
+    from afspm.runtime.following import Follower
+    from afspm.runtime.scope import Scope
+
+NOT_RUNNING = 3
+"""The exit code where nothing runs."""
+TERMINAL = "terminal"
+
+Where = Annotated[
+    Path,
+    typer.Argument(
+        metavar="RUN|FILE",
+        help="The folder of a run, a folder of runs (its newest is meant), or the experiment file.",
+    ),
+]
+
+
+def person() -> str:
+    """ "terminal:ada": the terminal, and the user of this computer that it acts for."""
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError, ImportError):  # no such user: a container
+        user = ""
+    return f"{TERMINAL}:{user}" if user else TERMINAL
+
+
+@contextmanager
+def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
+    """Look on at the run that is meant; ends the command where nothing runs.
+
+    Args:
+        lines: also of scans that are being taken.
+    """
+    from afspm.runtime.following import LINES, SMALL, Follower
+
+    with Follower(_running(where), TERMINAL, (*SMALL, LINES) if lines else SMALL) as follower:
+        with _only_if_running():
+            follower.catch_up()
+        if follower.ended:
+            say_nothing_runs(f"{follower.folder.name} has just ended")
+        yield follower
+
+
+@contextmanager
+def acting(where: Path) -> Iterator[Scope]:
+    """A handle on the run that is meant, in the name of whoever sits here; ends the command where nothing runs."""
+    from afspm.runtime.connect import connect
+
+    folder = _running(where)
+    with _only_if_running():
+        scope = connect(folder, person())
+    with scope:
+        yield scope
+
+
+def about(follower: Follower, *, fancy: bool = True) -> About:
+    """What is known of the run besides what it publishes."""
+    from afspm.cli.telling import About
+    from afspm.runtime.following import facts_of
+
+    clock = follower.launch.clock
+    return About(
+        name=str(facts_of(follower.folder).get("name", follower.folder.name)),
+        folder=str(follower.folder),
+        simulated=follower.launch.simulated,
+        began_ns=round(float(clock["start_s"]) * 1e9) if clock else None,
+        speed=float(clock["speed"]) if clock else 1.0,
+        fancy=fancy,
+    )
+
+
+def can_show_blocks() -> bool:
+    """Whether what the bars are made of arrives at the terminal."""
+    try:
+        "█░".encode(sys.stdout.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True
+
+
+def say_nothing_runs(why: str) -> None:
+    """Raises typer.Exit."""
+    typer.echo(f"afspm: nothing runs here: {why}", err=True)
+    raise typer.Exit(NOT_RUNNING)
+
+
+def _running(where: Path) -> Path:
+    """The folder of the run that is meant, as far as it is not known to have ended."""
+    from afspm.errors import FileError
+    from afspm.runtime.connect import ENDED, find_run
+    from afspm.runtime.following import facts_of
+
+    try:
+        folder = find_run(where)
+    except FileError as error:
+        say_nothing_runs(str(error))
+        raise  # not reached
+    ended = facts_of(folder).get(ENDED)
+    if ended:
+        say_nothing_runs(f"{folder.name} has ended ({ended})")
+    return folder
+
+
+@contextmanager
+def _only_if_running() -> Iterator[None]:
+    from afspm.errors import ExperimentEnded, NoResponse
+
+    try:
+        yield
+    except (ExperimentEnded, NoResponse) as error:
+        say_nothing_runs(str(error))

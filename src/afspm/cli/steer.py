@@ -1,0 +1,91 @@
+"""`afspm pause`, `resume`, `end` and `problems`: acting on a running experiment from a terminal, by the user's name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.cli.joining import Where, acting, looking
+
+if TYPE_CHECKING:
+    from afspm.model import ControlMode
+
+RUNS = Path("runs")
+
+
+def pause(where: Where = RUNS) -> None:
+    """Pause a running experiment: MANUAL, so that no component commands the microscope.
+
+    What is measured just then is stopped, unless the experiment file says otherwise, and taken again afterwards. The
+    components go on running, and wait. `afspm resume` lets them go on.
+    """
+    from afspm.model import ControlMode
+
+    _set_mode(where, ControlMode.MANUAL, "the experiment is paused (MANUAL); `afspm resume` lets it go on")
+
+
+def resume(where: Where = RUNS) -> None:
+    """Let a paused experiment go on: AUTOMATED.
+
+    It has to be running. An experiment that was killed, with its computer perhaps, goes on by `afspm run --resume RUN`.
+    """
+    from afspm.model import ControlMode
+
+    _set_mode(where, ControlMode.AUTOMATED, "the experiment goes on (AUTOMATED)")
+
+
+def end(
+    where: Where = RUNS,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
+) -> None:
+    """End a running experiment, for all its components; it asks first."""
+    with acting(where) as scope:
+        if not yes:
+            typer.confirm("End the experiment?", abort=True)
+        scope.end_experiment()
+    typer.echo("the experiment is ended")
+
+
+def problems(
+    where: Where = RUNS,
+    flag: Annotated[
+        list[str] | None, typer.Option("--flag", metavar="NAME", help="Flag a problem. Repeatable.", show_default=False)
+    ] = None,
+    clear: Annotated[
+        list[str] | None, typer.Option("--clear", metavar="NAME", help="Remove its flag.", show_default=False)
+    ] = None,
+) -> None:
+    """List the problems that are flagged, by whom and since when; or flag and clear them.
+
+    Control is taken from whoever has it when a problem is flagged, until who solves it has cleared it.
+    """
+    if flag or clear:
+        with acting(where) as scope:
+            for name in flag or ():
+                scope.flag(name)
+                typer.echo(f"flagged {name}")
+            for name in clear or ():
+                scope.clear(name)
+                typer.echo(f"cleared {name}")
+        return
+    _list(where)
+
+
+def _list(where: Path) -> None:
+    from afspm.cli.telling import flagged, lasting
+
+    with looking(where) as follower:
+        now_ns, found = follower.clock.now_ns(), list(flagged(follower.overview))
+        for _, name, span in found:
+            since = f", for {lasting(now_ns - span.start_ns)}" if span else ""
+            typer.echo(f"{name}{since}{f', flagged by {span.by}' if span and span.by else ''}")
+        if not found:
+            typer.echo(f"no problem is flagged; there are {', '.join(follower.overview.problems)}")
+
+
+def _set_mode(where: Path, mode: ControlMode, done: str) -> None:
+    with acting(where) as scope:
+        scope.set_mode(mode)
+    typer.echo(done)

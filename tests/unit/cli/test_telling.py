@@ -1,0 +1,125 @@
+"""What the terminal says of a running experiment."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from afspm import model
+from afspm.cli import telling
+from afspm.cli.telling import About
+from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
+from afspm.record.overview import Overview
+
+S = 1_000_000_000
+START = 1_700_000_000 * S
+ABOUT = About("night", "runs/night-1", simulated=True, began_ns=START, speed=60.0)
+REGION = model.Region((0.0, 0.0), (1e-6, 1e-6))
+
+
+def process(name: str, condition: ProcessCondition, **more: object) -> model.ProcessState:
+    return model.ProcessState(name, "component", condition, START, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def night() -> Overview:
+    overview = Overview()
+    for after_s, message, thing in (
+        (0, "ScopeStateMsg", model.ScopeStatus(ScopeState.FREE)),
+        (1, "ControlState", ControlState(ControlMode.AUTOMATED, "series")),
+        (2, "ScanParameters2d", model.ScanParameters(REGION, (128, 64))),
+        (3, "ScopeStateMsg", model.ScopeStatus(ScopeState.SCANNING)),
+        (103, "ScopeStateMsg", model.ScopeStatus(ScopeState.FREE)),
+        (110, "ScopeStateMsg", model.ScopeStatus(ScopeState.SCANNING)),
+        (120, "Progress", model.Progress(START + 120 * S, "series", 1, 5, START)),
+        (121, "ProcessStates", model.ProcessStates(START, "lab", (
+            process("series", ProcessCondition.BUSY, step_age_s=12.0),
+            process("judge", ProcessCondition.GIVEN_UP, last_exit="exit code 1"),
+        ))),
+        (122, "JournalEntries", model.JournalEntries((
+            model.JournalEntry(START + 122 * S, "request", "judge", "scan-speed = 1 m/s", 9, "at most 1e-5 m/s"),
+            model.JournalEntry(START + 123 * S, "control", "judge", "flagged tip-shape-changed"),
+        ))),
+        (123, "ControlState", ControlState(ControlMode.AUTOMATED, "series", (1,))),
+        (124, "LogLines", model.LogLines((model.LogLine(START + 124 * S, "judge", "ERROR", "lost the tip [/x]"),))),
+    ):  # fmt: skip
+        overview.take(message, thing, START + after_s * S)
+    return overview
+
+
+def shown(overview: Overview, about: About = ABOUT, width: int = 140, silent_s: float = 0.0) -> str:
+    console = Console(file=io.StringIO(), width=width, highlight=False, markup=False)
+    console.print(telling.screen(overview, about, START + 160 * S, silent_s=silent_s))
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return text
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "SIMULATED",
+        "running for 2 min 40 s, 60 x real time",
+        "AUTOMATED, series is in control for 2 min 39 s",
+        "tip-shape-changed for 37 s, flagged by judge",
+        "scanning for 50 s",
+        "50 % 50 s left (1 s real)",
+        "1000 x 1000 nm, 64 x 128",
+        "series: 1 of 5",
+        "7 min 20 s left",
+        "series (busy for 12 s)",
+        "judge given up for 2 min 40 s (exit code 1)",
+        "judge: scan-speed = 1 m/s: at most 1e-5 m/s",
+        "lost the tip [/x]",
+    ],
+)
+def test_what_is_so_is_said(night: Overview, said: str) -> None:
+    assert said in shown(night)
+
+
+def test_nothing_is_cut_off_in_a_narrow_terminal(night: Overview) -> None:
+    wide, narrow = shown(night, width=300), shown(night, width=30)
+    assert max(map(len, narrow.splitlines())) <= 30
+    assert "".join(narrow.split()) == "".join(wide.split())
+
+
+def test_without_block_characters_bars_are_plain(night: Overview) -> None:
+    about = About("night", "", fancy=False)
+    assert shown(night, about).isascii()
+    assert telling.bar(0.5, fancy=False, width=4) == "[##..]"
+
+
+def test_silence_is_said_as_such(night: Overview) -> None:
+    assert "no news for 30 s" in shown(night, silent_s=30.0)
+    assert "no news" not in shown(night, silent_s=2.0)
+
+
+def test_manual_is_said_with_since_when(night: Overview) -> None:
+    night.take("ControlState", ControlState(ControlMode.MANUAL, None, (1,)), START + 130 * S)
+    assert "MANUAL for 30 s" in shown(night)
+
+
+def test_nothing_known_is_said_as_such() -> None:
+    assert "not known yet" in shown(Overview())
+    assert "has not been heard of yet" in shown(Overview())
+
+
+def test_json_says_the_same(night: Overview) -> None:
+    told = json.loads(json.dumps(telling.as_json(night, ABOUT, START + 160 * S)))
+    assert (told["mode"], told["holder"], told["simulated"]) == ("AUTOMATED", "series", True)
+    assert [(one["name"], one["by"]) for one in told["problems"]] == [("tip-shape-changed", "judge")]
+    assert told["scan"] == {"part": 0.5, "remaining_s": 50.0}
+    assert told["progress"]["series"] == {"done": 1, "of": 5, "remaining_s": 440.0}
+    assert [one["condition"] for one in told["processes"]] == ["BUSY", "GIVEN_UP"]
+    assert told["refusals"][0]["reason"] == "at most 1e-5 m/s"
+    assert told["log"][0]["text"] == "lost the tip [/x]"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0, "0 s"), (59.4, "59 s"), (200, "3 min 20 s"), (1200, "20 min"), (7500, "2 h 05 min"), (3 * 86400, "3 d 0 h")],
+)
+def test_durations_are_for_people(seconds: float, words: str) -> None:
+    assert telling.lasting(round(seconds * S)) == words
