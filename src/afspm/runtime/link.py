@@ -10,7 +10,7 @@ from typing import Any
 from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
-from afspm.model import TELL_REQUEST, ControlRequest, Packet, Request, Response, Told
+from afspm.model import TELL_REQUEST, ControlRequest, Packet, Request, Response, Told, request_name
 from afspm.runtime.process import Activity
 from afspm.runtime.stopping import StopRequested
 from afspm.runtime.view import KEPT, View
@@ -162,7 +162,7 @@ class Link:
         return f"{self.name}/{self._session}/{self._requests}"
 
     def request(
-        self, kind: ControlRequest, subject: Any = None, *, request_id: str = "", until_s: float | None = None
+        self, kind: int, subject: Any = None, *, request_id: str = "", until_s: float | None = None
     ) -> Response:
         """Ask the scheduler and wait for its answer, whatever it is.
 
@@ -188,11 +188,11 @@ class Link:
                     break
                 # a connection that was lost is the scheduler's restart, not its silence
                 sent += connection == self.connections
-                self.log.debug("%s (%s) is asked again", kind.name, request.id)
+                self.log.debug("%s (%s) is asked again", request_name(kind), request.id)
         finally:
             self._asked = ""
         raise NoResponse(
-            f"{kind.name} was not answered, asked {max(sent, 1)} times",
+            f"{request_name(kind)} was not answered, asked {max(sent, 1)} times",
             where=self.name,
             hint="whether it was carried out is not known",
         )
@@ -222,9 +222,9 @@ class Link:
         soon_s = self.clock.monotonic_s() + timeout_s
         return soon_s if until_s is None else min(soon_s, until_s)
 
-    def _tries(self, kind: ControlRequest) -> int:
+    def _tries(self, kind: int) -> int:
         # a scheduler of version 1 does not know ids: what it may have done must not be asked for twice
-        if kind is ControlRequest.ACTION and self._ids_are_echoed is False:
+        if kind == ControlRequest.ACTION and self._ids_are_echoed is False:
             return 1
         return 1 + self._retries
 

@@ -1,0 +1,154 @@
+"""The newest picture of each channel, growing or finished, and as many before as a bounded memory takes."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.model import Region, Scan, ScanLines
+
+MEMORY_BYTES = 192 << 20
+Key = tuple[int, str]
+"""Time in ns and channel."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Frame:
+    """One channel of a scan, as far as it has come.
+
+    Attributes:
+        number: higher than that of every frame of any channel before.
+        values: [y, x], y ascending, as published; NaN in rows that have not come yet.
+        time_ns: when it was finished; None while it grows.
+        began_ns: the time that its lines carry; None if it came whole.
+        rows: how many have come.
+        newest_row: index of the one that came last; None where it is finished.
+    """
+
+    number: int
+    channel: str
+    unit: str
+    region: Region
+    values: NDArray[np.float64]
+    time_ns: int | None
+    began_ns: int | None = None
+    filename: str = ""
+    rows: int = 0
+    newest_row: int | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether it is finished."""
+        return self.time_ns is not None
+
+
+class FrameStore:
+    """What pictures are made of. Not for several threads at once.
+
+    Args:
+        memory_bytes: of finished frames that are kept, beside the newest of each channel.
+    """
+
+    def __init__(self, memory_bytes: int = MEMORY_BYTES) -> None:
+        self._memory_bytes = memory_bytes
+        self._number = 0
+        self._newest: dict[str, Frame] = {}
+        self._came: dict[str, NDArray[np.bool_]] = {}
+        self._kept: OrderedDict[Key, Frame] = OrderedDict()
+        self._kept_bytes = 0
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """In the order in which they were first seen."""
+        return tuple(self._newest)
+
+    @property
+    def number(self) -> int:
+        """Of the newest frame; 0 before the first."""
+        return self._number
+
+    @property
+    def kept_bytes(self) -> int:
+        return self._kept_bytes
+
+    def take_scan(self, scan: Scan, time_ns: int) -> None:
+        """A finished channel; `time_ns` is the packet's, for scans that say none. Without values it is no picture."""
+        if not scan.values.size:
+            return
+        before = self._newest.get(scan.channel)
+        time_ns = scan.time_ns or time_ns
+        if before is not None and before.time_ns is not None and time_ns <= before.time_ns:
+            return  # a replay: what is there is newer
+        self._came.pop(scan.channel, None)
+        began_ns = before.began_ns if before is not None and not before.complete else None
+        frame = Frame(
+            self._next(), scan.channel, scan.unit, scan.region, scan.values, time_ns, began_ns, scan.filename,
+            scan.shape[0],
+        )  # fmt: skip
+        self._newest[scan.channel] = frame
+        self._keep(frame)
+
+    def take_lines(self, lines: ScanLines) -> None:
+        """Lines of a running scan; those of one that is finished already are passed over."""
+        before = self._newest.get(lines.channel)
+        if before is not None and self._is_over(before, lines):
+            return
+        grows = (
+            before is not None
+            and not before.complete
+            and before.began_ns == lines.began_ns
+            and before.values.shape == lines.shape
+        )
+        picture = lines.into(before.values if grows and before is not None else None)
+        came = self._came[lines.channel] if grows else np.zeros(lines.shape[0], np.bool_)
+        last = lines.first_row + len(lines.values)
+        downwards = last < len(came) and bool(came[last])
+        came[lines.first_row : last] = True
+        self._came[lines.channel] = came
+        self._newest[lines.channel] = Frame(
+            self._next(), lines.channel, lines.unit, lines.region, picture, None, lines.began_ns,
+            rows=int(came.sum()), newest_row=lines.first_row if downwards else last - 1,
+        )  # fmt: skip
+
+    def newest(self, channel: str | None = None) -> Frame | None:
+        """The newest frame of a channel; None: of the channel seen first. A growing one is a copy as it is now."""
+        if channel is None:
+            channel = next(iter(self._newest), None)
+        frame = self._newest.get(channel) if channel is not None else None
+        return frame if frame is None or frame.complete else _copied(frame)
+
+    def newest_number(self, channel: str | None = None) -> tuple[int, bool]:
+        """(number, whether it is finished) of the newest frame, without a copy; 0 if there is none."""
+        if channel is None:
+            channel = next(iter(self._newest), None)
+        frame = self._newest.get(channel) if channel is not None else None
+        return (0, False) if frame is None else (frame.number, frame.complete)
+
+    def kept(self, time_ns: int, channel: str) -> Frame | None:
+        """A finished frame from before; None if it is not kept here any more."""
+        return self._kept.get((time_ns, channel))
+
+    def _is_over(self, before: Frame, lines: ScanLines) -> bool:
+        if not before.complete or lines.began_ns is None:
+            return False
+        if before.began_ns is not None:
+            return lines.began_ns <= before.began_ns
+        return before.time_ns is not None and lines.began_ns < before.time_ns
+
+    def _next(self) -> int:
+        self._number += 1
+        return self._number
+
+    def _keep(self, frame: Frame) -> None:
+        assert frame.time_ns is not None
+        self._kept[frame.time_ns, frame.channel] = frame
+        self._kept_bytes += frame.values.nbytes
+        while self._kept_bytes > self._memory_bytes and len(self._kept) > 1:
+            self._kept_bytes -= self._kept.popitem(last=False)[1].values.nbytes
+
+
+def _copied(frame: Frame) -> Frame:
+    return replace(frame, values=frame.values.copy())

@@ -1,0 +1,138 @@
+"""What the page fetches by itself: pictures as they come, values, profiles.
+
+The browser asks for the next picture when it has drawn the last, and gets the newest: what it was too slow for is left
+out, and nothing waits for it here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from afspm.dashboard.bell import Bell
+from afspm.dashboard.drawing import Drawer, Drawn, Look, number_or_none
+from afspm.dashboard.frames import Frame
+from afspm.dashboard.levelling import Levelling
+from afspm.dashboard.palettes import PALETTES
+from afspm.dashboard.pictures import Contrast
+from afspm.dashboard.profiles import profile
+from afspm.dashboard.record import Archive
+from afspm.dashboard.watch import Watch
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI, Response
+
+POLL_S = 20.0  # then the browser asks anew: what is in between may close connections that say nothing for longer
+GROWING_S = 0.2  # between two pictures of a growing scan
+FINISHED_S = 0.04  # between two of finished ones, for each viewer
+
+
+class Live:
+    """The answers to what the page fetches.
+
+    Args:
+        archive: where scans are that are not in memory any more.
+    """
+
+    def __init__(self, watch: Watch, bell: Bell, archive: Archive) -> None:
+        self._watch = watch
+        self._bell = bell
+        self._archive = archive
+        self._drawer = Drawer()
+        self._waiting = 0
+
+    def add_to(self, app: FastAPI) -> None:
+        """Serve /live/image, /live/value, /live/profile."""
+        app.get("/live/image", response_model=None)(self._image)
+        app.get("/live/value", response_model=None)(self._value)
+        app.get("/live/profile", response_model=None)(self._profile)
+
+    async def _image(
+        self, channel: str = "", time: int = 0, after: int = 0, levelling: str = "", contrast: str = "",
+        palette: str = "",
+    ) -> Response:  # fmt: skip
+        """A picture newer than number `after`; of one finished scan if a `time` is given. 204: nothing new yet."""
+        from fastapi.responses import PlainTextResponse, Response
+
+        if not time and not await self._wait_for_newer(channel, after):
+            return Response(status_code=204)
+        drawn = await asyncio.to_thread(self._drawn, channel, time, look_of(levelling, contrast, palette))
+        if drawn is None:
+            return PlainTextResponse("the values of this scan are not kept here any more", 404)
+        headers = {"X-Frame": drawn.head(), "Cache-Control": "no-store"}
+        return Response(drawn.png, media_type="image/png", headers=headers)
+
+    async def _value(
+        self, column: int, row: int, channel: str = "", time: int = 0, levelling: str = "", contrast: str = "",
+        palette: str = "",
+    ) -> dict[str, Any]:  # fmt: skip
+        """The value of one pixel, as published and as levelled."""
+        drawn = await asyncio.to_thread(self._drawn, channel, time, look_of(levelling, contrast, palette))
+        if drawn is None or not (0 <= row < drawn.values.shape[0] and 0 <= column < drawn.values.shape[1]):
+            return {"value": None, "levelled": None, "unit": ""}
+        return {
+            "value": number_or_none(float(drawn.frame.values[row, column])),
+            "levelled": number_or_none(float(drawn.values[row, column])),
+            "unit": drawn.frame.unit,
+            "number": drawn.frame.number,
+        }
+
+    async def _profile(
+        self, x0: float, y0: float, x1: float, y1: float, channel: str = "", time: int = 0, levelling: str = "",
+        contrast: str = "", palette: str = "",
+    ) -> dict[str, Any]:  # fmt: skip
+        """Levelled values along a line between two (column, row)."""
+        drawn = await asyncio.to_thread(self._drawn, channel, time, look_of(levelling, contrast, palette))
+        if drawn is None:
+            return {"distances_m": [], "values": [], "unit": ""}
+        found = profile(drawn.values, drawn.frame.region, (x0, y0), (x1, y1))
+        return {
+            "distances_m": found.distances_m.tolist(),
+            "values": [number_or_none(value) for value in found.values.tolist()],
+            "unit": drawn.frame.unit,
+        }
+
+    async def _wait_for_newer(self, channel: str, after: int) -> bool:
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
+        end_s, growing_s = now_s + POLL_S, now_s + GROWING_S
+        self._waiting += 1
+        try:
+            if after:  # many viewers at full speed get fewer pictures each, and not the experiment less time
+                await asyncio.sleep(FINISHED_S * max(1, self._waiting // 4))
+            while True:
+                number, complete = self._newest(channel)
+                now_s = loop.time()
+                if number > after and (complete or not after or now_s >= growing_s):
+                    return True
+                until_s = growing_s if number > after else end_s
+                if now_s >= end_s:
+                    return False
+                await self._bell.wait(until_s - now_s)
+        finally:
+            self._waiting -= 1
+
+    def _newest(self, channel: str) -> tuple[int, bool]:
+        with self._watch.reading():
+            return self._watch.frames.newest_number(channel or None)
+
+    def _drawn(self, channel: str, time_ns: int, look: Look) -> Drawn | None:
+        frame = self._frame(channel, time_ns)
+        return None if frame is None else self._drawer.draw(frame, look)
+
+    def _frame(self, channel: str, time_ns: int) -> Frame | None:
+        with self._watch.reading():
+            if not time_ns:
+                return self._watch.frames.newest(channel or None)
+            kept = self._watch.frames.kept(time_ns, channel)
+        return kept or self._archive.frame(time_ns, channel)
+
+
+def look_of(levelling: str, contrast: str, palette: str) -> Look:
+    """As the page names it; what it doesn't name, or nobody knows, is as by default."""
+    usual = Look()
+    return Look(
+        Levelling(levelling) if levelling in Levelling._value2member_map_ else usual.levelling,
+        Contrast(contrast) if contrast in Contrast._value2member_map_ else usual.contrast,
+        palette if palette in PALETTES else usual.palette,
+    )

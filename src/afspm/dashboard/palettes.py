@@ -1,0 +1,27 @@
+"""Colour maps: from dark to light, so that they can be read without colours too."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEVELS: Final = 255
+"""Colours of a map; the last index of a byte is left for what was not measured."""
+UNMEASURED: Final = 255
+
+# (position, red, green, blue), straight lines in between
+_STOPS: Final[dict[str, tuple[tuple[float, int, int, int], ...]]] = {
+    "gold": ((0.0, 18, 6, 4), (0.25, 92, 36, 8), (0.5, 172, 92, 22), (0.75, 232, 172, 72), (1.0, 255, 250, 224)),
+    "grey": ((0.0, 8, 8, 8), (1.0, 250, 250, 250)),
+    "ice": ((0.0, 4, 8, 26), (0.3, 16, 56, 120), (0.6, 48, 132, 186), (0.85, 158, 214, 226), (1.0, 244, 252, 250)),
+}
+PALETTES: Final = tuple(_STOPS)
+
+
+def colours(name: str) -> NDArray[np.uint8]:
+    """The colours of a map from the lowest value to the highest, shape (LEVELS, 3). Raises KeyError."""
+    stops = np.array(_STOPS[name], dtype=np.float64)
+    at = np.linspace(0.0, 1.0, LEVELS)
+    return np.stack([np.interp(at, stops[:, 0], stops[:, i]) for i in (1, 2, 3)], axis=-1).round().astype(np.uint8)

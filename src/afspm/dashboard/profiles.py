@@ -1,0 +1,66 @@
+"""Values of a scan along a line."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from afspm.dashboard.levelling import Array
+from afspm.model import Region
+
+MOST_POINTS = 1024
+Pixel = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """Values along a line.
+
+    Attributes:
+        distances_m: from its beginning.
+        values: NaN where nothing was measured.
+    """
+
+    distances_m: Array
+    values: Array
+
+
+def profile(values: Array, region: Region, begin: Pixel, end: Pixel) -> Profile:
+    """Along a straight line between two places in the scan, linear between pixels, about one point a pixel.
+
+    Args:
+        values: [y, x], y ascending.
+        begin, end: (column, row), fractions of pixels allowed; what lies outside is moved to the border.
+    """
+    ny, nx = values.shape
+    (x0, y0), (x1, y1) = (_inside(place, nx, ny) for place in (begin, end))
+    count = min(MOST_POINTS, max(2, round(math.hypot(x1 - x0, y1 - y0)) + 1))
+    x, y = np.linspace(x0, x1, count), np.linspace(y0, y1, count)
+    column_m = region.size_m[0] / max(nx - 1, 1)
+    row_m = region.size_m[1] / max(ny - 1, 1)
+    length_m = math.hypot((x1 - x0) * column_m, (y1 - y0) * row_m)
+    return Profile(np.linspace(0.0, length_m, count), _interpolated(values, x, y))
+
+
+def _inside(place: Pixel, nx: int, ny: int) -> Pixel:
+    return min(max(place[0], 0.0), nx - 1.0), min(max(place[1], 0.0), ny - 1.0)
+
+
+def _interpolated(values: Array, x: Array, y: Array) -> Array:
+    ny, nx = values.shape
+    left = np.clip(np.floor(x).astype(int), 0, max(nx - 2, 0))
+    low = np.clip(np.floor(y).astype(int), 0, max(ny - 2, 0))
+    right, high = np.minimum(left + 1, nx - 1), np.minimum(low + 1, ny - 1)
+    u, v = x - left, y - low
+    total = np.zeros(x.shape)
+    # a neighbour of no weight must not spoil it with its NaN
+    for rows, columns, weights in (
+        (low, left, (1 - u) * (1 - v)),
+        (low, right, u * (1 - v)),
+        (high, left, (1 - u) * v),
+        (high, right, u * v),
+    ):
+        total += np.where(weights > 0.0, values[rows, columns] * weights, 0.0)
+    return total

@@ -1,0 +1,189 @@
+"""The sample as a map: where everything of the run lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from afspm.dashboard.levelling import Array
+from afspm.dashboard.plots import round_ticks
+from afspm.dashboard.words import clock, escape, quantity, scale
+from afspm.model import Region
+from afspm.record.overview import ScanTaken, SpectrumTaken
+
+MOST_PLACES = 1500
+_MARGIN = 0.06
+_SAME = 200.0  # places that differ by less than this part of their size are one on the map
+
+
+@dataclass(frozen=True)
+class MapContent:
+    """What is on the map, in the coordinates of components (of the sample, where drift is corrected).
+
+    Attributes:
+        current: the region that is set.
+        limits: where scans may lie at all, in tip coordinates.
+        tip_to_sample: 2 x 3; None where the two are the same.
+        probe_m: where the probe stands.
+        shown: (time, channel) of the scan in the image; None: the newest.
+    """
+
+    scans: Sequence[ScanTaken] = ()
+    spectra: Sequence[SpectrumTaken] = ()
+    current: Region | None = None
+    limits: Region | None = None
+    tip_to_sample: Array | None = None
+    probe_m: tuple[float, float] | None = None
+    shown: tuple[int, str] | None = None
+
+
+def map_html(content: MapContent) -> str:
+    """The map as HTML; scans have their time and channel as data-time and data-channel, spectra their time."""
+    places, left_out = places_of(content.scans)
+    spectra = [one for one in content.spectra if one.position_m is not None][-MOST_PLACES:]
+    frame = _frame(content, places, spectra)
+    if frame is None:
+        return '<p class="nothing">No place is known yet.</p>'
+    shapes = [
+        "" if content.limits is None else _polygon(frame, _limits(content), "limits"),
+        *(_scan(frame, one, count, content.shown) for one, count in places),
+        "" if content.current is None else _polygon(frame, content.current.corners_m(), "current"),
+        *(_spectrum(frame, one) for one in spectra),
+        "" if content.probe_m is None else _probe(frame, content.probe_m),
+    ]
+    ticks = _ticks(frame)
+    more = f"<p>{left_out} older places are not drawn.</p>" if left_out else ""
+    words = f"{len(places)} places with scans and {len(spectra)} spectra"
+    return (
+        f'<figure class="map" role="img" aria-label="Map of the sample: {words}">'
+        f'<div class="map-area" style="aspect-ratio:{frame.width:.6g}/{frame.height:.6g}">'
+        f'<svg viewBox="0 0 {frame.width:.6g} {frame.height:.6g}">{"".join(shapes)}</svg>{ticks}</div>'
+        f"{_drift_words(content)}{more}</figure>"
+    )
+
+
+def places_of(scans: Sequence[ScanTaken]) -> tuple[list[tuple[ScanTaken, int]], int]:
+    """([(newest scan, how many there are) for each place], how many older places are left out); large ones first."""
+    found: dict[tuple[int, ...], tuple[ScanTaken, int]] = {}
+    seen: dict[tuple[int, ...], int] = {}
+    for scan in scans:
+        key = _place(scan.region)
+        if seen.get(key) != scan.time_ns:
+            seen[key] = scan.time_ns
+            count = found.pop(key, (scan, 0))[1]
+            found[key] = (scan, count + 1)
+    newest = list(found.values())[-MOST_PLACES:]
+    newest.sort(key=lambda one: -one[0].region.size_m[0] * one[0].region.size_m[1])
+    return newest, len(found) - len(newest)
+
+
+def _place(region: Region) -> tuple[int, ...]:
+    step = max(region.size_m) / _SAME
+    (x, y), (width, height) = region.center_m, region.size_m
+    return (round(x / step), round(y / step), round(width / step), round(height / step), round(region.angle_rad * 500))
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """The part of the plane that is shown, in a unit that makes handy numbers. y is upwards, unlike on the screen."""
+
+    left_m: float
+    low_m: float
+    width: float
+    height: float
+    per_m: float
+
+    def at(self, xy_m: Sequence[float] | Array) -> tuple[float, float]:
+        x, y = (float(xy_m[0]) - self.left_m) * self.per_m, (float(xy_m[1]) - self.low_m) * self.per_m
+        return x, self.height - y
+
+
+def _frame(
+    content: MapContent, places: Sequence[tuple[ScanTaken, int]], spectra: Sequence[SpectrumTaken]
+) -> _Frame | None:
+    points = [one.region.corners_m() for one, _ in places]
+    points += [np.array([one.position_m]) for one in spectra]
+    if content.current is not None:
+        points.append(content.current.corners_m())
+    if content.limits is not None:
+        points.append(_limits(content))
+    if content.probe_m is not None:
+        points.append(np.array([content.probe_m]))
+    if not points:
+        return None
+    every = np.concatenate(points)
+    low, high = every.min(axis=0), every.max(axis=0)
+    side = max(*(high - low), 1e-10)
+    low, high = low - _MARGIN * side, high + _MARGIN * side
+    # never narrower than two to three, which nobody could click in
+    for axis in (0, 1):
+        lacking = 0.67 * (high - low).max() - (high - low)[axis]
+        if lacking > 0.0:
+            low[axis], high[axis] = low[axis] - lacking / 2, high[axis] + lacking / 2
+    per_m = 1000.0 / float((high - low).max())
+    width, height = (float(v) * per_m for v in high - low)
+    return _Frame(float(low[0]), float(low[1]), width, height, per_m)
+
+
+def _limits(content: MapContent) -> Array:
+    """The corners of what is allowed, moved along with the tip under a sample that drifts."""
+    assert content.limits is not None
+    corners = content.limits.corners_m()
+    if content.tip_to_sample is None:
+        return corners
+    return np.asarray(corners @ content.tip_to_sample[:, :2].T + content.tip_to_sample[:, 2])
+
+
+def _polygon(frame: _Frame, corners_m: Array, style: str, inside: str = "", data: str = "") -> str:
+    points = " ".join("{:.2f},{:.2f}".format(*frame.at(corner)) for corner in corners_m)
+    return f'<polygon class="{style}" points="{points}"{data}>{inside}</polygon>'
+
+
+def _scan(frame: _Frame, one: ScanTaken, count: int, shown: tuple[int, str] | None) -> str:
+    width, height = (quantity(size, "m", 3) for size in one.region.size_m)
+    often = f", {count} scans" if count > 1 else ""
+    cut = ", interrupted" if one.interrupted else ""
+    who = f" by {one.holder}" if one.holder else ""
+    title = f"{width} × {height} at {clock(one.time_ns)}{who}{often}{cut}"
+    style = "scan" + (" cut" if one.interrupted else "") + (" shown" if shown and shown[0] == one.time_ns else "")
+    data = f' data-time="{one.time_ns}" data-channel="{escape(one.channel)}"'
+    return _polygon(frame, one.region.corners_m(), style, f"<title>{escape(title)}</title>", data)
+
+
+def _spectrum(frame: _Frame, one: SpectrumTaken) -> str:
+    assert one.position_m is not None
+    x, y = frame.at(one.position_m)
+    title = escape(f"{one.kind or 'spectrum'} at {clock(one.time_ns)}")
+    return f'<path class="spectrum" d="M{x:.2f} {y:.2f}h0" data-spectrum="{one.time_ns}"><title>{title}</title></path>'
+
+
+def _probe(frame: _Frame, xy_m: tuple[float, float]) -> str:
+    x, y = frame.at(xy_m)
+    return f'<path class="probe" d="M{x - 14:.2f} {y:.2f}h28M{x:.2f} {y - 14:.2f}v28"><title>the probe</title></path>'
+
+
+def _ticks(frame: _Frame) -> str:
+    low = np.array([frame.left_m, frame.low_m])
+    high = low + np.array([frame.width, frame.height]) / frame.per_m
+    factor, unit = scale(float(np.abs(np.concatenate([low, high])).max()), "m")
+    parts = []
+    for axis, side in ((0, "left"), (1, "bottom")):
+        span = high[axis] - low[axis]
+        for value in round_ticks(float(low[axis]) * factor, float(high[axis]) * factor, 4):
+            at = 100.0 * (value / factor - low[axis]) / span
+            text = f"{value:g}".replace("-", "−")
+            parts.append(f'<span class="tick-{"xy"[axis]}" style="{side}:{at:.2f}%">{text}</span>')
+    return f'{"".join(parts)}<span class="map-unit">{unit}</span>'
+
+
+def _drift_words(content: MapContent) -> str:
+    if content.tip_to_sample is None:
+        return ""
+    x, y = content.tip_to_sample[:, 2]
+    factor, unit = scale(max(abs(x), abs(y)), "m")
+    return (
+        f'<p class="map-drift">Sample coordinates; the sample has moved by ({-x * factor:.3g}, {-y * factor:.3g}) '
+        f"{unit} under the tip, and what it may reach with it.</p>"
+    )

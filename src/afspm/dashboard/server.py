@@ -1,0 +1,115 @@
+"""Serves the page, in a thread of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from afspm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from afspm.dashboard.guard import App
+
+USUAL_PORT = 8080
+_STARTED_S, _STOPPED_S = 20.0, 3.0
+
+
+def listening(host: str, port: int | None, wanted: Iterable[int] = (USUAL_PORT,)) -> socket.socket:
+    """A socket that listens at `host`.
+
+    Args:
+        port: 0 for any that is free; None: the first of `wanted` that is free, or any.
+
+    Raises:
+        ConfigError: no such address, or the port is taken.
+    """
+    for attempt in (*wanted, 0) if port is None else (port,):
+        try:
+            return _bound(host, attempt)
+        except OSError as error:
+            failed = error
+    raise ConfigError(
+        f"the dashboard can't listen at {host}, port {port}: {failed.strerror or failed}",
+        where="dashboard",
+        hint="is another one running there? choose another with port, or leave it away",
+    ) from failed
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    bound = socket.socket(family, kind, protocol)
+    try:
+        if hasattr(socket, "SO_EXCLUSIVEADDRUSE"):  # Windows, where the other option would let two have it
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+        else:
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+        bound.listen(128)
+    except OSError:
+        bound.close()
+        raise
+    return bound
+
+
+class PageServer:
+    """Serves an ASGI application until it is stopped.
+
+    Args:
+        certificate, key: PEM files, for https; None: http.
+
+    Raises:
+        ConfigError: the files are no certificate and its key.
+    """
+
+    def __init__(self, app: App, bound: socket.socket, certificate: Path | None, key: Path | None) -> None:
+        import uvicorn
+
+        logging.getLogger("uvicorn").setLevel(logging.WARNING)
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            lifespan="on",
+            timeout_graceful_shutdown=1,
+            ssl_certfile=certificate,
+            ssl_keyfile=key,
+        )
+        try:
+            config.load()
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"certificate and certificate_key can't be used: {error}", where="dashboard", hint="two PEM files"
+            ) from error
+        self._socket = bound
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
+        self._over = threading.Event()
+
+    def start(self) -> None:
+        """Begin to serve; what comes before is answered then."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop, within seconds; whoever is connected is cut off."""
+        self._server.should_exit = True
+        self._thread.join(_STOPPED_S)
+        with contextlib.suppress(OSError):
+            self._socket.close()
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether it ended without being told to."""
+        return self._over.is_set() and not self._server.should_exit
+
+    def _run(self) -> None:
+        try:
+            self._server.run(sockets=[self._socket])
+        except SystemExit:  # that is how it tells that it couldn't start
+            logging.getLogger("afspm.dashboard").error("the page can't be served")
+        finally:
+            self._over.set()
