@@ -15,6 +15,7 @@ from afspm.experiment.handlers import check_handlers
 from afspm.experiment.known import WIRE_SETTINGS
 from afspm.experiment.parts import Role, wire_of
 from afspm.experiment.resolved import Resolved
+from afspm.model import component_of
 
 # What translators and schedulers publish by themselves; scans and spectra continue with their kind.
 PUBLISHED: Final = (
@@ -25,8 +26,12 @@ PUBLISHED: Final = (
     "ScanParameters2d",
     "ZCtrlParameters",
     "ProbePosition",
+    "JournalEntries",
+    "ProcessStates",
+    "LogLines",
+    "Progress",
 )
-CONTINUED: Final = ("Scan2d", "Spec1d")
+CONTINUED: Final = ("Scan2d", "Spec1d", "ProcessStates", "Progress")
 LIVE: Final = "ScanLines"
 """Published only where it is asked for."""
 LONGEST_NAME = 100
@@ -264,7 +269,7 @@ def check_names_of_people(resolved: Resolved) -> None:
     for role, members in resolved.control.roles:
         for i, member in enumerate(members or ()):
             any_role = True
-            if member not in names:
+            if not {member, component_of(member)} & names:
                 place = resolved.document.place("control", "roles", role, i)
                 what = f"[control.roles] {role}: there is no {member!r} among components and keys"
                 resolved.findings.error(what, place, nearest(member, names))

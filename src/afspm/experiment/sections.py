@@ -38,8 +38,9 @@ class Roles(Section):
     end_experiment: tuple[str, ...] | None = None
     set_mode: tuple[str, ...] | None = None
     clear_problems: tuple[str, ...] | None = None
-    operate: tuple[str, ...] = ()
-    """Who may command the microscope in MANUAL mode: nobody, if not named."""
+    operate: tuple[str, ...] | None = None
+    """Who may command the microscope in MANUAL mode; None: the components that are made for it, such as a dashboard."""
+    restart: tuple[str, ...] | None = None
 
 
 class Control(Section):

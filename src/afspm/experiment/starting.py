@@ -180,6 +180,11 @@ def _first(a: int | None, b: int) -> int:
     return b if a is None else a
 
 
+def _operators(resolved: Resolved) -> list[str]:
+    """Components by which a person may command the microscope in MANUAL mode, as their classes say."""
+    return [name for name, component in resolved.classes.items() if getattr(component, "operates", False) is True]
+
+
 def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
     """The sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m.
 
@@ -197,7 +202,10 @@ def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
             "stop_scan_on_manual": control.stop_scan_on_manual,
             "retract": control.retract,
             "dangerous": None if control.dangerous is None else list(control.dangerous),
-            "roles": {role: None if who is None else list(who) for role, who in control.roles},
+            "roles": {
+                **{role: None if who is None else list(who) for role, who in control.roles},
+                "operate": _operators(resolved) if control.roles.operate is None else list(control.roles.operate),
+            },
         },
         "limits": limits.to_settings(resolved.limits),
         "cache": resolved.caching.to_settings(),

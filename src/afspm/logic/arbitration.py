@@ -12,7 +12,7 @@ from enum import Enum, auto
 from types import MappingProxyType
 from typing import Any
 
-from afspm.model import ControlMode, ControlResponse, ControlState, ProblemNames
+from afspm.model import ControlMode, ControlResponse, ControlState, ProblemNames, component_of
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
@@ -105,17 +105,21 @@ class Control:
 class Roles:
     """Who may do what is not everybody's. None: everybody may; but nobody may `operate` unless named.
 
+    Who acts for a person ("dashboard:Ada") has the roles of the component and those given to just that person there.
+
     Attributes:
         end: end the experiment.
         mode: switch between MANUAL and AUTOMATED.
         clear: remove flags of others (who flagged a problem, or is in control to solve it, may always).
         operate: command the microscope in MANUAL mode.
+        restart: have a process started anew.
     """
 
     end: Collection[str] | None = None
     mode: Collection[str] | None = None
     clear: Collection[str] | None = None
     operate: Collection[str] = ()
+    restart: Collection[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,21 +166,22 @@ class Row:
     cause: Cause | None = None
 
 
-def _may(role: Collection[str] | None, who: str) -> bool:
-    return role is None or who in role
+def may(role: Collection[str] | None, who: str) -> bool:
+    """Whether `who` has a role."""
+    return role is None or who in role or component_of(who) in role
 
 
 def _may_clear(control: Control, ask: Ask, rules: Rules) -> bool:
     flagged_by = control.problems.get(ask.number, ask.who)
     solves = control.holder == ask.who and control.solving == ask.number
-    return flagged_by == ask.who or solves or _may(rules.roles.clear, ask.who)
+    return flagged_by == ask.who or solves or may(rules.roles.clear, ask.who)
 
 
 OTHERWISE = Condition("otherwise", lambda c, a, r: True)
 IS_MANUAL = Condition("the mode is manual", lambda c, a, r: c.mode is ControlMode.MANUAL)
 IS_OPERATOR = Condition(
     "the mode is manual and it has the role `operate`",
-    lambda c, a, r: c.mode is ControlMode.MANUAL and a.who in r.roles.operate,
+    lambda c, a, r: c.mode is ControlMode.MANUAL and may(r.roles.operate, a.who),
 )
 ASKER_HOLDS = Condition("it is in control", lambda c, a, r: c.holder == a.who)
 OTHER_HOLDS = Condition("another is in control", lambda c, a, r: c.holder not in (None, a.who))
@@ -196,8 +201,8 @@ HOLDER_SOLVES_IT = Condition(
 MAY_NOT_CLEAR = Condition(
     "another flagged it, and it has not the role `clear`", lambda c, a, r: not _may_clear(c, a, r)
 )
-MAY_NOT_SET_MODE = Condition("it has not the role `mode`", lambda c, a, r: not _may(r.roles.mode, a.who))
-MAY_NOT_END = Condition("it has not the role `end`", lambda c, a, r: not _may(r.roles.end, a.who))
+MAY_NOT_SET_MODE = Condition("it has not the role `mode`", lambda c, a, r: not may(r.roles.mode, a.who))
+MAY_NOT_END = Condition("it has not the role `end`", lambda c, a, r: not may(r.roles.end, a.who))
 NO_SUCH_MODE = Condition(
     "neither manual nor automated", lambda c, a, r: a.number not in (ControlMode.MANUAL, ControlMode.AUTOMATED)
 )

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from afspm.logic.arbitration import Cause
+from afspm.logic.chronicle import SCHEDULER, Chronicle
 from afspm.logic.errands import Errands
 from afspm.logic.events import Codec, Effect, Log, Reply, RequestIn, SaveState
 from afspm.logic.forwarding import NOT_SENT, UNKNOWN, End, Forwarder, Job, Settled
@@ -18,7 +19,7 @@ from afspm.logic.once import Fate, OnceTable, fingerprint
 from afspm.logic.sessions import Hearing, Sessions
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import Watchdog
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, component_of
 
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
@@ -26,6 +27,8 @@ _SENT_REMEMBERED = 100
 _UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
 OwnEnd = Callable[[Response, float, int], Iterable[Effect]]
 """Told of the answer to a request of the scheduler's own, with now_s and now_ns; what follows from it."""
+LATE = "late: it had been told that there was no answer"
+"""Of an answer of the translator that came after all."""
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 
 
@@ -38,6 +41,7 @@ class Desk:
     Args:
         holder: says who is in control.
         save: says what is to be saved.
+        chronicle: is told of every request that has got its answer.
         frame: the coordinates of components, where they are not those of the microscope.
     """
 
@@ -49,6 +53,7 @@ class Desk:
         lease: Lease,
         holder: Callable[[], str | None],
         save: Callable[[], SaveState],
+        chronicle: Chronicle,
         frame: CoordinateFrame | None = None,
     ) -> None:
         self.effects: list[Effect] = []
@@ -63,6 +68,7 @@ class Desk:
         self._lease = lease
         self._holder = holder
         self._save = save
+        self._chronicle = chronicle
         self._frame = frame
         self._asked_by_us: dict[int, OwnEnd] = {}
         self._ids_known: bool | None = None
@@ -117,7 +123,7 @@ class Desk:
         if not name:
             self._refuse(event, "say who you are: set the socket's identity to the component's name")
             return False
-        if event.user is not None and event.user != name:
+        if event.user is not None and event.user != component_of(name):
             self._refuse(event, f"the key is that of {event.user}, not of {name}")
             return False
         hearing = self.sessions.hear(event.connection, name, event.request.id, now_s)
@@ -131,8 +137,7 @@ class Desk:
         if event.connection not in self._refused:
             self._refused.add(event.connection)
             self._log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
-        response = Response(int(ControlResponse.FAILURE), b"", why, event.request.id)
-        self.effects.append(Reply(event.connection, event.name, response))
+        self._tell(event, Response(int(ControlResponse.FAILURE), b"", why, event.request.id))
 
     def _repeated(self, event: RequestIn, outcome: Fate | Response, now_s: float) -> bool:
         """A request comes again with its id: answer it without doing it again. False: it may be done."""
@@ -151,15 +156,18 @@ class Desk:
         if may_send and (self._holder() == name or reads(request)):
             return False
         reason = f"{UNKNOWN}it was sent once, and is not sent again"
-        response = Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id)
-        self.effects.append(Reply(event.connection, name, response))
+        self._tell(event, Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id))
         return True
 
-    def answer(self, event: RequestIn, code: ControlResponse, reason: str = "") -> None:
+    def answer(self, event: RequestIn, code: ControlResponse, reason: str = "", payload: bytes = b"") -> None:
         """Answer a request by ourselves, once and for all."""
-        response = Response(int(code), b"", reason, event.request.id)
+        response = Response(int(code), payload, reason, event.request.id)
         self._once.note(event.name, event.request, response)
+        self._tell(event, response)
+
+    def _tell(self, event: RequestIn, response: Response) -> None:
         self.effects.append(Reply(event.connection, event.name, response))
+        self._chronicle.answered(event.name, event.request, response, event.heard_s)
 
     def call_back(self, former: str, cause: Cause | None) -> None:
         """Commands of a former holder that have not been sent are not sent any more."""
@@ -213,7 +221,7 @@ class Desk:
         refusal.id = event.request.id
         self._log("WARNING", f"refused {event.name}: {refusal.reason}")
         self._once.note(event.name, event.request, refusal)
-        self.effects.append(Reply(event.connection, event.name, refusal))
+        self._tell(event, refusal)
 
     def _moves_first(self, event: RequestIn, now_s: float, now_ns: int) -> bool:
         """Whether the microscope has to be moved before an action; then it is, or the action is answered."""
@@ -247,11 +255,14 @@ class Desk:
     ) -> None:
         name, request = event.name, event.request
         seen = self._watchdog.states_seen
-        job = Job(name, request, command, 0, deadline_s, connection=event.connection, states_seen=seen, mapped=mapped)
+        job = Job(
+            name, request, command, 0, deadline_s,
+            connection=event.connection, states_seen=seen, mapped=mapped, heard_s=event.heard_s,
+        )  # fmt: skip
         refused = self.forwarder.ask(job, now_s)
         if refused is not None:
             self._once.forget(name, request)
-            self.effects.append(Reply(event.connection, name, refused.response))
+            self._tell(event, refused.response)
             return
         if request.id:
             self._once.note(name, request, Fate.PENDING)
@@ -283,6 +294,8 @@ class Desk:
             if response.code == _SUCCESS and (job.command or job.request.kind == _PARAM):
                 self._learn(job, response, now_ns)
         if not job.client:
+            if not reads(job.request):
+                self._chronicle.answered(SCHEDULER, job.request, response, job.heard_s)
             self._own_ended(job, end, response, now_s, now_ns)
         elif end is End.ANSWERED and _was_not_sent(response):
             self._forget(job, response)
@@ -290,6 +303,7 @@ class Desk:
             self._finish(job, response, _unknown_fate(response))
         elif end is End.LATE:
             self._once.note(job.client, job.request, _unknown_fate(response) or response)
+            self._chronicle.answered(job.client, job.request, response, job.heard_s, LATE)
             self._log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
         elif end is End.UNKNOWN:
             if job.request.kind == _ACTION:
@@ -310,6 +324,7 @@ class Desk:
 
     def _reply_to(self, job: Job, response: Response) -> None:
         """Answer over the newest connection of the client; without an id only over the one that it asked by."""
+        self._chronicle.answered(job.client, job.request, response, job.heard_s)
         connection = self.sessions.connection_of(job.client)
         if connection is not None and (job.request.id or connection == job.connection):
             self.effects.append(Reply(connection, job.client, response))
@@ -353,7 +368,8 @@ class Desk:
             self._once.forget(event.name, event.request)
         else:
             self._once.note(event.name, event.request, answer)
-        self._reply_to(Job(event.name, event.request, command=True, connection=event.connection), answer)
+        asked = Job(event.name, event.request, command=True, connection=event.connection, heard_s=event.heard_s)
+        self._reply_to(asked, answer)
 
     def _log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))

@@ -11,7 +11,15 @@ from afspm.model import PacketHeader
 
 EnvelopeMapping = Callable[[PacketHeader], str]
 
-DEFAULT_HISTORY = {"Scan2d": 5, "Spec1d": 10, "ScopeStateMsg": 10, "DriftMapping": 10, "ScanLines": 0}
+DEFAULT_HISTORY = {
+    "Scan2d": 5,
+    "Spec1d": 10,
+    "ScopeStateMsg": 10,
+    "DriftMapping": 10,
+    "ScanLines": 0,
+    "JournalEntries": 1000,
+    "LogLines": 1000,
+}
 """How many packets are kept of each envelope, by message; of all others one. Lines are of the moment."""
 
 

@@ -6,7 +6,7 @@ means something in the experiment.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -44,12 +44,22 @@ class RequestIn:
 
     Attributes:
         user: whose key it was, where connections are authenticated; None where they are not.
+        heard_s: when it was taken in for the first time, real; the scheduler fills that in.
     """
 
     connection: int
     name: str
     request: Request
     user: str | None = None
+    heard_s: float = -1.0
+
+
+@dataclass(slots=True)
+class Unreadable:
+    """What came from the peer `name` was no request, and was refused with `response`."""
+
+    name: str
+    response: Response
 
 
 @dataclass(slots=True)
@@ -143,6 +153,7 @@ Input = (
     | Disconnected
     | Greeted
     | RequestIn
+    | Unreadable
     | PacketIn
     | SubscriberJoined
     | TranslatorUp
@@ -227,6 +238,12 @@ Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill
 class Codec(Protocol):
     """The wire as far as decisions need it, so that they need not know the wire."""
 
+    def encode(self, thing: Any) -> bytes:
+        """A model object as the payload of a packet."""
+
+    def encode_orders(self, restart: Sequence[str]) -> bytes:
+        """The object of the answer to a supervisor: processes that it is to start anew."""
+
     def encode_control_state(self, state: ControlState) -> bytes:
         """A ControlState as the payload of a packet."""
 
@@ -240,4 +257,4 @@ class Codec(Protocol):
         """A ParameterMsg out of a response; None if it is not one."""
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
-        """The object of a small packet (ScopeStatus, Feedback, ScanParameters, ProbePosition); None if malformed."""
+        """The object of a small packet (ScopeStatus, Feedback, ProcessStates …); None if malformed."""

@@ -34,6 +34,7 @@ class Job:
         sent_s: when it was sent; None while it waits.
         answered: the client has been told that there was no response in time.
         states_seen: how many states the microscope had told when it was sent on its way.
+        heard_s: when it was asked, real.
         mapped: what is sent in place of `request`, where the microscope has other coordinates; None: that itself.
     """
 
@@ -47,6 +48,7 @@ class Job:
     connection: int = -1
     states_seen: int = 0
     mapped: Mapped | None = None
+    heard_s: float = 0.0
 
     @property
     def outgoing(self) -> Request:
@@ -138,7 +140,8 @@ class Forwarder:
         if not self.up:
             return None
         self.number += 1
-        job = Job("", request, command=True, number=self.number, deadline_s=now_s + self.timeout_s)
+        deadline_s = now_s + self.timeout_s
+        job = Job("", request, command=True, number=self.number, deadline_s=deadline_s, heard_s=now_s)
         if self.flight is None:
             self._send(job, now_s)
         else:

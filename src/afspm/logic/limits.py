@@ -24,6 +24,7 @@ from afspm.model import (
     Response,
     ScanParameters,
     ShapeChange,
+    component_of,
     names,
 )
 from afspm.model.geometry import XY
@@ -170,7 +171,7 @@ class Guard:
         if limit is None:
             return
         error = ControlResponse.ACTION_ERROR if what == "action" else ControlResponse.PARAM_ERROR
-        if limit.only is not None and who not in limit.only:
+        if limit.only is not None and not {who, component_of(who)} & set(limit.only):
             allowed = ", ".join(sorted(limit.only)) or "nobody"
             raise _Breach(error, f"{who} may not use the {what} {name}, only {allowed} ({limit.source})")
         last_ns = self._last_ns.get(name)

@@ -12,6 +12,7 @@ from afspm.errors import AfspmError
 from afspm.logic import arbitration
 from afspm.logic.arbitration import Ask, Cause, Control, Do, Event
 from afspm.logic.cache import TIME_STEP_NS, Cache
+from afspm.logic.chronicle import ENTRIES, Chronicle
 from afspm.logic.desk import Desk, OwnEnd, reads
 from afspm.logic.events import (
     Announced,
@@ -37,16 +38,20 @@ from afspm.logic.events import (
     TranslatorDown,
     TranslatorReply,
     TranslatorUp,
+    Unreadable,
 )
 from afspm.logic.frame import CoordinateFrame
 from afspm.logic.lease import Lease
 from afspm.logic.sessions import token_of
 from afspm.logic.settings import SchedulerSettings
+from afspm.logic.telling import Telling
 from afspm.logic.trust import TRANSLATOR, Trust
 from afspm.logic.watchdog import Watchdog
 from afspm.logic.words import is_routine, said
 from afspm.model import (
     CLOCK_REQUEST,
+    RESTART_REQUEST,
+    TELL_REQUEST,
     ControlRequest,
     ControlResponse,
     ControlState,
@@ -60,6 +65,7 @@ from afspm.model import (
     ScanParameters,
     ScopeState,
     ScopeStatus,
+    component_of,
 )
 
 __all__ = ["CONTROL_STATE", "SchedulerCore", "SchedulerSettings"]
@@ -106,7 +112,11 @@ class SchedulerCore:
         self._watchdog = Watchdog(settings.watchdog)
         self._trust = Trust(settings.malfunction_after_s)
         self._frame = frame
-        self._desk = desk = Desk(settings, codec, self._watchdog, self._lease, self._holder, self._save, frame)
+        self._chronicle = chronicle = Chronicle(self._rules.problems)
+        self._telling = Telling(codec)
+        self._desk = desk = Desk(
+            settings, codec, self._watchdog, self._lease, self._holder, self._save, chronicle, frame
+        )
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
         self._started_s = 0.0
         self._announce_at_s: float | None = None
@@ -120,6 +130,7 @@ class SchedulerCore:
         self._effects: list[Effect] = []
         self._handlers: dict[type, Callable[[Any, float, int], None]] = {
             RequestIn: self._on_request,
+            Unreadable: self._on_unreadable,
             TranslatorReply: self._on_reply,
             PacketIn: self._on_packet,
             Connected: self._on_connected,
@@ -143,15 +154,18 @@ class SchedulerCore:
         self._started_s = now_s
         self._lease.held_by(self._control.holder, now_ns)
         self._cache.remember(self._recent)
+        self._chronicle.at(now_s, now_ns)
         if self._control.ended:
             self._effects.append(Kill())
         else:  # first, in the order of time, what the translator published before we were there
             self._announce_at_s = now_s + self._settings.catch_up_s
+            self._chronicle.began(self._control, again=self._is_restarted)
         return self._effects
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
         """Take in what happened; `now_s` is real and monotonic, `now_ns` the experiment's time."""
         self._effects = self._desk.effects = []
+        self._chronicle.at(now_s, now_ns)
         self._handlers[type(event)](event, now_s, now_ns)
         self._held_due_s = now_s if self._held and self._announce_at_s is None else None
         return self._with_forwards()
@@ -172,6 +186,7 @@ class SchedulerCore:
             self._desk.mover.due_s(),
             self._held_due_s,
             self._malfunction_at_s(),
+            self._entries_due_s(),
         )
         for deadline_s in others_s:
             if deadline_s is not None and (soonest_s is None or deadline_s < soonest_s):
@@ -190,6 +205,7 @@ class SchedulerCore:
             "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
             "granted_to": self._granted_to,
+            "supervisors": self._telling.snapshot(),
             **self._desk.snapshot(),
             **({} if self._frame is None else {"frame": self._frame.snapshot()}),
         }
@@ -206,6 +222,7 @@ class SchedulerCore:
         self._watchdog.restore(map(str, state["wanted"]))
         self._granted_to = state.get("granted_to")
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
+        self._telling.restore(state.get("supervisors", {}))
         self._desk.restore(state)
         if self._frame is not None and "frame" in state:
             self._frame.restore(state["frame"])
@@ -260,7 +277,7 @@ class SchedulerCore:
             self._log("WARNING", f"{name} is in control and gone; it has {self._settings.grace_s:g} s to come back")
 
     def _on_greeted(self, event: Greeted, now_s: float, now_ns: int) -> None:
-        if event.name and (event.user is None or event.user == event.name):
+        if event.name and (event.user is None or event.user == component_of(event.name)):
             self._sessions.hear(event.connection, event.name, None, now_s)
 
     def _on_died(self, event: ComponentDied, now_s: float, now_ns: int) -> None:
@@ -273,7 +290,10 @@ class SchedulerCore:
     def _on_announced(self, event: Announced, now_s: float, now_ns: int) -> None:
         # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
         time_ns = now_ns if event.before_ns is None else event.before_ns - TIME_STEP_NS
-        packet, cached = self._cache.stamp(event.envelope, event.payload, time_ns)
+        self._announce(event.envelope, event.payload, time_ns)
+
+    def _announce(self, envelope: str, payload: bytes, time_ns: int) -> None:
+        packet, cached = self._cache.stamp(envelope, payload, time_ns)
         self._effects += [self._save(), Publish(packet, None, cached)]
 
     def _on_subscriber(self, event: SubscriberJoined, now_s: float, now_ns: int) -> None:
@@ -283,6 +303,8 @@ class SchedulerCore:
 
     def _on_request(self, event: RequestIn, now_s: float, now_ns: int) -> None:
         name, request = event.name, event.request
+        if event.heard_s < 0.0:
+            event.heard_s = now_s
         if self._is_too_early(request):
             self._held.append(event)
             return
@@ -290,8 +312,12 @@ class SchedulerCore:
             return
         kind = request.kind
         control_event = _CONTROL_EVENTS.get(kind)
-        if self._control.ended:
+        if kind == TELL_REQUEST:  # a supervisor's last words come after the end
+            self._on_told(event, now_s, now_ns)
+        elif self._control.ended:
             self._desk.answer(event, ControlResponse.FAILURE, "the experiment has ended")
+        elif kind == RESTART_REQUEST:
+            self._on_restart(event, now_s)
         elif kind == CLOCK_REQUEST:
             self._tell_time(event, now_ns)
         elif control_event is not None:
@@ -316,6 +342,32 @@ class SchedulerCore:
         response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
         self._effects.append(Reply(event.connection, event.name, response))
 
+    def _on_unreadable(self, event: Unreadable, now_s: float, now_ns: int) -> None:
+        self._chronicle.unreadable(event.name, event.response)
+
+    def _on_told(self, event: RequestIn, now_s: float, now_ns: int) -> None:
+        """Somebody has something to publish; a supervisor is told in return what it is to do."""
+        envelope, why = self._telling.envelope(event, now_s)
+        if not envelope:
+            self._desk.answer(event, ControlResponse.FAILURE, why)
+            return
+        orders = self._telling.orders_for(event.name)
+        self._announce(envelope, event.request.subject.payload, now_ns)
+        self._desk.answer(event, ControlResponse.SUCCESS, payload=self._codec.encode_orders(orders))
+
+    def _on_restart(self, event: RequestIn, now_s: float) -> None:
+        process = str(event.request.subject)
+        if not arbitration.may(self._rules.roles.restart, event.name):
+            why = f"{event.name} has not the role 'restart' ([control] roles)"
+        else:
+            why = self._telling.order(process, now_s)
+        if why:
+            self._desk.answer(event, ControlResponse.FAILURE, why)
+            return
+        self._effects.append(self._save())
+        self._log("INFO", f"{process} is to be started anew, as {event.name} wishes")
+        self._desk.answer(event, ControlResponse.SUCCESS)
+
     # --- control ---
 
     def _arbitrate(self, ask: Ask, event: RequestIn | None, now_s: float, now_ns: int) -> None:
@@ -336,6 +388,7 @@ class SchedulerCore:
         if event is not None and row.response is not None:
             self._desk.answer(event, row.response, arbitration.reason(row, before, ask, self._rules))
         if after.ended and not before.ended:
+            self._publish_entries(now_ns)
             self._effects.append(Kill())
 
     def _control_changed(
@@ -347,6 +400,7 @@ class SchedulerCore:
             had_died: `ask` is of a holder in another life than that in which it got control.
         """
         after = self._control
+        self._chronicle.changed(before, after, ask, row)
         self._lease.held_by(after.holder, now_ns)
         wanted: list[str] = []
         if row.cause is not None and (before.holder is not None or row.cause is Cause.MANUAL):
@@ -374,6 +428,16 @@ class SchedulerCore:
     def _publish_control(self, now_ns: int) -> None:
         publish = self._stamp_control(now_ns)
         self._effects += [self._save(), publish]
+
+    def _publish_entries(self, now_ns: int) -> None:
+        """What has happened since the last time."""
+        entries = self._chronicle.take()
+        if entries.entries:
+            self._announce(ENTRIES, self._codec.encode(entries), now_ns)
+
+    def _entries_due_s(self) -> float | None:
+        """When that is due; not while what was published before a restart may still come again."""
+        return None if self._announce_at_s is not None else self._chronicle.due_s
 
     def _stamp_control(self, now_ns: int) -> Publish:
         """The control state as a packet, which has its time before it is published: that is saved first."""
@@ -457,6 +521,12 @@ class SchedulerCore:
     # --- time ---
 
     def _on_tick(self, event: Tick, now_s: float, now_ns: int) -> None:
+        self._see_to_deadlines(now_s, now_ns)
+        entries_due_s = self._entries_due_s()
+        if entries_due_s is not None and now_s >= entries_due_s:
+            self._publish_entries(now_ns)
+
+    def _see_to_deadlines(self, now_s: float, now_ns: int) -> None:
         # one change of control in a step: it is saved and told before the next is decided
         if self._announce_at_s is not None and now_s >= self._announce_at_s:
             self._publish_control(now_ns)

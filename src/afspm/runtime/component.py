@@ -73,6 +73,8 @@ class Component:
     """Envelopes that it publishes itself: it then gets an address to do so."""
     listens: ClassVar[tuple[str, ...] | None] = None
     """Envelopes, or how they begin, that it subscribes to where the experiment file doesn't say; None: all."""
+    operates: ClassVar[bool] = False
+    """Whether a person commands the microscope by it in MANUAL mode, where the experiment file names nobody else."""
     needs_actions: tuple[str, ...] = ()
     """Actions that the microscope must have."""
     needs_parameters: tuple[str, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from afspm import wire
@@ -29,6 +30,9 @@ class WireCodec:
 
     def encode(self, thing: Any) -> bytes:
         return wire.encode(thing)[1]
+
+    def encode_orders(self, restart: Sequence[str]) -> bytes:
+        return wire.encode_orders(restart)
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
         """See `scheduler.drift.places.PlaceCodec`."""

@@ -2,7 +2,7 @@
 
 A folder with one file a packet, which follows what is cached: a thread writes what is new and deletes what went, some
 time after it happened. What was not written yet when the scheduler was killed the translator still has, and sends it
-again.
+again. What the scheduler itself publishes nobody else has: that is written before it is published.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ class Journal:
         self._condition = threading.Condition()
         self._closing = False
         self._failing = False
+        self._has_folder = False
         self._thread: threading.Thread | None = None
 
     def load(self) -> list[Entry]:
@@ -65,6 +66,19 @@ class Journal:
         """The cache is no longer what it was at the last `follow`. Costs next to nothing."""
         if self._due_s is None and self._folder is not None:
             self._due_s = max(self._clock.monotonic_s() + _PERIOD_S, self._not_before_s)
+
+    def keep(self, packet: Packet) -> None:
+        """Write a packet of the scheduler's own at once; it is newer than all that is cached."""
+        if self._folder is None or packet.time_ns is None:
+            return
+        try:
+            if not self._has_folder:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                self._has_folder = True
+            _store(self._folder / _name(packet.time_ns), packet, None)
+            self._written.add(packet.time_ns)
+        except OSError as error:
+            self._tell(error)
 
     @property
     def due_s(self) -> float | None:
@@ -101,24 +115,28 @@ class Journal:
                 self._write(wanted)
                 self._failing = False
             except OSError as error:
-                if not self._failing:  # once, not with every packet
-                    self._log.critical("the cache is not kept, a restarted scheduler will miss scans: %s", error)
-                self._failing = True
+                self._tell(error)
             now_s = self._clock.monotonic_s()
             self._not_before_s = now_s + (now_s - began_s) / _SHARE
+
+    def _tell(self, error: OSError) -> None:
+        if not self._failing:  # once, not with every packet
+            self._log.critical("the cache is not kept, a restarted scheduler will miss scans: %s", error)
+        self._failing = True
 
     def _write(self, wanted: tuple[Entry, ...]) -> None:
         folder = self._folder
         if folder is None:
             return
         folder.mkdir(parents=True, exist_ok=True)
-        times = {packet.time_ns for packet, _ in wanted}
+        times = {packet.time_ns for packet, _ in wanted if packet.time_ns is not None}
+        newest_ns = max(times, default=0)
         for packet, source_ns in wanted:
             if packet.time_ns is not None and packet.time_ns not in self._written:
                 _store(folder / _name(packet.time_ns), packet, source_ns)
                 self._written.add(packet.time_ns)
         # after the new ones: a kill in between leaves too much rather than too little
-        for time_ns in self._written - times:
+        for time_ns in [time_ns for time_ns in self._written - times if time_ns <= newest_ns]:  # newer ones were kept
             (folder / _name(time_ns)).unlink(missing_ok=True)
             self._written.discard(time_ns)
 

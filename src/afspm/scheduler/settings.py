@@ -42,7 +42,11 @@ def scheduler_settings(
 
 def _roles(table: Table) -> Roles:
     return Roles(
-        table.get("end_experiment"), table.get("set_mode"), table.get("clear_problems"), tuple(table.get("operate", ()))
+        table.get("end_experiment"),
+        table.get("set_mode"),
+        table.get("clear_problems"),
+        tuple(table.get("operate") or ()),
+        table.get("restart"),
     )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
-from afspm.model import ControlResponse, Packet, Response
+from afspm.model import TELL_REQUEST, ControlResponse, Packet, Response
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
@@ -28,6 +28,7 @@ _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
+_TELL = bytes([TELL_REQUEST])
 FAREWELL_S = 3.0
 """How long (real) after the end whoever comes late, or is started again, is still given what was measured and told that
 it is over."""
@@ -125,10 +126,7 @@ class Shell:
             elif source is sockets.router or source is sockets.router.monitor:
                 for event in sockets.router.receive() if source is sockets.router else sockets.router.follow():
                     if isinstance(event, PeerAsked) and event.frames:
-                        response = Response(
-                            ControlResponse.FAILURE, reason="the experiment has ended", id=_id_of(event)
-                        )
-                        sockets.router.reply(event.connection, wire.encode_response(response))
+                        self._asked_late(event)
             elif source is sockets.link:
                 sockets.link.receive()
             elif source is sockets.link.monitor:
@@ -138,6 +136,14 @@ class Shell:
                 sockets.subscriber.receive()
             else:
                 sockets.subscriber.follow()
+
+    def _asked_late(self, asked: PeerAsked) -> None:
+        """A supervisor says its last words; all others hear that it is over."""
+        if asked.frames[0] == _TELL:
+            self._request(asked)
+            return
+        response = Response(ControlResponse.FAILURE, reason="the experiment has ended", id=_id_of(asked))
+        self._sockets.router.reply(asked.connection, wire.encode_response(response))
 
     def close(self) -> None:
         """Write down what is cached, unless the experiment is over."""
@@ -170,6 +176,7 @@ class Shell:
             self._complaints.say(f"refused a request of {name or 'a nameless peer'}: {error}")
             response = Response(error.response, reason=str(error), id=_id_of(asked))
             self._sockets.router.reply(asked.connection, wire.encode_response(response))
+            self._take(events.Unreadable(name, response))
             return
         self._take(events.RequestIn(asked.connection, name, request, asked.user))
 
@@ -221,6 +228,8 @@ class Shell:
                 case events.Forward():
                     sockets.link.send(effect.number, wire.encode_request(effect.request))
                 case events.Publish():
+                    if effect.cached and effect.source_ns is None:
+                        self._journal.keep(effect.packet)
                     sockets.publisher.publish(effect.packet)
                     if effect.cached:
                         self._journal.changed()

@@ -17,6 +17,7 @@ from pathlib import Path
 import zmq
 
 from afspm.errors import ConfigError
+from afspm.model import component_of
 
 _NAME = re.compile(r"[A-Za-z0-9_. +-]{1,100}")
 _ENTRY = re.compile(r'^\s*(public-key|secret-key)\s*=\s*"([^"]{40})"\s*$', re.MULTILINE)
@@ -72,11 +73,14 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
 
 
 def from_launch(name: str, entries: Mapping[str, str] | None) -> Keys | None:
-    """The keys that a launch line speaks of: `{"folder": …, "<address>": "<name of who binds it>", …}`."""
+    """The keys that a launch line speaks of: `{"folder": …, "<address>": "<name of who binds it>", …}`.
+
+    Whoever acts for a person ("dashboard:Ada") does so with the key of the component.
+    """
     if not entries or "folder" not in entries:
         return None
     servers = {address: owner for address, owner in entries.items() if "://" in address}
-    return load(entries["folder"], name, servers)
+    return load(entries["folder"], component_of(name), servers)
 
 
 def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from afspm.logic.chronicle import PERIOD_S
 from afspm.logic.events import (
     Connected,
     Effect,
@@ -13,6 +14,7 @@ from afspm.logic.events import (
     Publish,
     Reply,
     RequestIn,
+    Tick,
     TranslatorCaughtUp,
     TranslatorReply,
     TranslatorUp,
@@ -23,6 +25,7 @@ from afspm.model import (
     ControlMode,
     ControlRequest,
     ControlResponse,
+    JournalEntry,
     Packet,
     PacketHeader,
     Request,
@@ -47,6 +50,7 @@ class Lab:
         self.effects: list[Effect] = []
         self.forwarded: list[Forward] = []
         self.newest = 0
+        self.entries_seen = 0
         if state is not None:
             self.core.restore(state)
         self.effects += self.core.start(self.now_s, self.now_ns)
@@ -60,6 +64,14 @@ class Lab:
     def later(self, real_s: float = 0.0, experiment_s: float = 0.0) -> None:
         self.now_s += real_s
         self.now_ns += round(experiment_s * NS)
+
+    def entries(self) -> list[JournalEntry]:
+        """Wait until what has happened is published; returns what was since the last time."""
+        self.later(PERIOD_S)
+        self.step(Tick())
+        told = [self.codec.decode(p.payload) for p in published(self.effects) if p.envelope == "JournalEntries"]
+        new, self.entries_seen = told[self.entries_seen :], len(told)
+        return [entry for entries in new for entry in entries.entries]
 
     def connect(self, name: str) -> int:
         self.newest += 1

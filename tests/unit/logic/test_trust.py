@@ -49,6 +49,7 @@ def test_a_microscope_that_stays_lost_is_a_malfunction_and_nobody_stays_in_contr
     lose(lab, PATIENCE_S)
     assert (problems(lab), lab.holder) == ({LOST: "translator"}, None)
     assert lab.take_control("series") is ControlResponse.WRONG_EXP_PROBLEM
+    lab.entries()
     assert lab.core.deadline_s() is None  # there is nothing more to wait for
 
 

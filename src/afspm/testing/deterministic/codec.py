@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from afspm.model import ControlState, Parameter
@@ -23,6 +24,9 @@ class TableCodec:
 
     def decode(self, payload: bytes | memoryview) -> Any:
         return self._objects[int(bytes(payload))]
+
+    def encode_orders(self, restart: Sequence[str]) -> bytes:
+        return self.encode(tuple(restart))
 
     def encode_control_state(self, state: ControlState) -> bytes:
         return self.encode(state)

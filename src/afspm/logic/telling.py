@@ -1,0 +1,102 @@
+"""What others have the scheduler publish, and what supervisors are ordered to do in return."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from afspm.logic.events import Codec, RequestIn
+from afspm.model import LogLines, ProcessStates, Progress, Told, component_of
+
+SUPERVISOR = "supervisor"
+"""Whose key it takes, where there are keys, to speak of processes; each supervisor adds ":" and what tells it apart."""
+LONGEST = 256 * 1024
+"""Bytes that may be told at a time."""
+SILENT_S = 10.0
+"""A supervisor that has not been heard of for so long, real time, is given no more orders."""
+_MOST = 64  # supervisors
+
+
+@dataclass(slots=True)
+class _Supervisor:
+    """One, by the name it asks under; `told_s` is None for one that was known before a restart of ours."""
+
+    processes: tuple[str, ...]
+    told_s: float | None = None
+    orders: list[str] = field(default_factory=list)
+
+
+class Telling:
+    """Knows which supervisor has which processes, and what each is still to be ordered."""
+
+    def __init__(self, codec: Codec) -> None:
+        self._codec = codec
+        self._supervisors: dict[str, _Supervisor] = {}
+
+    def snapshot(self) -> dict[str, Any]:
+        """What must survive a kill, as plain JSON."""
+        return {name: [list(one.processes), list(one.orders)] for name, one in self._supervisors.items()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take up what `snapshot` wrote."""
+        self._supervisors = {
+            str(name): _Supervisor(tuple(map(str, processes)), None, list(map(str, orders)))
+            for name, (processes, orders) in state.items()
+        }
+
+    def envelope(self, event: RequestIn, now_s: float) -> tuple[str, str]:
+        """The envelope under which to publish what is told, or "" and why it is not."""
+        told = event.request.subject
+        if not isinstance(told, Told):
+            return "", "nothing is told"
+        if len(told.payload) > LONGEST:
+            return "", f"{len(told.payload)} bytes are told at once, at most {LONGEST} may be"
+        thing = self._codec.decode_packet(told.message, told.payload)
+        if isinstance(thing, Progress) and told.message == "Progress":
+            mine = thing.name in (event.name, component_of(event.name))
+            return _named(told.message, thing.name) if mine else ("", f"{event.name} is not {thing.name}")
+        if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != told.message:
+            return "", f"a {told.message[:80]} is not published for others, or can't be read"
+        if event.user not in (None, SUPERVISOR):
+            return "", f"it takes the key of {SUPERVISOR!r} to speak of processes, not that of {event.user}"
+        if isinstance(thing, LogLines):
+            return told.message, ""
+        envelope, why = _named(told.message, thing.supervisor)
+        if not why:
+            self._know(event.name, tuple(state.name for state in thing.processes), now_s)
+        return envelope, why
+
+    def orders_for(self, supervisor: str) -> list[str]:
+        """Processes that a supervisor is to start anew; it has been told of them then."""
+        known = self._supervisors.get(supervisor)
+        if known is None:
+            return []
+        orders, known.orders = known.orders, []
+        return orders
+
+    def order(self, process: str, now_s: float) -> str:
+        """Have a process started anew; returns why that can't be, or ""."""
+        having = {name: one for name, one in self._supervisors.items() if process in one.processes}
+        if not having:
+            known = sorted({process for one in self._supervisors.values() for process in one.processes})
+            return f"no supervisor has a process {process!r}; known: {', '.join(known) or 'none'}"
+        newest = max(having.values(), key=lambda one: now_s if one.told_s is None else one.told_s)
+        if newest.told_s is not None and now_s - newest.told_s > SILENT_S:
+            return f"the supervisor of {process} has not been heard of for {now_s - newest.told_s:.0f} s"
+        if process not in newest.orders:
+            newest.orders.append(process)
+        return ""
+
+    def _know(self, name: str, processes: tuple[str, ...], now_s: float) -> None:
+        known = self._supervisors.pop(name, None) or _Supervisor(())
+        known.processes, known.told_s = processes, now_s
+        self._supervisors[name] = known  # the one heard of last is last
+        if len(self._supervisors) > _MOST:
+            del self._supervisors[next(iter(self._supervisors))]
+
+
+def _named(message: str, whose: str) -> tuple[str, str]:
+    if not whose or len(whose) > 200 or "\0" in whose:
+        return "", f"a {message} does not say whose it is"
+    return f"{message}_{whose}", ""
