@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from afspm.components import verdicts
-from afspm.components.night_record import NightRecord, control_entry, mark_entry, scan_entry
 from afspm.components.records import LineFile
 from afspm.model import ControlState, Scan, ScopeState, ScopeStatus
+from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
 from afspm.runtime.component import Component
 
 
@@ -43,7 +43,7 @@ class NightPicture(Component):
     def on_tick(self) -> None:
         if not self._drawing_is_loaded and importlib.util.find_spec("matplotlib"):
             # now, when there is time: at the end all must be quick
-            importlib.import_module("afspm.components.night_figure").prepare()
+            importlib.import_module("afspm.record.night_figure").prepare()
         self._drawing_is_loaded = True
 
     def on_control(self, control_state: ControlState) -> None:
@@ -75,7 +75,7 @@ class NightPicture(Component):
             self.log.info("no scan, no picture")
             return
         try:
-            from afspm.components.night_figure import draw
+            from afspm.record.night_figure import draw
         except ImportError:
             self.log.error(
                 'no picture without matplotlib: pip install "afspm[plot]"; the record is in %s', self._file.path

@@ -6,9 +6,12 @@ from typing import Any
 
 from afspm import wire
 from afspm.model import Scan
+from afspm.record.night_record import BAD
+
+__all__ = ["BAD", "GOOD", "MESSAGE", "UNCLEAR", "read_verdict", "verdict_message"]
 
 MESSAGE = "SpatialROIWithScoreList"
-GOOD, UNCLEAR, BAD = 1.0, 0.5, 0.0
+GOOD, UNCLEAR = 1.0, 0.5
 
 
 def verdict_message(scan: Scan, score: float) -> Any:

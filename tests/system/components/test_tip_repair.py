@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from afspm.components.night_record import NightRecord
 from afspm.model import Problem
+from afspm.record.night_record import NightRecord
 
 SAMPLE = Path(__file__).parents[3] / "experiments" / "tip_repair" / "experiment.toml"
 SHORTER = """

@@ -12,7 +12,9 @@ from runtime_lab import REGION, Lab, context_of, run
 
 from afspm import wire
 from afspm.components.night_picture import NightPicture
-from afspm.components.night_record import (
+from afspm.components.verdicts import BAD, MESSAGE, verdict_message
+from afspm.model import ControlMode, ControlState, Problem, Region, Scan, ScopeState
+from afspm.record.night_record import (
     THUMBNAIL_PX,
     NightRecord,
     control_entry,
@@ -20,12 +22,10 @@ from afspm.components.night_record import (
     scan_entry,
     thumbnail,
 )
-from afspm.components.verdicts import BAD, MESSAGE, verdict_message
-from afspm.model import ControlMode, ControlState, Problem, Region, Scan, ScopeState
 from afspm.runtime.exit_codes import ExitCode
 
 pytest.importorskip("matplotlib")
-from afspm.components.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by, main
+from afspm.record.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by, main
 
 MINUTE_NS = 60_000_000_000
 TIP = int(Problem.TIP_SHAPE_CHANGED)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from afspm.model import ControlMode, ControlState, Scan
 
 THUMBNAIL_PX = 64
+BAD = 0.0
+"""The score of a scan that was judged to show a bad tip."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,18 @@ class Mark:
 
 @dataclass
 class NightRecord:
-    """Everything that the picture shows."""
+    """Everything that the picture shows.
+
+    Attributes:
+        scans_taken: how many scans there were, if not all are among `shots`.
+    """
 
     shots: list[Shot] = field(default_factory=list)
     control: list[tuple[int, ControlState]] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
     interruptions: list[int] = field(default_factory=list)
     end_ns: int = 0
+    scans_taken: int | None = None
     _known: set[str] = field(default_factory=set, repr=False)
 
     @classmethod
@@ -96,6 +103,11 @@ class NightRecord:
         """When the first thing happened: the first scan, or the first control."""
         times = [shot.start_ns or shot.time_ns for shot in self.shots] + [t for t, s in self.control if s.holder]
         return min(times, default=self.end_ns)
+
+    @property
+    def scans(self) -> int:
+        """How many there were."""
+        return len(self.shots) if self.scans_taken is None else self.scans_taken
 
     @property
     def holders(self) -> list[str]:

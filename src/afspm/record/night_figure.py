@@ -1,6 +1,6 @@
 """A `NightRecord` as a figure: contact sheet, bands over the night, and a close look at each repair.
 
-    python -m afspm.components.night_figure RUN_FOLDER
+    python -m afspm.record.night_figure RUN_FOLDER
 
 draws it again from what a run has left.
 """
@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.components import verdicts
-from afspm.components.night_record import Mark, NightRecord, Shot, Span
 from afspm.model import ProblemNames, names
+from afspm.record.night_record import BAD, Mark, NightRecord, Shot, Span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -109,7 +108,7 @@ def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, 
     until = f"{end:%H:%M}" if begin.date() == end.date() else f"{end:%Y-%m-%d %H:%M}"
     what = f"{title}   " if title else ""
     y = 1 - 0.17 / height_in
-    about = f"{what}{begin:%Y-%m-%d %H:%M} to {until} UTC, {len(record.shots)} scans"
+    about = f"{what}{begin:%Y-%m-%d %H:%M} to {until} UTC, {record.scans} scans"
     figure.text(0.03, y, about, size=7, va="center")
     legend = "bar: who was in control, as in b; framed: the tip was judged bad"
     figure.text(0.86, y, legend, size=5.5, va="center", ha="right")
@@ -133,7 +132,7 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
         canvas[y : y + THUMB_PX, x : x + THUMB_PX] = picture
         bar = _rgb(colours.get(record.holder_of(shot) or "", NOBODY))
         canvas[y + THUMB_PX + 1 : y + THUMB_PX + BAR_PX, x : x + THUMB_PX] = bar
-        if record.verdict(shot) == verdicts.BAD:
+        if record.verdict(shot) == BAD:
             _frame(canvas[y : y + THUMB_PX, x : x + THUMB_PX], _rgb(PROBLEM))
     ax.imshow(canvas, interpolation="nearest", aspect="auto")
     ax.set_axis_off()
@@ -191,7 +190,7 @@ def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], *
 
 def flagged_by(record: NightRecord, span: Span) -> str:
     """Who thought badly of a scan just when a problem was flagged; empty if nobody said so."""
-    near = [m for m in record.marks if m.score == verdicts.BAD and abs(m.time_ns - span.start_ns) < AROUND_NS / 4]
+    near = [m for m in record.marks if m.score == BAD and abs(m.time_ns - span.start_ns) < AROUND_NS / 4]
     return min(near, key=lambda m: abs(m.time_ns - span.start_ns)).by if near else ""
 
 
@@ -262,9 +261,7 @@ def _chosen(record: NightRecord) -> list[Shot]:
     if len(shots) <= MOST_SHOTS:
         return shots
     series = record.holders[0] if record.holders else None
-    odd = {
-        i for i, shot in enumerate(shots) if record.holder_of(shot) != series or record.verdict(shot) == verdicts.BAD
-    }
+    odd = {i for i, shot in enumerate(shots) if record.holder_of(shot) != series or record.verdict(shot) == BAD}
     odd = set(sorted(odd)[: MOST_SHOTS // 2])
     rest = [i for i in range(len(shots)) if i not in odd]
     even = np.linspace(0, len(rest) - 1, MOST_SHOTS - len(odd)).round().astype(int)
