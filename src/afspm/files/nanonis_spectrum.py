@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from datetime import tzinfo
 from pathlib import Path
@@ -42,10 +43,15 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
     names, units = zip(*map(_name_and_unit, columns), strict=True)
     values = np.array([[float(cell) for cell in line] for line in lines])
     end = _time(header, ("Saved Date", "Date"), zone)
-    position = (float(header["X (m)"]), float(header["Y (m)"])) if "X (m)" in header and "Y (m)" in header else None
-    spectrum = Spectrum(position, header["Experiment"], names, units, values, end, str(path))
+    spectrum = Spectrum(_position_m(header), header["Experiment"], names, units, values, end, str(path))
     start = _time(header, ("Start time",), zone)
     return FileContent(CONTROLLER, spectra=(spectrum,), header=header, start_ns=start, end_ns=end)
+
+
+def _position_m(header: dict[str, str]) -> tuple[float, float] | None:
+    """Where the tip was; None if that is not said, or is no place."""
+    x, y = (float(header.get(f"{axis} (m)", "nan")) for axis in "XY")
+    return (x, y) if math.isfinite(x) and math.isfinite(y) else None
 
 
 def _name_and_unit(column: str) -> tuple[str, str]:

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-from functools import cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from corpus import reading, whole
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import DATA, WHOLE
 
-import afspm
 from afspm.errors import FileError
-from afspm.files import FileContent
 
 pytest.importorskip("h5py")
 pytest.importorskip("scipy")
 
-REAL = [
+SOME = [
     "asylum/DTMicroscope_scan_0001.ibw",
     "asylum/fmt-igor-fd_SiN_FD_plot.ibw",
     "nanonis/ProbeFlow_nanonis.sxm",
@@ -31,28 +27,12 @@ REAL = [
 ]
 
 
-@cache
-def whole(name: str) -> bytes:
-    if name in WHOLE:
-        with TemporaryDirectory() as folder:
-            WHOLE[name](Path(folder) / name)
-            return (Path(folder) / name).read_bytes()
-    return (DATA / name).read_bytes()
-
-
 def need(name: str) -> None:
     if name not in WHOLE and not (DATA / name).is_file():
         pytest.skip(f"{DATA / name} is missing")
 
 
-def reading(content: bytes, name: str) -> FileContent:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / Path(name).name
-        path.write_bytes(content)
-        return afspm.read(path)
-
-
-@pytest.mark.parametrize("name", [*WHOLE, *REAL])
+@pytest.mark.parametrize("name", [*WHOLE, *SOME])
 @settings(max_examples=40)
 @given(data=st.data())
 def test_a_file_that_was_cut_off_is_refused_or_holds_the_same(name: str, data: st.DataObject) -> None:
@@ -69,7 +49,7 @@ def test_a_file_that_was_cut_off_is_refused_or_holds_the_same(name: str, data: s
             np.testing.assert_array_equal(part.values, complete.values[:rows])
 
 
-@pytest.mark.parametrize("name", [n for n in [*WHOLE, *REAL] if not n.endswith(".dat")])
+@pytest.mark.parametrize("name", [n for n in [*WHOLE, *SOME] if not n.endswith(".dat")])
 def test_values_that_are_cut_off_are_refused(name: str) -> None:
     need(name)
     content = whole(name)
@@ -78,7 +58,7 @@ def test_values_that_are_cut_off_are_refused(name: str) -> None:
             reading(content[:length], name)
 
 
-@pytest.mark.parametrize("name", [*WHOLE, *REAL])
+@pytest.mark.parametrize("name", [*WHOLE, *SOME])
 @settings(max_examples=60)
 @given(data=st.data())
 def test_damaged_bytes_are_refused_or_read_and_nothing_else(name: str, data: st.DataObject) -> None:

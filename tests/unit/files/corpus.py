@@ -1,0 +1,32 @@
+"""Files to cut and damage: those of real microscopes, where they are, and small ones as the controllers write them."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from samples import DATA, WHOLE
+
+import afspm
+from afspm.files import FORMATS, FileContent
+
+REAL = sorted(path.relative_to(DATA).as_posix() for path in DATA.rglob("*") if path.suffix in FORMATS)
+
+
+@cache
+def whole(name: str) -> bytes:
+    """Of one of `WHOLE` or `REAL`."""
+    if name not in WHOLE:
+        return (DATA / name).read_bytes()
+    with TemporaryDirectory() as folder:
+        WHOLE[name](Path(folder) / name)
+        return (Path(folder) / name).read_bytes()
+
+
+def reading(content: bytes, name: str) -> FileContent:
+    """What is in a file of that name. Raises FileError: as `afspm.read`."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / Path(name).name
+        path.write_bytes(content)
+        return afspm.read(path)
