@@ -15,8 +15,8 @@ Reader = Callable[[Path, tzinfo | None], FileContent]
 # By suffix, "module:function" of this package.
 FORMATS = {
     ".ibw": "asylum:read_igor",
-    ".h5": "nsid:read_nsid",
-    ".hdf5": "nsid:read_nsid",
+    ".h5": "nexus:read_hdf5",
+    ".hdf5": "nexus:read_hdf5",
     ".sxm": "nanonis:read_scan",
     ".dat": "nanonis_spectrum:read_spectrum",
     ".nc": "gxsm:read_netcdf",

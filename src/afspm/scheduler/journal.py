@@ -15,6 +15,7 @@ from pathlib import Path
 
 from afspm.clock import Clock
 from afspm.model import Packet
+from afspm.record.ahead import FOLDER_SUFFIX, RECORDED_FILE, Ahead, written_ahead
 
 _PERIOD_S = 0.05
 # the thread may take this part of the time at most, so that a flood of large scans is not slowed down by the disk
@@ -33,6 +34,10 @@ class Journal:
     """
 
     def __init__(self, folder: Path | None, clock: Clock, log: logging.Logger) -> None:
+        recorded = folder.parent / RECORDED_FILE if folder else None
+        self._ahead: Ahead | None = None
+        if folder is not None and recorded is not None and recorded.exists():
+            self._ahead = Ahead(folder.with_suffix(FOLDER_SUFFIX), recorded)
         self._folder = folder
         self._clock = clock
         self._log = log
@@ -43,15 +48,16 @@ class Journal:
         self._condition = threading.Condition()
         self._closing = False
         self._failing = False
+        self._defenceless = False
         self._has_folder = False
         self._thread: threading.Thread | None = None
 
     def load(self) -> list[Entry]:
         """What was cached, oldest first. Damaged files are told of and deleted."""
-        if self._folder is None or not self._folder.is_dir():
+        if self._folder is None:
             return []
         entries: list[Entry] = []
-        for file in sorted(self._folder.iterdir()):
+        for file in sorted(self._folder.iterdir()) if self._folder.is_dir() else ():
             entry = _read(file) if file.suffix == _SUFFIX else None
             if entry is not None and entry[0].time_ns is not None:
                 entries.append(entry)
@@ -60,7 +66,29 @@ class Journal:
             if file.suffix == _SUFFIX:
                 self._log.warning("deleted a damaged packet of the cache: %s", file)
             file.unlink(missing_ok=True)
-        return entries
+        return self._with_ahead(self._folder, entries)
+
+    def _with_ahead(self, folder: Path, entries: list[Entry]) -> list[Entry]:
+        """With what was published after the thread had written last."""
+        found = {packet.time_ns or 0: (packet, source_ns) for packet, source_ns in entries}
+        newest_ns = max((packet.time_ns or 0 for packet, source_ns in entries if source_ns is not None), default=-1)
+        for written in written_ahead(folder.with_suffix(FOLDER_SUFFIX), newest_ns):
+            if written.cached:
+                found.setdefault(written.packet.time_ns or 0, (written.packet, written.source_ns))
+        return [found[time_ns] for time_ns in sorted(found)]
+
+    def note(self, packet: Packet, source_ns: int | None, *, cached: bool) -> None:
+        """A packet is about to be published."""
+        if self._ahead is None:
+            return
+        try:
+            kept = self._ahead.note(packet, source_ns, cached=cached)
+            complaint = "" if kept else "the recorder does not keep up"
+        except OSError as error:
+            complaint = str(error)
+        if complaint and not self._defenceless:
+            self._log.critical("what is published now would be lost in a power cut: %s", complaint)
+        self._defenceless = bool(complaint)
 
     def changed(self) -> None:
         """The cache is no longer what it was at the last `follow`. Costs next to nothing."""
@@ -95,8 +123,10 @@ class Journal:
             self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
             self._thread.start()
 
-    def close(self) -> None:
+    def close(self, *, ended: bool = False) -> None:
         """Write what is still to be written. Safe to repeat."""
+        if self._ahead is not None:
+            self._ahead.close(ended=ended)
         with self._condition:
             self._closing = True
             self._condition.notify()

@@ -149,7 +149,7 @@ class Shell:
         """Write down what is cached, unless the experiment is over."""
         if not self.ended:
             self._journal.follow(self._core.cached())
-        self._journal.close()
+        self._journal.close(ended=self.ended)
 
     # --- what comes in ---
 
@@ -230,6 +230,7 @@ class Shell:
                 case events.Publish():
                     if effect.cached and effect.source_ns is None:
                         self._journal.keep(effect.packet)
+                    self._journal.note(effect.packet, effect.source_ns, cached=effect.cached)
                     sockets.publisher.publish(effect.packet)
                     if effect.cached:
                         self._journal.changed()

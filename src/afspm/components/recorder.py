@@ -1,0 +1,102 @@
+"""`Recorder`: keeps the record of a run. It is part of every experiment, unless [record] of its file says otherwise."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from afspm.model import Frame
+from afspm.runtime.component import Component
+from afspm.runtime.exit_codes import ExitCode
+from afspm.transport.port import CaughtUp, Killed, PacketReceived, ParentGone
+
+if TYPE_CHECKING:
+    from afspm.record.store import About
+    from afspm.runtime.process import Context
+
+EXPERIMENT_FILE = "experiment.toml"
+
+
+class Recorder(Component):
+    """Writes `journal.sqlite`, and every scan and spectrum as an HDF5 file, into the folder of the run.
+
+    It only listens. Whatever is killed, also everything at once, nothing that was published is missing in the record
+    of a run that is resumed, and nothing is there twice. A disk that is full is told; the experiment goes on, and what
+    was missed is recorded once there is room, as far as it is still kept then.
+
+    Args:
+        scans: whether scans and spectra are kept; else only the journal is.
+    """
+
+    listens: ClassVar = None
+    records: ClassVar[bool] = True
+    longest_step_s: ClassVar[float] = 120.0
+
+    def __init__(self, scans: bool = True) -> None:
+        self.scans = scans
+
+    def run_process(self, context: Context) -> int:
+        from afspm.components.recording import Writer
+
+        launch = context.launch
+        run_dir = Path(launch.run_dir or ".")
+        context.activity.longest_step_s = self.longest_step_s
+        port = context.open_port()
+        source = launch.sockets.subscribe[0] if launch.sockets.subscribe else ""
+        writer = Writer(
+            run_dir,
+            Path(launch.state_dir) if launch.state_dir else None,
+            _about(context, run_dir, scans=self.scans),
+            context.clock,
+            context.log,
+            step=context.activity.step,
+            wake=port.wake_up,
+        )
+        writer.start()
+        try:
+            while True:
+                for incoming in port.poll(None):
+                    match incoming:
+                        case PacketReceived():
+                            writer.put(incoming.packet, "" if incoming.source == source else incoming.source)
+                        case CaughtUp() if incoming.source == source:
+                            writer.caught_up()
+                        case Killed():
+                            writer.finish(ended=True)
+                            return ExitCode.ENDED
+                        case ParentGone():
+                            writer.finish(ended=False)
+                            return ExitCode.ORPHAN
+                writer.check()
+                if writer.wants_replay():
+                    port.close()
+                    port = context.open_port()
+        finally:
+            port.close()
+
+
+def _about(context: Context, run_dir: Path, *, scans: bool) -> About:
+    from afspm.record.store import About
+
+    launch = context.launch
+    frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
+    name, seeds = _said(run_dir / EXPERIMENT_FILE)
+    facts: dict[str, Any] = {
+        "experiment": name,
+        "run": run_dir.resolve().name,
+        "simulated": launch.simulated,
+        "seeds": seeds,
+        "frame": frame.value,
+    }
+    return About(facts, context.problems, frame, measured=scans)
+
+
+def _said(file: Path) -> tuple[str, dict[str, Any]]:
+    """What the experiment file says: its name, and the seed of each component that has one."""
+    try:
+        said = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return "", {}
+    seeds = {name: table["seed"] for name, table in said.items() if isinstance(table, dict) and "seed" in table}
+    return str(said.get("name", "")), seeds

@@ -1,0 +1,125 @@
+"""journal.sqlite: the tables, and how the file is opened. One process writes, any number read meanwhile."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+from afspm.errors import FileError
+
+JOURNAL_FILE = "journal.sqlite"
+FORMAT = "afspm record 1"
+
+_TABLES = """
+CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+-- Everything that was published. What is measured has its values in a file: the payload is the rest of the message.
+CREATE TABLE IF NOT EXISTS packets (
+  time_ns INTEGER NOT NULL, envelope TEXT NOT NULL, message TEXT NOT NULL, source TEXT NOT NULL,
+  payload BLOB NOT NULL, scan INTEGER, spectrum INTEGER, channel TEXT, first_row INTEGER, rows INTEGER);
+CREATE UNIQUE INDEX IF NOT EXISTS packets_once ON packets (time_ns, envelope);
+CREATE INDEX IF NOT EXISTS packets_by_message ON packets (message, time_ns);
+-- Lengths in m, angles in rad; channels and problems as JSON. An interrupted scan without lines has no file.
+CREATE TABLE IF NOT EXISTS scans (
+  number INTEGER PRIMARY KEY, time_ns INTEGER NOT NULL, began_ns INTEGER, filename TEXT NOT NULL, file TEXT NOT NULL,
+  interrupted INTEGER NOT NULL, center_x REAL, center_y REAL, width REAL, height REAL, angle REAL, frame TEXT,
+  rows INTEGER, columns INTEGER, channels TEXT NOT NULL, holder TEXT, mode TEXT, problems TEXT NOT NULL);
+CREATE UNIQUE INDEX IF NOT EXISTS scans_once ON scans (time_ns, filename, interrupted);
+CREATE TABLE IF NOT EXISTS spectra (
+  number INTEGER PRIMARY KEY, time_ns INTEGER NOT NULL, began_ns INTEGER, filename TEXT NOT NULL, file TEXT NOT NULL,
+  kind TEXT NOT NULL, x REAL, y REAL, frame TEXT, points INTEGER NOT NULL, names TEXT NOT NULL, units TEXT NOT NULL,
+  holder TEXT, mode TEXT, problems TEXT NOT NULL);
+CREATE UNIQUE INDEX IF NOT EXISTS spectra_once ON spectra (time_ns, filename, kind);
+-- Requests with their answers, changes of control, orders.
+CREATE TABLE IF NOT EXISTS entries (
+  time_ns INTEGER NOT NULL, kind TEXT NOT NULL, who TEXT NOT NULL, what TEXT NOT NULL, response INTEGER,
+  reason TEXT NOT NULL, took_s REAL);
+CREATE INDEX IF NOT EXISTS entries_by_time ON entries (time_ns);
+-- A row for each change of a process, not for each time that it was told.
+CREATE TABLE IF NOT EXISTS processes (
+  time_ns INTEGER NOT NULL, name TEXT NOT NULL, role TEXT NOT NULL, condition INTEGER NOT NULL,
+  since_ns INTEGER NOT NULL, starts INTEGER NOT NULL, pid INTEGER NOT NULL, last_exit TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS log (
+  time_ns INTEGER NOT NULL, name TEXT NOT NULL, level TEXT NOT NULL, text TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS log_by_time ON log (time_ns);
+"""
+
+
+def open_to_write(folder: Path) -> sqlite3.Connection:
+    """The journal in a run folder, made if it is not there.
+
+    Raises:
+        FileError: it is damaged, or something else.
+        sqlite3.OperationalError: the disk is full …
+    """
+    path = folder / JOURNAL_FILE
+    connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=30.0)
+    try:
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.executescript(_TABLES)
+        connection.execute("INSERT OR IGNORE INTO about VALUES ('format', ?)", (FORMAT,))
+        check_format(connection, path)
+    except sqlite3.OperationalError:
+        connection.close()
+        raise
+    except (sqlite3.DatabaseError, FileError) as error:
+        connection.close()
+        raise damaged(path, error) from error
+    return connection
+
+
+def open_to_read(folder: Path) -> sqlite3.Connection:
+    """The journal in a run folder, which may be written at the same time, or on a disk that can't be written to.
+
+    Raises:
+        FileError: there is none, or it is damaged, or something else.
+    """
+    path = folder / JOURNAL_FILE
+    if not path.is_file():
+        raise FileError("there is no record in this folder", where=str(folder), hint="name the folder of a run, runs/…")
+    try:
+        try:
+            return _checked(f"{path.resolve().as_uri()}?mode=ro", path)
+        except sqlite3.OperationalError as error:
+            if "unable to open" not in str(error) and "readonly" not in str(error):
+                raise
+            return _checked(f"{_copy(path).as_uri()}?mode=ro", path)  # what is beside it can't be made there
+    except sqlite3.DatabaseError as error:
+        raise damaged(path, error) from error
+
+
+def damaged(path: Path, error: Exception) -> FileError:
+    """What to say of a journal that can't be read."""
+    return error if isinstance(error, FileError) else FileError(f"is damaged: {error}", where=str(path))
+
+
+def check_format(connection: sqlite3.Connection, path: Path) -> None:
+    """Raises FileError: it is something else, or of a version to come."""
+    found = connection.execute("SELECT value FROM about WHERE name = 'format'").fetchone()
+    if found is None or found[0] != FORMAT:
+        said = found[0] if found else "something else"
+        raise FileError(f"is no journal of this version: {said}", where=str(path), hint="a newer afspm may read it")
+
+
+def _checked(uri: str, path: Path) -> sqlite3.Connection:
+    connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=30.0)
+    try:
+        connection.execute("PRAGMA query_only = 1")
+        if connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'about'").fetchone() is None:
+            raise FileError("is no journal of an experiment", where=str(path))
+        check_format(connection, path)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _copy(path: Path) -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="afspm-record-"))
+    for suffix in ("", "-wal"):
+        with suppress(FileNotFoundError):
+            shutil.copy(f"{path}{suffix}", folder / f"{path.name}{suffix}")
+    return folder / path.name

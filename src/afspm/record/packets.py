@@ -1,0 +1,110 @@
+"""What was published, out of the record again: whole, or without the values that are in files."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm import wire
+from afspm.errors import FileError, WireError
+from afspm.model import Frame, Packet, Scan, Spectrum
+from afspm.record.measured import SCHEDULER
+from afspm.wire.values import shape_of_scan, with_values
+
+_AT_ONCE = 500
+_FILES_KEPT = 4
+_LAST = chr(0x10FFFF)  # after every envelope
+_COLUMNS = "time_ns, envelope, message, payload, scan, spectrum, channel, first_row, rows"
+
+
+def packets(
+    journal: sqlite3.Connection, folder: Path, since_ns: int, messages: Sequence[str] | None
+) -> Iterator[Packet]:
+    """Packets of the scheduler as they were published, oldest first."""
+    values = _Values(journal, folder)
+    for time_ns, envelope, message, payload, *place in _rows(journal, since_ns, messages):
+        found = values.of(*place)
+        yield Packet(envelope, payload if found is None else with_values(message, payload, found), time_ns)
+
+
+def without_reading_files(
+    journal: sqlite3.Connection, frame: Frame, messages: Sequence[str] | None
+) -> Iterator[tuple[Packet, str, Any]]:
+    """Packets, names of their messages, and what is in them: scans of the right shape, but with NaN for values.
+
+    Lines of running scans and what can't be read are left out.
+    """
+    for time_ns, envelope, message, payload, scan, _, _, _, _ in _rows(journal, -1, messages):
+        if not message or message == "ScanLines":
+            continue
+        try:
+            thing = wire.decode(message, payload)
+            if isinstance(thing, Scan) and scan is not None:
+                thing = _shaped(thing, payload)
+        except WireError:
+            continue
+        yield Packet(envelope, payload, time_ns), message, _placed(thing, frame)
+
+
+def _rows(journal: sqlite3.Connection, since_ns: int, messages: Sequence[str] | None) -> Iterator[Any]:
+    """Some at a time, so that a reader that takes its time holds up nobody, and what is written meanwhile comes too."""
+    wanted = "" if messages is None else f" AND message IN ({', '.join('?' * len(messages))})"
+    sql = f"SELECT {_COLUMNS} FROM packets WHERE source = ? AND (time_ns, envelope) > (?, ?){wanted}"
+    sql += f" ORDER BY time_ns, envelope LIMIT {_AT_ONCE}"
+    after = (since_ns, _LAST)
+    while rows := journal.execute(sql, (SCHEDULER, *after, *(messages or ()))).fetchall():
+        yield from rows
+        after = rows[-1][:2]
+
+
+def _shaped(scan: Scan, payload: bytes) -> Scan:
+    return replace(scan, values=np.broadcast_to(np.nan, shape_of_scan(payload)))
+
+
+def _placed(thing: Any, frame: Frame) -> Any:
+    if frame is Frame.TIP:
+        return thing
+    if isinstance(thing, Scan):
+        return replace(thing, region=replace(thing.region, frame=frame))
+    return replace(thing, frame=frame) if isinstance(thing, Spectrum) else thing
+
+
+class _Values:
+    """The values of packets, from the files that they are in; a few files are kept, since channels come together."""
+
+    def __init__(self, journal: sqlite3.Connection, folder: Path) -> None:
+        self._journal = journal
+        self._folder = folder
+        self._kept: OrderedDict[str, Any] = OrderedDict()
+
+    def of(
+        self, scan: int | None, spectrum: int | None, channel: str | None, first_row: int | None, rows: int | None
+    ) -> NDArray[np.float64] | None:
+        """None: the packet is whole as it is. Raises FileError: the file is missing or damaged."""
+        if spectrum is not None:
+            found: NDArray[np.float64] = self._content("spectra", spectrum).spectra[0].values
+            return found
+        if scan is None:
+            return None
+        content = self._content("scans", scan)
+        values: NDArray[np.float64] | None = next((s.values for s in content.scans if s.channel == channel), None)
+        if values is None:
+            raise FileError(f"channel {channel!r} is missing", where=f"scan {scan} of {self._folder}")
+        return values if first_row is None else values[first_row : first_row + (rows or 0)]
+
+    def _content(self, table: str, number: int) -> Any:
+        from afspm.files import read
+
+        (file,) = self._journal.execute(f"SELECT file FROM {table} WHERE number = ?", (number,)).fetchone()
+        if file not in self._kept:
+            self._kept[file] = read(self._folder / file)
+            if len(self._kept) > _FILES_KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[file]

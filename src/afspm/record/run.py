@@ -1,0 +1,328 @@
+"""`open_run`: what is kept of a run, as tables and arrays, read when it is asked for."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from afspm import wire
+from afspm.errors import FileError, WireError
+from afspm.model import (
+    ControlState,
+    Frame,
+    JournalEntry,
+    LogLine,
+    Packet,
+    ProblemNames,
+    ProcessCondition,
+    Region,
+    ScanSet,
+    Spectrum,
+)
+from afspm.record import journal
+from afspm.record.packets import packets, without_reading_files
+from afspm.record.tables import ControlRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
+
+if TYPE_CHECKING:
+    from afspm.record.overview import DriftPoint, Overview
+
+RUN_FILE, EXPERIMENT_FILE, LATEST_FILE = "run.json", "experiment.toml", "latest"
+
+
+def open_run(path: str | Path = "runs") -> Run:
+    """Open what is kept of a run; also of one that goes on, or that was killed.
+
+        run = afspm.open_run("runs/tip_repair-20261120-040000")
+        run.scan(-1)["Height"].to_xarray()
+        run.scans.to_xarray()
+        [entry.reason for entry in run.refusals]
+
+    Args:
+        path: the folder of the run; or the folder of all runs: its newest is meant.
+
+    Raises:
+        FileError: there is no record, or it is damaged.
+    """
+    return Run(_folder(Path(path)))
+
+
+class Run:
+    """What is kept of a run. Everything is read when it is asked for: of a run that goes on, the newest.
+
+    Attributes:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._journal = journal.open_to_read(folder)
+
+    # --- what was measured ---
+
+    @property
+    def scans(self) -> Table[ScanRow]:
+        """One row for each scan, those that were interrupted too, in the order in which they were recorded."""
+        return Table(_scan_row(row) for row in self._query("SELECT * FROM scans ORDER BY number"))
+
+    @property
+    def spectra(self) -> Table[SpectrumRow]:
+        """One row for each spectrum, in the order in which they were recorded."""
+        return Table(_spectrum_row(row) for row in self._query("SELECT * FROM spectra ORDER BY number"))
+
+    def scan(self, index: int | ScanRow) -> ScanSet:
+        """All channels of a scan: by its place in `scans` (-1: the last), or by its row.
+
+        Raises:
+            FileError: its file is missing or damaged, or it was interrupted before anything of it was seen.
+            IndexError: there is no such scan.
+        """
+        row = index if isinstance(index, ScanRow) else self._row("scans", index, _scan_row)
+        return ScanSet(self._content(row.file, f"scan {row.number}").scans)
+
+    def spectrum(self, index: int | SpectrumRow) -> Spectrum:
+        """A spectrum: by its place in `spectra` (-1: the last), or by its row. Raises as `scan`."""
+        row = index if isinstance(index, SpectrumRow) else self._row("spectra", index, _spectrum_row)
+        spectrum: Spectrum = self._content(row.file, f"spectrum {row.number}").spectra[0]
+        return spectrum
+
+    def about(self, row: ScanRow | SpectrumRow) -> dict[str, Any]:
+        """What its file says beside the values: drift, feedback, the controller's header … Raises as `scan`."""
+        header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
+        return header
+
+    # --- what happened ---
+
+    @property
+    def journal(self) -> Table[JournalEntry]:
+        """Requests with their answers, changes of control, orders; oldest first."""
+        return Table(JournalEntry(*row) for row in self._query("SELECT * FROM entries ORDER BY time_ns, rowid"))
+
+    @property
+    def refusals(self) -> Table[JournalEntry]:
+        """Requests that were not carried out, with the reasons."""
+        rows = self._query("SELECT * FROM entries WHERE response > 0 ORDER BY time_ns, rowid")
+        return Table(JournalEntry(*row) for row in rows)
+
+    @property
+    def control(self) -> Table[ControlRow]:
+        """Who was in control, the mode and the problems: a row for each change."""
+        rows: list[ControlRow] = []
+        for time_ns, payload in self._query(
+            "SELECT time_ns, payload FROM packets WHERE message = 'ControlState' ORDER BY time_ns"
+        ):
+            state = self._decoded("ControlState", payload)
+            if isinstance(state, ControlState) and (not rows or rows[-1].state != state):
+                rows.append(ControlRow(time_ns, state))
+        return Table(rows)
+
+    @property
+    def problems(self) -> Table[ProblemRow]:
+        """Each time that a problem was flagged."""
+        lanes = self.overview().problem_lanes
+        rows = [
+            ProblemRow(span.label, number, span.start_ns, span.end_ns, span.by)
+            for number, lane in lanes.items()
+            for span in lane.spans
+        ]
+        return Table(sorted(rows, key=lambda row: row.flagged_ns))
+
+    @property
+    def processes(self) -> Table[ProcessRow]:
+        """A row for each change of a process."""
+        return Table(
+            ProcessRow(time_ns, name, role, ProcessCondition(condition), *rest)
+            for time_ns, name, role, condition, *rest in self._query("SELECT * FROM processes ORDER BY time_ns, rowid")
+        )
+
+    @property
+    def restarts(self) -> Table[ProcessRow]:
+        """Each time that a process was started again: its first row with that number of starts."""
+        seen: dict[str, int] = {}
+        rows = []
+        for row in self.processes:
+            if row.starts > seen.get(row.name, 1):
+                rows.append(row)
+            seen[row.name] = row.starts
+        return Table(rows)
+
+    @property
+    def log(self) -> Table[LogLine]:
+        """What all processes said, oldest first."""
+        return Table(LogLine(*row) for row in self._query("SELECT * FROM log ORDER BY time_ns, rowid"))
+
+    @property
+    def drift(self) -> Table[DriftPoint]:
+        """What was known of drift after each scan; empty without a Drift Compensated Scheduler."""
+        return Table(self.overview(messages=("DriftMapping",)).drift)
+
+    # --- everything ---
+
+    def packets(self, *, since_ns: int = -1, messages: Sequence[str] | None = None) -> Iterator[Packet]:
+        """What the scheduler published and is newer than `since_ns`, oldest first, whole, as it was published.
+
+        Args:
+            messages: names of those wanted, e.g. "ControlState"; None: all.
+        """
+        yield from packets(self._journal, self.folder, since_ns, messages)
+
+    def overview(self, messages: Sequence[str] | None = None) -> Overview:
+        """What it came to, as the dashboard shows it. Files of scans are not read for it."""
+        from afspm.record.overview import Overview
+
+        overview = Overview(self.problem_names)
+        for packet, message, thing in without_reading_files(self._journal, self.frame, messages):
+            overview.take(message, thing, packet.time_ns or 0, packet.envelope)
+        return overview
+
+    # --- the run itself ---
+
+    @cached_property
+    def experiment(self) -> dict[str, Any]:
+        """The experiment file as it was expanded."""
+        try:
+            return tomllib.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise FileError(f"can't be read: {error}", where=str(self.folder / EXPERIMENT_FILE)) from error
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """run.json: clock, addresses, how it ended. Empty if it can't be read."""
+        try:
+            facts = json.loads((self.folder / RUN_FILE).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return facts if isinstance(facts, dict) else {}
+
+    @property
+    def name(self) -> str:
+        """Of the experiment."""
+        return str(self._note("experiment") or self.facts.get("name") or self.folder.name)
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the microscope was a simulated one."""
+        return bool(self._note("simulated"))
+
+    @property
+    def seeds(self) -> dict[str, Any]:
+        """Of what was left to chance, by component."""
+        return dict(self._note("seeds") or {})
+
+    @property
+    def frame(self) -> Frame:
+        """Of all places: those of the sample where drift was compensated."""
+        return Frame(self._note("frame") or Frame.TIP.value)
+
+    @property
+    def problem_names(self) -> ProblemNames:
+        """The problems of the experiment."""
+        return ProblemNames(self._note("problems") or {})
+
+    def close(self) -> None:
+        """Read nothing more. Safe to repeat."""
+        self._journal.close()
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        scans, spectra = (self._query(f"SELECT count(*) FROM {kind}")[0][0] for kind in ("scans", "spectra"))
+        return f"<Run {self.folder.name}: {scans} scans, {spectra} spectra>"
+
+    def _query(self, sql: str, values: Sequence[Any] = ()) -> list[Any]:
+        with self._naming_damage():
+            return self._journal.execute(sql, values).fetchall()
+
+    @contextmanager
+    def _naming_damage(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.ProgrammingError as error:
+            raise FileError("the run was closed", where=str(self.folder)) from error
+        except sqlite3.DatabaseError as error:
+            raise journal.damaged(self.folder / journal.JOURNAL_FILE, error) from error
+
+    def _note(self, name: str) -> Any:
+        found = self._query("SELECT value FROM about WHERE name = ?", (name,))
+        return json.loads(found[0][0]) if found else None
+
+    def _row(self, table: str, index: int, made: Any) -> Any:
+        order, offset = ("ASC", index) if index >= 0 else ("DESC", -index - 1)
+        found = self._query(f"SELECT * FROM {table} ORDER BY number {order} LIMIT 1 OFFSET ?", (offset,))
+        if not found:
+            raise IndexError(f"there is no number {index} among the {table} of {self.folder.name}")
+        return made(found[0])
+
+    def _content(self, file: str, what: str) -> Any:
+        from afspm.files import read
+
+        if not file:
+            raise FileError(f"{what} was interrupted before anything of it was seen", where=str(self.folder))
+        return read(self.folder / file)
+
+    @staticmethod
+    def _decoded(message: str, payload: bytes) -> Any:
+        try:
+            return wire.decode(message, payload)
+        except WireError:
+            return None
+
+
+def _folder(path: Path) -> Path:
+    latest = path / LATEST_FILE
+    if not (path / journal.JOURNAL_FILE).is_file() and latest.is_file():
+        return path / latest.read_text(encoding="utf-8").strip()
+    return path
+
+
+def _scan_row(row: Any) -> ScanRow:
+    (
+        number, time_ns, began_ns, filename, file, interrupted, x, y, width, height, angle, frame, rows, columns,
+        channels, holder, mode, problems,
+    ) = row  # fmt: skip
+    region = None if frame is None else Region((x, y), (width, height), angle, Frame(frame))
+    return ScanRow(
+        number,
+        time_ns,
+        began_ns,
+        tuple((name, unit) for name, unit in json.loads(channels)),
+        region,
+        None if rows is None else (rows, columns),
+        bool(interrupted),
+        holder,
+        mode,
+        tuple(json.loads(problems)),
+        filename,
+        file,
+    )
+
+
+def _spectrum_row(row: Any) -> SpectrumRow:
+    (
+        number, time_ns, began_ns, filename, file, kind, x, y, frame, points, names, units, holder, mode, problems,
+    ) = row  # fmt: skip
+    return SpectrumRow(
+        number,
+        time_ns,
+        began_ns,
+        kind,
+        None if x is None else (x, y),
+        Frame(frame),
+        points,
+        tuple(json.loads(names)),
+        tuple(json.loads(units)),
+        holder,
+        mode,
+        tuple(json.loads(problems)),
+        filename,
+        file,
+    )

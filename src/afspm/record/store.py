@@ -1,0 +1,214 @@
+"""`Store`: writes the record of a run: the journal, and a file for each scan and spectrum.
+
+What is given in one call is recorded as a whole or not at all, and nothing is there twice, however often it is given:
+files are written aside and renamed before the journal names them, in one transaction.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from afspm import wire
+from afspm.errors import WireError
+from afspm.model import (
+    Frame,
+    JournalEntries,
+    LogLines,
+    Packet,
+    ProblemNames,
+    ProcessStates,
+    Scan,
+    ScanLines,
+    ScopeStatus,
+    Spectrum,
+)
+from afspm.record import circumstances, journal
+from afspm.record.gathering import Gathering, Taken
+from afspm.record.measured import SCHEDULER, MeasuredFiles, insert_packet
+from afspm.wire.values import without_values
+
+__all__ = ["SCHEDULER", "About", "Store"]
+
+_PROCESS = "SELECT role, condition, since_ns, starts, pid, last_exit FROM processes WHERE name = ? ORDER BY rowid DESC"
+
+
+@dataclass(frozen=True)
+class About:
+    """What is so of the whole run.
+
+    Attributes:
+        facts: written into every file: the name of the experiment, seeds …
+        frame: of the places in what is published.
+        measured: whether scans and spectra are written; else there is the journal alone.
+    """
+
+    facts: dict[str, Any] = field(default_factory=dict)
+    problems: ProblemNames = field(default_factory=ProblemNames)
+    frame: Frame = Frame.TIP
+    measured: bool = True
+
+
+class Store:
+    """The record of one run.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        FileError: the journal is damaged.
+        sqlite3.OperationalError: the disk is full …
+    """
+
+    def __init__(self, folder: Path, about: About = About()) -> None:
+        self._folder = folder
+        self._about = about
+        self._journal = journal.open_to_write(folder)
+        self._files = MeasuredFiles(folder, self._journal, about.facts, about.problems)
+        self._gathering = Gathering(circumstances.last_state(self._journal))
+        newest = self._journal.execute("SELECT max(time_ns) FROM packets WHERE source = ?", (SCHEDULER,)).fetchone()[0]
+        self._newest_ns = -1 if newest is None else int(newest)
+        for name, value in about.facts.items():
+            self.note(name, value)
+
+    @property
+    def recorded_ns(self) -> int:
+        """Up to this time everything is recorded that the scheduler published and that was given."""
+        return min((packet.time_ns or 0 for packet in self._gathering.waiting()), default=self._newest_ns + 1) - 1
+
+    def take(self, packets: Iterable[tuple[Packet, str]]) -> None:
+        """Record packets, each with its source, in the order in which they were published.
+
+        Raises:
+            OSError, sqlite3.OperationalError: the disk is full …; nothing of these is recorded then.
+        """
+        with self._all_or_nothing():
+            for packet, source in packets:
+                self._take(packet, source)
+
+    def flush(self) -> None:
+        """No more channels come to the scan that came last. Raises as `take`."""
+        if not any(True for _ in self._gathering.waiting()):
+            return
+        with self._all_or_nothing():
+            self._write(self._gathering.flush())
+
+    def finish(self) -> None:
+        """The experiment has ended: a scan of which only lines came is all that there will be. Raises as `take`."""
+        with self._all_or_nothing():
+            self._write(self._gathering.finish(self._newest_ns))
+
+    def has(self, packet: Packet) -> bool:
+        """Whether a packet is recorded, or waits to be with others of its scan."""
+        row = self._journal.execute(
+            "SELECT 1 FROM packets WHERE time_ns = ? AND envelope = ?", (packet.time_ns, packet.envelope)
+        )
+        waits = ((one.time_ns, one.envelope) == (packet.time_ns, packet.envelope) for one in self._gathering.waiting())
+        return row.fetchone() is not None or any(waits)
+
+    def note(self, name: str, value: Any) -> None:
+        """Something about the whole run, in JSON's types."""
+        text = json.dumps(value, ensure_ascii=False)
+        self._journal.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, text))
+
+    def sync(self) -> None:
+        """Wait until what is recorded is on the disk, so that it outlives a power cut. Raises OSError."""
+        with suppress(FileNotFoundError), (self._folder / f"{journal.JOURNAL_FILE}-wal").open("rb+") as file:
+            os.fsync(file.fileno())
+
+    def close(self) -> None:
+        """Safe to repeat."""
+        self._journal.close()
+
+    @contextmanager
+    def _all_or_nothing(self) -> Iterator[None]:
+        gathering, newest_ns = self._gathering.copy(), self._newest_ns
+        self._journal.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+            self._journal.execute("COMMIT")
+        except BaseException:
+            self._gathering, self._newest_ns = gathering, newest_ns
+            with suppress(sqlite3.Error):  # a full disk may have rolled it back already
+                self._journal.execute("ROLLBACK")
+            raise
+
+    def _take(self, packet: Packet, source: str) -> None:
+        if self.has(packet):
+            return
+        message, thing = _read(packet)
+        match thing:
+            case Scan() if thing.values.size and self._about.measured:
+                self._write(self._gathering.scan(packet, self._placed(thing)))
+            case ScanLines() if self._about.measured:
+                self._write(self._gathering.lines(packet, self._placed(thing)))
+            case Spectrum() if self._about.measured:
+                self._write(self._gathering.spectrum(packet, self._placed(thing)))
+            case _:
+                self._add(packet, message, source, thing)
+        if source == SCHEDULER:
+            self._newest_ns = max(self._newest_ns, packet.time_ns or 0)
+
+    def _add(self, packet: Packet, message: str, source: str, thing: Any) -> None:
+        """What is kept in the journal alone."""
+        payload = without_values(message, packet.payload) if message else bytes(packet.payload)
+        insert_packet(self._journal, packet, message, payload, source=source)
+        match thing:
+            case ScopeStatus() if source == SCHEDULER:
+                self._write(self._gathering.status(thing, packet.time_ns or 0))
+            case JournalEntries():
+                self._add_entries(thing)
+            case ProcessStates():
+                self._add_processes(thing)
+            case LogLines():
+                self._add_log(thing)
+
+    def _write(self, taken: Iterable[Taken]) -> None:
+        for one in taken:
+            self._files.write(one)
+
+    def _placed(self, thing: Any) -> Any:
+        """With the frame of its place, which the wire does not say."""
+        if self._about.frame is Frame.TIP:
+            return thing
+        if isinstance(thing, Spectrum):
+            return replace(thing, frame=self._about.frame)
+        return replace(thing, region=replace(thing.region, frame=self._about.frame))
+
+    def _add_entries(self, entries: JournalEntries) -> None:
+        self._journal.executemany(
+            "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [(e.time_ns, e.kind, e.who, e.what, e.response, e.reason, e.took_s) for e in entries.entries],
+        )
+
+    def _add_processes(self, states: ProcessStates) -> None:
+        for state in states.processes:
+            row = (state.role, int(state.condition), state.since_ns, state.starts, state.pid, state.last_exit)
+            if self._journal.execute(_PROCESS, (state.name,)).fetchone() != row:
+                self._journal.execute(
+                    "INSERT INTO processes VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (states.time_ns, state.name, *row)
+                )
+
+    def _add_log(self, log: LogLines) -> None:
+        self._journal.executemany(
+            "INSERT INTO log VALUES (?, ?, ?, ?)",
+            [(line.time_ns, line.name, line.level, line.text) for line in log.lines],
+        )
+
+
+def _read(packet: Packet) -> tuple[str, Any]:
+    """The name of the message, and what is in it; what can't be read is kept as it is."""
+    try:
+        message = wire.message_of(packet.envelope)
+    except WireError:
+        return "", None
+    try:
+        return message, wire.decode(message, packet.payload)
+    except WireError:
+        return "", None

@@ -1,0 +1,196 @@
+"""What the record gives: rows as small objects, and tables of them as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.model import ControlState, Frame, ProcessCondition, Region
+from afspm.model.geometry import XY
+
+if TYPE_CHECKING:
+    import xarray
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class ScanRow:
+    """A scan, without its values.
+
+    Attributes:
+        number: counts from 1, in the order in which scans were recorded.
+        time_ns: when it was finished, or interrupted; began_ns: None if that was not seen.
+        channels: (name, unit) of each.
+        region, shape: None of an interrupted scan of which nothing was seen; shape is (rows, columns).
+        interrupted: only a part of it was taken.
+        holder, mode, problems: who was in control when it began, and how things stood; None: not known.
+        filename: of the controller; file: of the record, from the run folder, empty if there is none.
+    """
+
+    number: int
+    time_ns: int
+    began_ns: int | None
+    channels: tuple[tuple[str, str], ...]
+    region: Region | None
+    shape: tuple[int, int] | None
+    interrupted: bool
+    holder: str | None
+    mode: str | None
+    problems: tuple[str, ...]
+    filename: str
+    file: str
+
+
+@dataclass(frozen=True, slots=True)
+class SpectrumRow:
+    """A spectrum, without its values; attributes as of `ScanRow`. `position_m` is (x, y) in `frame`."""
+
+    number: int
+    time_ns: int
+    began_ns: int | None
+    kind: str
+    position_m: XY | None
+    frame: Frame
+    points: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    holder: str | None
+    mode: str | None
+    problems: tuple[str, ...]
+    filename: str
+    file: str
+
+
+@dataclass(frozen=True, slots=True)
+class ControlRow:
+    """From `time_ns` on it was so."""
+
+    time_ns: int
+    state: ControlState
+
+
+@dataclass(frozen=True, slots=True)
+class ProblemRow:
+    """A problem that was flagged, until it was removed; `cleared_ns` None: it still is. `by`: "" if not known."""
+
+    name: str
+    number: int
+    flagged_ns: int
+    cleared_ns: int | None
+    by: str
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessRow:
+    """A change of a process; attributes as of `model.ProcessState`. `time_ns` is when it was told."""
+
+    time_ns: int
+    name: str
+    role: str
+    condition: ProcessCondition
+    since_ns: int
+    starts: int
+    pid: int
+    last_exit: str
+
+
+class Table(Sequence[T], Generic[T]):
+    """Rows of one kind: a sequence, with `to_numpy` and `to_xarray` for the columns that are numbers and texts."""
+
+    def __init__(self, rows: Iterable[T]) -> None:
+        self._rows = tuple(rows)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> Table[T]: ...
+    def __getitem__(self, index: int | slice) -> T | Table[T]:
+        return Table(self._rows[index]) if isinstance(index, slice) else self._rows[index]
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __iter__(self) -> Iterator[T]:
+        return iter(self._rows)
+
+    def where(self, wanted: Callable[[T], bool]) -> Table[T]:
+        """The rows for which it is true."""
+        return Table(row for row in self._rows if wanted(row))
+
+    def columns(self) -> dict[str, list[Any]]:
+        """Each column by its name, as numbers and texts; places are taken apart (`center_x_m` …), times are ns."""
+        taken_apart = [_apart(row) for row in self._rows]
+        names = dict.fromkeys(name for row in taken_apart for name in row)
+        return {name: [row.get(name) for row in taken_apart] for name in names}
+
+    def to_numpy(self) -> NDArray[Any]:
+        """A structured array: times as datetime64[ns], numbers that are not known as NaN or -1."""
+        columns = {name: _array(name, values) for name, values in self.columns().items()}
+        made = np.empty(len(self), [(name, values.dtype) for name, values in columns.items()])
+        for name, values in columns.items():
+            made[name] = values
+        return made
+
+    def to_xarray(self) -> xarray.Dataset:
+        """A Dataset over `row` (needs the extra `xarray`)."""
+        import xarray
+
+        return xarray.Dataset({name: ("row", _array(name, values)) for name, values in self.columns().items()})
+
+    def __repr__(self) -> str:
+        kind = type(self._rows[0]).__name__ if self._rows else "nothing"
+        return f"<Table of {len(self)} {kind}>"
+
+
+def _apart(row: Any) -> dict[str, Any]:
+    """A row as numbers and texts."""
+    made: dict[str, Any] = {}
+    for field in fields(row):
+        name, value = field.name, getattr(row, field.name)
+        if name == "region":
+            made |= _of_region(value)
+        elif name == "shape":
+            made |= dict(zip(("rows", "columns"), value or (None, None), strict=True))
+        elif name == "position_m":
+            made |= dict(zip(("x_m", "y_m"), value or (None, None), strict=True))
+        elif name == "channels":
+            made["channels"] = ";".join(f"{channel} [{unit}]" for channel, unit in value)
+        elif isinstance(value, ControlState):
+            made |= {
+                "holder": value.holder,
+                "mode": value.mode.name.lower(),
+                "problems": " ".join(map(str, value.problems)),
+            }
+        elif isinstance(value, tuple):
+            made[name] = ";".join(map(str, value))
+        elif hasattr(value, "value"):
+            made[name] = value.name.lower()
+        else:
+            made[name] = value
+    return made
+
+
+def _of_region(region: Region | None) -> dict[str, Any]:
+    names = ("center_x_m", "center_y_m", "width_m", "height_m", "angle_rad")
+    if region is None:
+        return {**dict.fromkeys(names), "frame": None}
+    values = (*region.center_m, *region.size_m, region.angle_rad)
+    return {**dict(zip(names, values, strict=True)), "frame": region.frame.value}
+
+
+def _array(name: str, values: list[Any]) -> NDArray[Any]:
+    if name.endswith("_ns"):
+        return np.array(["NaT" if value is None else value for value in values], "datetime64[ns]")
+    known = [value for value in values if value is not None]
+    if known and all(isinstance(value, bool) for value in known):
+        return np.array([bool(value) for value in values])
+    if known and all(isinstance(value, int) for value in known):
+        return np.array([-1 if value is None else value for value in values], np.int64)
+    if all(isinstance(value, int | float) for value in known):
+        return np.array([np.nan if value is None else value for value in values], np.float64)
+    return np.array(["" if value is None else str(value) for value in values])
