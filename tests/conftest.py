@@ -16,6 +16,10 @@ settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None)  # new examples each time: AFSPM_EXAMPLES=explore make test
 settings.load_profile(os.environ.get("AFSPM_EXAMPLES", "repeatable"))
 
+# as for a registration in an experiment: on small arrays several threads are slower than one, and take others' cores
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
 # a shell that runs the tests in the background ignores Ctrl-C for them, and so would everything that they start
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

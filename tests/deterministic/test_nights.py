@@ -12,7 +12,7 @@ from afspm.testing import longrun
 from afspm.testing.deterministic.night import CAST, FAULTS, Fault, Night, Plan, plan
 
 # together a few thousand experiment hours; more: python -m afspm.testing.longrun
-CHUNKS = [range(first, first + 30) for first in range(0, 240, 30)]
+CHUNKS = [range(first, first + 15) for first in range(0, 150, 15)]
 
 
 @pytest.mark.parametrize("seeds", CHUNKS, ids=lambda seeds: f"seeds-{seeds.start}-{seeds.stop - 1}")
@@ -22,7 +22,7 @@ def test_every_invariant_holds_in_many_nights(seeds: range) -> None:
 
 
 def test_the_nights_are_a_few_thousand_hours() -> None:
-    assert sum(plan(seed).hours for seeds in CHUNKS for seed in seeds) >= 1900.0
+    assert sum(plan(seed).hours_to_the_end for seeds in CHUNKS for seed in seeds) >= 2000.0
 
 
 def test_a_night_replays_exactly() -> None:
@@ -62,7 +62,7 @@ _faults = st.builds(
 )
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32),
     faults=st.lists(_faults, max_size=12),

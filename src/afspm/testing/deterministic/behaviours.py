@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any
 
-from afspm.model import ControlMode, ControlRequest, ControlResponse, Parameter, Problem, ScopeState, names
+from afspm.model import (
+    RESTART_REQUEST,
+    TELL_REQUEST,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Problem,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    ScopeState,
+    Told,
+    names,
+)
 from afspm.testing.deterministic.client import Client, Doing
 
 _OK = int(ControlResponse.SUCCESS)
@@ -177,7 +191,7 @@ class Dawn(Operator):
 class Stranger(Client):
     """Asks for whatever comes to its mind, except to end the experiment."""
 
-    requests: tuple[tuple[ControlRequest, Any], ...] = (
+    requests: tuple[tuple[int, Any], ...] = (
         (ControlRequest.RELEASE_CTRL, None),
         (ControlRequest.RMV_EXP_PRBLM, 2),
         (ControlRequest.ADD_EXP_PRBLM, 0),
@@ -188,6 +202,8 @@ class Stranger(Client):
         (ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE)),
         (ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "nan", "V")),
         (ControlRequest.ACTION_SUPPORT, names.PULSE),
+        (RESTART_REQUEST, "experiment"),
+        (RESTART_REQUEST, "nobody"),
     )
 
     def behave(self) -> Doing:
@@ -195,6 +211,34 @@ class Stranger(Client):
             yield from self.sleep(self.some(600.0))
             kind, subject = self.timeline.random.choice(self.requests)
             yield from self.ask(kind, subject)
+
+
+class Teller(Client):
+    """A supervisor, as far as it tells how it is with its processes, and restarts those that it is ordered to.
+
+    Attributes:
+        processes: says which there are.
+        restart: starts one anew.
+        ordered: how often it was ordered to.
+    """
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self.processes: Callable[[], tuple[str, ...]] = tuple
+        self.restart: Callable[[str], None] = lambda name: None
+        self.ordered = 0
+
+    def behave(self) -> Doing:
+        while True:
+            now_ns = self.timeline.now_ns()
+            alive = ProcessCondition.ALIVE
+            states = tuple(ProcessState(name, "", alive, 0) for name in self.processes())
+            told = Told("ProcessStates", self.codec.encode(ProcessStates(now_ns, self.name, states)))
+            response = yield from self.ask(TELL_REQUEST, told)
+            for name in self.codec.decode(response.payload) if response.code == _OK else ():
+                self.ordered += 1
+                self.restart(name)
+            yield from self.sleep(2.0)
 
 
 class Listener(Client):

@@ -6,7 +6,6 @@ from collections.abc import Callable, Generator
 from typing import Any
 
 from afspm.model import (
-    ControlRequest,
     ControlResponse,
     ControlState,
     Packet,
@@ -173,7 +172,7 @@ class Client(Process):
 
     # --- what behaviours are made of ---
 
-    def ask(self, kind: ControlRequest, subject: Any = None, key: str = "") -> Generator[float, None, Response]:
+    def ask(self, kind: int, subject: Any = None, key: str = "") -> Generator[float, None, Response]:
         """Ask the scheduler, again if it is silent. NO_RESPONSE if it stays so."""
         self._requests += 1
         request_id = key or f"{self.identity}/{self.name}-{self.life}/{self._requests}"

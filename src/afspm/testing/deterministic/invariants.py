@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,9 +33,11 @@ from afspm.model import (
     names,
 )
 from afspm.testing.deterministic.client import Client
+from afspm.testing.deterministic.codec import TableCodec
 from afspm.testing.deterministic.microscope import FakeMicroscope
 from afspm.testing.deterministic.scheduler import SchedulerHost
 from afspm.testing.deterministic.timeline import Timeline
+from afspm.testing.deterministic.written import Written
 
 _SUCCESS, _NO_RESPONSE = int(ControlResponse.SUCCESS), int(ControlResponse.NO_RESPONSE)
 _FORWARDED = range(int(ControlRequest.ACTION), int(ControlRequest.SET_PROBE_POS) + 1)
@@ -67,7 +68,7 @@ class Bounds:
 class Invariants:
     """Watches the scheduler, the microscope and all components of one simulated night."""
 
-    def __init__(self, timeline: Timeline, bounds: Bounds, microscope: FakeMicroscope) -> None:
+    def __init__(self, timeline: Timeline, bounds: Bounds, microscope: FakeMicroscope, codec: TableCodec) -> None:
         self._timeline = timeline
         self._bounds = bounds
         self._microscope = microscope
@@ -89,13 +90,15 @@ class Invariants:
         self._definite: dict[tuple[str, str], int] = {}
         self._life = 0
         self._saved_control: Control | None = None
-        self._saved_text: str | None = None
+        self._saved_state: dict[str, bytes] | None = None
+        self.written = Written(timeline, codec, self._must, NAME_TAKEN)
         microscope.on_executed = self.executed
 
     # --- the scheduler ---
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
         """Before each effect."""
+        self.written.carried_out(host, effect)
         if self._life != host.life:
             self._life = host.life
             self._open.clear()  # what its former life had taken in is asked again
@@ -116,6 +119,7 @@ class Invariants:
         self.checks += 1
         self._scheduler_since_s = host.since_s
         self._note(event, effects)
+        self.written.stepped(host, event, effects)
         if isinstance(event, RequestIn):
             self._asked(event, effects)
             if event.name == self._holder and event.request.kind in _FORWARDED:
@@ -188,11 +192,11 @@ class Invariants:
 
     def _saved(self, host: SchedulerHost) -> None:
         """What is told is on the disk already."""
-        if host.core.control is self._saved_control and host.disk.state is self._saved_text:
+        if host.core.control is self._saved_control and host.disk.state is self._saved_state:
             return
-        self._saved_control, self._saved_text = host.core.control, host.disk.state
+        self._saved_control, self._saved_state = host.core.control, host.disk.state
         control = host.core.control.to_dict()
-        saved = json.loads(host.disk.state)["control"] if host.disk.state is not None else None
+        saved = host.disk.saved_part("control")
         if saved is None:
             saved = {"mode": 2, "holder": None, "solving": 0, "problems": {}, "ended": False}
         self._must(saved == control, f"told before it was saved: {control}, saved {saved}")

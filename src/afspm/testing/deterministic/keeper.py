@@ -38,6 +38,16 @@ class Keeper:
             self._do(process, watch.begin(timeline.monotonic_s()))
         self._beat()
 
+    def restart(self, name: str) -> None:
+        """Start a process anew, as somebody ordered."""
+        process, watch = self._children[name]
+        self._do(process, watch.restart(self._timeline.monotonic_s()))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all processes."""
+        return tuple(self._children)
+
     def _beat(self) -> None:
         now_s = self._timeline.monotonic_s()
         for process, watch in self._children.values():

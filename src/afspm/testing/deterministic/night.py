@@ -64,7 +64,7 @@ class Plan:
 
     Attributes:
         seed: of all that is left to chance.
-        hours: experiment time.
+        hours: experiment time, but for the calm.
         speed: experiment seconds in a real one.
         cast: who takes part.
         impostor: somebody calls himself "experiment" as well.
@@ -89,6 +89,21 @@ class Plan:
     loses_answer: float = 0.0
     dies_in_step: float = 0.0
     stop_when: tuple[Cause, ...] = (Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE)
+
+    @property
+    def length_s(self) -> float:
+        """Real time in which bad things happen."""
+        return self.hours * 3600.0 / self.speed
+
+    @property
+    def calm_s(self) -> float:
+        """Real time after that, in which all comes right."""
+        return max(self.length_s * _CALM, 4 * 3600.0 / self.speed, 200.0)
+
+    @property
+    def hours_to_the_end(self) -> float:
+        """Experiment time with the calm."""
+        return (self.length_s + self.calm_s) * self.speed / 3600.0
 
 
 def plan(seed: int, hours: float = 8.0) -> Plan:
@@ -153,7 +168,7 @@ class Night:
             self.settings.lease_s,
             self.settings.request_timeout_s,
         )
-        self.invariants = Invariants(timeline, bounds, self.microscope)
+        self.invariants = Invariants(timeline, bounds, self.microscope, self.codec)
         self.scheduler = SchedulerHost(
             timeline,
             self.weather,
@@ -169,6 +184,7 @@ class Night:
         self.dawn = behaviours.Dawn(timeline, self.weather, self.codec, self.scheduler, "dawn")
         self.keeper = Keeper(timeline, [self.microscope, self.scheduler, *self.components.values()], _policy())
         self.keeper.on_over = self._over
+        self.teller = self._teller()
 
     def make_codec(self) -> TableCodec:
         return TableCodec()
@@ -193,6 +209,15 @@ class Night:
             client.on_answer = self.invariants.answered
         self.invariants.components = list(made.values())
         return made
+
+    def _teller(self) -> behaviours.Teller:
+        """Whoever tells the scheduler of the processes; it is not among those that befalls something."""
+        teller = behaviours.Teller(
+            self.timeline, self.weather, self.codec, self.scheduler, "teller", "supervisor:night"
+        )
+        teller.processes, teller.restart = (lambda: self.keeper.names), self.keeper.restart
+        teller.start()
+        return teller
 
     def _over(self, name: str) -> None:
         if name in self.components and self.scheduler.alive:
@@ -222,8 +247,7 @@ class Night:
 
     def _run(self) -> Outcome:
         timeline, plan = self.timeline, self.plan
-        length_s = timeline.real_s(plan.hours * 3600.0)
-        calm_s = max(length_s * _CALM, timeline.real_s(4 * 3600.0), 200.0)
+        length_s, calm_s = plan.length_s, plan.calm_s
         for fault in plan.faults:
             timeline.after(fault.when * length_s, self._befall, fault)
         timeline.run_until(length_s)

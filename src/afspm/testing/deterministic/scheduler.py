@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import marshal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -38,13 +39,35 @@ from afspm.testing.deterministic.timeline import Timeline, Timer
 
 Entry = tuple[Packet, int | None]
 
+_BY_VALUE = 2  # the version of marshal whose bytes follow from the value alone
+
 
 @dataclass
 class Disk:
-    """What survives a kill of the scheduler."""
+    """What survives a kill of the scheduler.
 
-    state: str | None = None
+    Attributes:
+        state: the parts of what was last saved, by value; written ten times as fast as JSON, since there are a thousand
+            saves to a restart.
+    """
+
+    state: dict[str, bytes] | None = None
     journal: tuple[Entry, ...] = ()
+
+    def save(self, state: dict[str, Any]) -> None:
+        self.state = {name: marshal.dumps(part, _BY_VALUE) for name, part in state.items()}
+
+    def keep(self, packet: Packet) -> None:
+        """A packet of the scheduler's own, before it is published."""
+        self.journal = (*self.journal, (packet, None))
+
+    def saved(self) -> dict[str, Any] | None:
+        """As it comes out of a JSON file; None if nothing was saved."""
+        return None if self.state is None else {name: self.saved_part(name) for name in self.state}
+
+    def saved_part(self, name: str) -> Any:
+        """One part of it, as it comes out of a JSON file; None if nothing was saved."""
+        return None if self.state is None else json.loads(json.dumps(marshal.loads(self.state[name])))
 
 
 class Observer(Protocol):
@@ -103,8 +126,8 @@ class SchedulerHost(Process):
     def begin(self) -> None:
         self._forget()
         self.core = self._make_core()
-        if self.disk.state is not None:
-            self.core.restore(json.loads(self.disk.state))
+        if (saved := self.disk.saved()) is not None:
+            self.core.restore(saved)
         self.core.restore_cache(self.disk.journal)
         assert self.translator is not None
         server, publisher = self.translator
@@ -216,6 +239,8 @@ class SchedulerHost(Process):
         elif isinstance(effect, Forward):
             self._link.ask(effect.request, effect.number)
         elif isinstance(effect, Publish):
+            if effect.cached and effect.source_ns is None:
+                self.disk.keep(effect.packet)
             for feed in list(self._feeds):
                 feed.publish(effect.packet)
             if effect.cached and not self._journal_due:
@@ -224,7 +249,7 @@ class SchedulerHost(Process):
         elif isinstance(effect, Replay):
             self._replay = effect.packets
         elif isinstance(effect, SaveState):
-            self.disk.state = json.dumps(effect.state)
+            self.disk.save(effect.state)
         elif isinstance(effect, Kill):
             for feed in self._feeds:
                 feed.kill_signal()
