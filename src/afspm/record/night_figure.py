@@ -110,7 +110,8 @@ def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, 
     y = 1 - 0.17 / height_in
     about = f"{what}{begin:%Y-%m-%d %H:%M} to {until} UTC, {record.scans} scans"
     figure.text(0.03, y, about, size=7, va="center")
-    legend = "bar: who was in control, as in b; framed: the tip was judged bad"
+    is_judged = any(mark.of_ns is not None for mark in record.marks)
+    legend = "bar: who was in control, as in b" + ("; framed: the tip was judged bad" if is_judged else "")
     figure.text(0.86, y, legend, size=5.5, va="center", ha="right")
     _letter(figure, "a", 0.0, y)
     if simulated:

@@ -1,0 +1,220 @@
+"""The report as one HTML page: no script, nothing from elsewhere, light and dark, and fit to be printed."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+
+from afspm.record.lanes import Lane
+from afspm.record.report import time_line
+from afspm.record.report.pictures import Small
+from afspm.record.report.story import MOST_ROWS, Story, sentence, states_in_words
+from afspm.record.report.style import CSS
+
+_LEGEND = (
+    "The bar below a scan has the colour of who was in control; framed: a problem was flagged, or it was interrupted."
+)
+
+
+def html(story: Story, shown: Sequence[Small], figures: Sequence[Path]) -> str:
+    """The whole page."""
+    title = f"{escape(story.name)}, {_day(story.start_ns)}"
+    badge = '<span class="badge">SIMULATED</span>' if story.simulated else ""
+    body = [
+        f"<header><h1>{escape(story.name)}{badge}</h1><p>{escape(_when(story))}</p></header>",
+        _section("", _cards(story)),
+        _section(
+            "Time line",
+            f'<div class="scroll">{time_line.draw(story)}</div>'
+            + '<p class="note">Times in UTC, as the experiment had them.</p>',
+        ),
+        _section("What the time went into", _shares(story)),
+        _section("Problems and repairs", _problems(story)),
+        _section("Scans", _sheet(story, shown)),
+        _section("Figures", "".join(map(_figure, figures))),
+        _section("Refusals", _refusals(story)),
+        _section("Restarts", _restarts(story)),
+        f"<footer>{escape(story.folder)}</footer>",
+    ]
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{CSS}</style></head><body><main>{''.join(body)}</main></body></html>\n"
+    )
+
+
+def lasting(ns: int) -> str:
+    """A duration: "45 s", "12 min", "7 h 45 min"."""
+    seconds = round(ns / 1e9)
+    if seconds < 120:
+        return f"{seconds} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02} min"
+
+
+def _when(story: Story) -> str:
+    begin, end = (datetime.fromtimestamp(ns / 1e9, UTC) for ns in (story.start_ns, story.end_ns))
+    until = f"{end:%H:%M}" if begin.date() == end.date() else f"{end:%Y-%m-%d %H:%M}"
+    told = f"{begin:%Y-%m-%d %H:%M} to {until} UTC, {lasting(story.lasted_ns)}"
+    if story.speed != 1.0:
+        told += f" ({lasting(round(story.lasted_ns / story.speed))} real)"
+    return f"{told}; {story.ended or 'it goes on, or was killed'}"
+
+
+def _cards(story: Story) -> str:
+    interrupted = f"{story.interrupted} interrupted" if story.interrupted else ""
+    flags = len(story.problems)
+    unsolved = sum(span.end_ns is None for span in story.problems)
+    cards = [
+        ("scans", len(story.scans), interrupted),
+        ("spectra", story.spectra, ""),
+        ("problems flagged", flags, f"{unsolved} still flagged at the end" if unsolved else ""),
+        ("refusals", sum(one.count for one in story.refusals), ""),
+        ("restarts", len(story.restarts), f"given up: {', '.join(story.given_up)}" if story.given_up else ""),
+    ]
+    made = [
+        f'<div class="card"><b>{number}</b><span>{what}</span><small>{escape(note)}</small></div>'
+        for what, number, note in cards
+    ]
+    return f'<p class="lead">{escape(sentence(story))}</p><div class="cards">{"".join(made)}</div>'
+
+
+def _shares(story: Story) -> str:
+    seen, styles = story.overview, time_line.colours(story)
+    return '<div class="shares">' + "".join(
+        [
+            _share_table(story, "in control", seen.controls, styles),
+            _share_table(story, "microscope", seen.states, {}),
+            _share_table(story, "mode", seen.modes, {"manual": "manual"}),
+        ]
+    ) + "</div>"  # fmt: skip
+
+
+def _share_table(story: Story, heading: str, lane: Lane, styles: dict[str, str]) -> str:
+    rows = []
+    for label, ns in story.shares(lane):
+        part = 100.0 * ns / max(1, story.lasted_ns)
+        style = styles.get(label, "state")
+        words = label if styles else states_in_words(label)
+        bar = '<svg class="share" viewBox="0 0 100 10" preserveAspectRatio="none">'
+        bar += f'<rect class="{style}" width="{part:.2f}" height="10"/></svg>'
+        rows.append([escape(words), bar, lasting(ns), f"{part:.0f} %"])
+    return _table([heading, "", "", ""], rows) if rows else ""
+
+
+def _problems(story: Story) -> str:
+    rows = []
+    for span in story.problems:
+        end_ns = story.end_ns if span.end_ns is None else span.end_ns
+        rows.append(
+            [
+                escape(span.label),
+                _clock(span.start_ns),
+                escape(span.by or "not known"),
+                escape(", ".join(story.repairs(span)) or "nobody"),
+                escape(", ".join(story.done_meanwhile(span))),
+                lasting(end_ns - span.start_ns),
+                "<b>not solved</b>" if span.end_ns is None else _clock(end_ns),
+            ]
+        )
+    return (
+        _table(["problem", "flagged", "by", "in control meanwhile", "done to the tip", "for", "cleared"], rows)
+        or "<p>None.</p>"
+    )
+
+
+def _sheet(story: Story, shown: Sequence[Small]) -> str:
+    if not shown:
+        return "<p>None.</p>"
+    styles = time_line.colours(story)
+    left_out = len(story.scans) - len(shown)
+    note = f'<p class="note">{left_out} more are not shown.</p>' if left_out else ""
+    note += f'<p class="note">{_LEGEND}</p>'
+    return f'<div class="sheet">{"".join(_thumb(small, styles) for small in shown)}</div>{note}'
+
+
+def _thumb(small: Small, styles: dict[str, str]) -> str:
+    row = small.row
+    width, height = row.region.size_m if row.region else (1.0, 1.0)
+    picture = (
+        f'<img src="{_data(small.png)}" alt="" style="aspect-ratio:{width / height:.4g}">'
+        if small.picture is not None
+        else '<div class="none">no values</div>'
+    )
+    size = f"{width * 1e9:.4g} × {height * 1e9:.4g} nm" if row.region else ""
+    is_bad = row.interrupted or bool(row.problems)
+    mark = " <b>interrupted</b>" if row.interrupted else ""
+    style = styles.get(row.holder or "", "state")
+    holder = f"{row.holder or 'nobody'} in control"
+    title = ", ".join(filter(None, (f"scan {row.number}", small.channel, size, holder, *row.problems, row.filename)))
+    return (
+        f'<figure class="{"bad" if is_bad else ""}" title="{escape(title)}">{picture}<i class="{style}"></i>'
+        f"<figcaption>{row.number} · {_clock(row.time_ns)}{mark}</figcaption></figure>"
+    )
+
+
+def _figure(path: Path) -> str:
+    return (
+        f'<figure class="figure"><img src="{_data(path.read_bytes())}" alt="{escape(path.stem)}">'
+        f"<figcaption>{escape(path.name)}</figcaption></figure>"
+    )
+
+
+def _refusals(story: Story) -> str:
+    rows = [
+        [
+            _clock(one.first_ns) + (f" … {_clock(one.last_ns)}" if one.count > 1 else ""),
+            str(one.count),
+            escape(one.who),
+            escape(one.what),
+            escape(one.reason),
+        ]
+        for one in story.refusals[:MOST_ROWS]
+    ]
+    left_out = len(story.refusals) - len(rows)
+    more = f'<p class="note">{left_out} more are in the record.</p>' if left_out else ""
+    return (_table(["when", "times", "who", "asked for", "refused because"], rows) or "<p>None.</p>") + more
+
+
+def _restarts(story: Story) -> str:
+    rows = [
+        [_clock(one.time_ns), escape(one.name), str(one.starts), escape(one.last_exit)]
+        for one in story.restarts[:MOST_ROWS]
+    ]
+    return _table(["when", "process", "start number", "had ended"], rows) or "<p>None.</p>"
+
+
+def _section(heading: str, content: str) -> str:
+    if not content:
+        return ""
+    return f"<section>{f'<h2>{escape(heading)}</h2>' if heading else ''}{content}</section>"
+
+
+def _table(heads: Iterable[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of cells that are HTML already; empty without rows."""
+    if not rows:
+        return ""
+    head = "".join(f"<th>{escape(one)}</th>" for one in heads)
+    return (
+        f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(_lines(rows))}</tbody></table></div>'
+    )
+
+
+def _lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    for row in rows:
+        yield f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>"
+
+
+def _data(png: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
+
+
+def _clock(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%H:%M:%S}"
+
+
+def _day(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d}"

@@ -1,0 +1,139 @@
+"""Scans as small pictures, and the figures beside the report, from what is kept of a run."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm import wire
+from afspm.errors import AfspmError
+from afspm.model import ControlMode, ControlState, ScanSet, names
+from afspm.model.picture import png
+from afspm.record.night_record import Mark, NightRecord, Shot, thumbnail
+from afspm.record.report.story import Story
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow
+
+MOST = 98
+NIGHT, OFFSET = "night.png", "drift_offset.png"
+_TOPOGRAPHY = ("height", "topo", "z ", "z")
+_log = logging.getLogger("afspm.report")
+
+
+@dataclass(frozen=True)
+class Small:
+    """A scan and a grey picture of it, [y, x] with y upwards; None if its values can't be had."""
+
+    row: ScanRow
+    channel: str
+    picture: NDArray[np.uint8] | None
+
+    @property
+    def png(self) -> bytes:
+        """In colour, with y upwards. Raises AttributeError without a picture."""
+        assert self.picture is not None
+        return png(self.picture[::-1].astype(np.float64))
+
+
+def smalls(run: Run, rows: Sequence[ScanRow]) -> list[Small]:
+    """All scans, or of too many the interrupted ones and some evenly among the rest."""
+    return list(_read(run, chosen(rows)))
+
+
+def chosen(rows: Sequence[ScanRow], most: int = MOST) -> list[ScanRow]:
+    """At most so many rows, in their order."""
+    if len(rows) <= most:
+        return list(rows)
+    odd = [k for k, row in enumerate(rows) if row.interrupted][: most // 2]
+    rest = sorted(set(range(len(rows))) - set(odd))
+    even = [rest[k] for k in np.linspace(0, len(rest) - 1, most - len(odd)).round().astype(int)]
+    return [rows[k] for k in sorted({*odd, *even})]
+
+
+def _read(run: Run, rows: Sequence[ScanRow]) -> Iterator[Small]:
+    for row in rows:
+        try:
+            scans = run.scan(row)
+        except AfspmError as error:
+            _log.debug("scan %d has no picture: %s", row.number, error)
+            yield Small(row, "", None)
+            continue
+        channel = topography(scans)
+        values = scans[channel].values
+        yield Small(row, channel, thumbnail(values) if values.size else None)
+
+
+def topography(scans: ScanSet) -> str:
+    """The channel that is shown of a scan: one that is named like a height, else the first."""
+    return next((c for name in _TOPOGRAPHY for c in scans if c.lower().startswith(name)), scans.first.channel)
+
+
+def draw(run: Run, story: Story, shown: Sequence[Small]) -> None:
+    """Draw the night, and drift against time, where no component has done so, as far as matplotlib is there."""
+    if importlib.util.find_spec("matplotlib") is None:
+        return
+    if not (run.folder / NIGHT).exists() and any(small.picture is not None for small in shown):
+        from afspm.record import night_figure
+
+        record = night_of(run, story, shown)
+        numbers = {number: story.overview.problems.name(number) for number in record.problems}
+        night_figure.draw(record, run.folder / NIGHT, numbers, title=story.name, simulated=story.simulated)
+    if not (run.folder / OFFSET).exists() and len(story.overview.drift) > 1:
+        from afspm.drift.figures import offsets, style
+
+        title = f"{story.name} (simulated)" if story.simulated else story.name
+        style.save(offsets.draw(drift_of(run), title=title), run.folder / OFFSET)
+
+
+def night_of(run: Run, story: Story, shown: Sequence[Small]) -> NightRecord:
+    """What the picture of the night shows."""
+    record = NightRecord(end_ns=story.end_ns, scans_taken=len(story.scans))
+    record.shots = [
+        Shot(small.row.time_ns, small.row.began_ns, small.row.holder, small.picture)
+        for small in shown
+        if small.picture is not None
+    ]
+    record.control = [(row.time_ns, row.state) for row in run.control] or [
+        (story.start_ns, ControlState(ControlMode.UNDEFINED))
+    ]
+    record.marks = [
+        Mark(entry.time_ns, entry.who, entry.what)
+        for entry in run.journal
+        if entry.what in (names.PULSE, names.CRASH) and entry.response == 0
+    ]
+    return record
+
+
+def drift_of(run: Run) -> Any:
+    """A `drift.record.DriftRecord` of what the scheduler told."""
+    from afspm.drift.record import DriftRecord, drift_at
+
+    told = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
+    told = [message for message in told if len(message.matrix) == 6 and len(message.center) == 2]
+
+    def square(values: Any) -> NDArray[np.float64]:
+        return np.array(values if len(values) == 4 else [np.nan] * 4, dtype=np.float64).reshape(2, 2)
+
+    return DriftRecord(
+        keys=tuple(message.filename for message in told),
+        time_s=np.array([message.timestamp.ToNanoseconds() * 1e-9 for message in told]),
+        center_m=np.array([tuple(message.center) for message in told]).reshape(-1, 2),
+        drift_m=np.array([drift_at(np.array(m.matrix).reshape(2, 3), m.center) for m in told]).reshape(-1, 2),
+        covariance_m2=np.array([square(message.covariance) for message in told]).reshape(-1, 2, 2),
+        rate_m_s=np.array([tuple(m.rate) if len(m.rate) == 2 else (0.0, 0.0) for m in told]).reshape(-1, 2),
+        matched=np.array([message.matched for message in told], dtype=bool),
+        reasons=tuple(message.reason for message in told),
+    )
+
+
+def figures(folder: Path) -> list[Path]:
+    """The pictures in the run folder: the night first, then those of drift, then whatever else."""
+    found = sorted(folder.glob("*.png"))
+    return sorted(found, key=lambda path: (path.name != NIGHT, not path.name.startswith("drift_offset"), path.name))

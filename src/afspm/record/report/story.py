@@ -1,0 +1,163 @@
+"""What the report tells of a run: read once, reckoned up, independent of how it is shown."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from afspm.model import JournalEntry, ProcessCondition, ScopeState, names
+from afspm.record.lanes import Lane, Span
+from afspm.record.overview import Overview, Restart
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow
+
+MOST_ROWS = 200
+ENDED = "ended"
+_PROCESS_TROUBLE = frozenset({ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP})
+
+
+@dataclass(frozen=True, slots=True)
+class Refusals:
+    """Requests of one kind that were refused for one reason: how often, and when first and last."""
+
+    who: str
+    what: str
+    reason: str
+    count: int
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(frozen=True)
+class Story:
+    """A run, reckoned up. Times in ns of experiment time since the Unix epoch.
+
+    Attributes:
+        start_ns, end_ns: the first and the last that is known of it.
+        speed: experiment seconds in a real second.
+        ended: how it ended, in words; empty if it goes on, or was killed.
+        problems: spans of all problems in the order of time.
+        restarts, given_up: of processes.
+        actions: what was done to the tip, e.g. pulses.
+    """
+
+    name: str
+    folder: str
+    simulated: bool
+    start_ns: int
+    end_ns: int
+    speed: float
+    ended: str
+    overview: Overview
+    scans: Sequence[ScanRow]
+    spectra: int
+    refusals: Sequence[Refusals]
+    restarts: Sequence[Restart]
+    given_up: Sequence[str]
+    actions: Sequence[JournalEntry]
+
+    @property
+    def lasted_ns(self) -> int:
+        return max(0, self.end_ns - self.start_ns)
+
+    @property
+    def interrupted(self) -> int:
+        """How many scans were."""
+        return sum(scan.interrupted for scan in self.scans)
+
+    @property
+    def problems(self) -> list[Span]:
+        spans = [span for lane in self.overview.problem_lanes.values() for span in lane.spans]
+        return sorted(spans, key=lambda span: span.start_ns)
+
+    def shares(self, lane: Lane) -> list[tuple[str, int]]:
+        """For how long altogether, in ns, each thing of a lane was so: the longest first."""
+        return sorted(lane.lasted_ns(self.end_ns).items(), key=lambda share: -share[1])
+
+    def done_meanwhile(self, problem: Span) -> list[str]:
+        """What was done to the tip while a problem was flagged: "4 × pulse", "1 × crash"."""
+        end_ns = self.end_ns if problem.end_ns is None else problem.end_ns
+        done = [entry.what for entry in self.actions if problem.start_ns <= entry.time_ns <= end_ns]
+        return [f"{count} × {what.removeprefix('x-')}" for what, count in Counter(done).items()]
+
+    def repairs(self, problem: Span) -> list[str]:
+        """Who was in control while a problem was flagged, in the order in which they came."""
+        end_ns = self.end_ns if problem.end_ns is None else problem.end_ns
+        during = [
+            span.label
+            for span in self.overview.controls.spans
+            if span.start_ns < end_ns and (span.end_ns is None or span.end_ns > problem.start_ns)
+        ]
+        return list(dict.fromkeys(during))
+
+
+def read(run: Run) -> Story:
+    """The story of a run. Raises FileError: the record is damaged."""
+    overview, scans = run.overview(), run.scans
+    clock = run.facts.get("clock") or {}
+    start_ns = round(float(clock["start_s"]) * 1e9) if "start_s" in clock else _first_ns(overview, scans)
+    return Story(
+        name=run.name,
+        folder=run.folder.name,
+        simulated=run.simulated,
+        start_ns=start_ns,
+        end_ns=max(overview.newest_ns, start_ns),
+        speed=float(clock.get("speed", 1.0)),
+        ended=str(run.facts.get(ENDED, "")),
+        overview=overview,
+        scans=list(scans),
+        spectra=len(run.spectra),
+        refusals=gathered(list(run.refusals)),
+        restarts=list(overview.restarts),
+        actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
+        given_up=[n for n, state in overview.processes.items() if state.condition is ProcessCondition.GIVEN_UP],
+    )
+
+
+def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
+    """The same refused again and again told once, in the order in which each came first."""
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for entry in refusals:
+        groups.setdefault((entry.who, entry.what, entry.reason), []).append(entry.time_ns)
+    return [Refusals(*key, len(times), min(times), max(times)) for key, times in groups.items()]
+
+
+def sentence(story: Story) -> str:
+    """The run in one sentence."""
+    parts = [_counted(len(story.scans), "scan", "scans")]
+    if story.spectra:
+        parts.append(_counted(story.spectra, "spectrum", "spectra"))
+    flagged = Counter(span.label for span in story.problems)
+    parts += [f"{name} flagged {_times(count)}" for name, count in flagged.items()]
+    if story.restarts:
+        parts.append(_counted(len(story.restarts), "restart", "restarts"))
+    parts += [f"{name} given up" for name in story.given_up]
+    return ", ".join(parts)
+
+
+def _counted(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
+
+
+def _times(count: int) -> str:
+    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def _first_ns(overview: Overview, scans: Sequence[ScanRow]) -> int:
+    lanes = (overview.controls, overview.modes, overview.states)
+    times = [lane.spans[0].start_ns for lane in lanes if lane.spans]
+    times += [scan.began_ns or scan.time_ns for scan in scans[:1]]
+    return min(times, default=overview.newest_ns)
+
+
+def states_in_words(label: str) -> str:
+    """A lane's label of the scope state as people say it."""
+    known = {ScopeState.SPEC.name.lower(): "spectrum", ScopeState.BUSY_PARAM.name.lower(): "setting parameters"}
+    return known.get(label, label.replace("_", " "))
+
+
+def in_trouble(lane: Lane) -> list[Span]:
+    """When a process was not well."""
+    labels = {condition.name.lower().replace("_", " ") for condition in _PROCESS_TROUBLE}
+    return [span for span in lane.spans if span.label in labels]

@@ -1,0 +1,38 @@
+"""Writing the report of a run into its folder."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from afspm.errors import FileError
+from afspm.record.report import page, pictures, story
+from afspm.record.run import open_run
+
+REPORT_FILE = "report.html"
+
+
+def write(folder: str | Path) -> Path:
+    """Write `report.html` and the figures that are not there yet; returns the file.
+
+    Needs the extra `record`; the figures need `plot`.
+
+    Args:
+        folder: of a run, which may still go on; or of all runs: its newest is meant.
+
+    Raises:
+        FileError: there is no record, or the report can't be written.
+    """
+    with open_run(folder) as run:
+        told = story.read(run)
+        shown = pictures.smalls(run, told.scans)
+        pictures.draw(run, told, shown)
+        text = page.html(told, shown, pictures.figures(run.folder))
+        target = run.folder / REPORT_FILE
+    aside = target.with_name(f".{target.name}.{os.getpid()}")
+    try:
+        aside.write_text(text, encoding="utf-8")
+        aside.replace(target)
+    except OSError as error:
+        raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
+    return target

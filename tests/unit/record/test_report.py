@@ -1,0 +1,226 @@
+"""The report of a run, from a record."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from afspm import model, wire
+from afspm.errors import FileError
+from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
+from afspm.record.lanes import Span
+from afspm.record.report import REPORT_FILE, pictures, story, time_line, write
+from afspm.record.run import open_run
+from afspm.record.store import About, Store
+
+S = 1_000_000_000
+START = 1_700_000_000 * S
+REGION = model.Region((0.0, 0.0), (2e-6, 1e-6))
+TIP = int(model.Problem.TIP_SHAPE_CHANGED)
+
+
+def scan(end_s: float, channel: str = "Height Retrace", side: int = 8) -> model.Scan:
+    values = np.arange(side * side, dtype=np.float64).reshape(side, side) % 5
+    return model.Scan(REGION, channel, "m", values, START + round(end_s * S), f"scan-{end_s:g}.nc")
+
+
+def entry(at_s: float, kind: str, who: str, what: str, response: int | None = None, reason: str = "") -> object:
+    return model.JournalEntries((model.JournalEntry(START + round(at_s * S), kind, who, what, response, reason),))
+
+
+def processes(at_s: float, *states: model.ProcessState) -> tuple[float, object]:
+    return at_s, model.ProcessStates(START + round(at_s * S), "lab", states)
+
+
+def process(name: str, condition: ProcessCondition, since_s: float, starts: int = 1, last: str = "") -> object:
+    return model.ProcessState(name, "component", condition, START + round(since_s * S), 0.0, starts, 7, last)
+
+
+def night() -> list[tuple[float, object]]:
+    packets: list[tuple[float, object]] = [
+        (1, model.ScopeStatus(ScopeState.FREE)),
+        (2, ControlState(ControlMode.AUTOMATED, "series <b>")),
+        processes(3, process("judge", ProcessCondition.ALIVE, 3)),  # type: ignore[arg-type]
+    ]
+    for began_s in (100, 700, 1300):
+        packets += [
+            (began_s, model.ScopeStatus(ScopeState.SCANNING)),
+            (began_s + 90, scan(began_s + 90)),
+            (began_s + 91, scan(began_s + 90, "Phase")),
+            (began_s + 92, model.ScopeStatus(ScopeState.FREE)),
+        ]
+    return [
+        *packets,
+        (1500, ControlState(ControlMode.AUTOMATED, None, (TIP,))),
+        (1501, entry(1500, "control", "judge", "flagged tip-shape-changed")),
+        (1510, ControlState(ControlMode.AUTOMATED, "corrector", (TIP,))),
+        (1520, entry(1520, "request", "corrector", "x-pulse", 0)),
+        (1530, entry(1530, "request", "corrector", "x-pulse", 0)),
+        (1540, entry(1540, "request", "corrector", "bias = 20 V", 9, "at most <10> V")),
+        (1541, entry(1541, "request", "corrector", "bias = 20 V", 9, "at most <10> V")),
+        (1600, ControlState(ControlMode.AUTOMATED, "series <b>")),
+        processes(1700, process("judge", ProcessCondition.RESTARTING, 1700, 1, "signal 9")),  # type: ignore[arg-type]
+        processes(1702, process("judge", ProcessCondition.ALIVE, 1702, 2, "signal 9")),  # type: ignore[arg-type]
+        (3601, model.ScopeStatus(ScopeState.MOVING)),
+    ]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / "night-1"
+    folder.mkdir()
+    facts = {"name": "night", "clock": {"origin_s": 0.0, "start_s": START / S, "speed": 60.0}, "ended": "all is done"}
+    (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
+    store = Store(folder, About({"experiment": "night", "simulated": True}))
+    packets = []
+    for at_s, thing in night():
+        name, payload = wire.encode(thing)
+        suffix = f"_{thing.channel}" if isinstance(thing, model.Scan) else ""
+        packets.append((model.Packet(name + suffix, payload, START + round(at_s * S)), ""))
+    store.take(packets)
+    store.finish()
+    store.close()
+    return folder
+
+
+def told(run: Path) -> story.Story:
+    with open_run(run) as opened:
+        return story.read(opened)
+
+
+class Page(HTMLParser):
+    """What a browser would load, and whether every element is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.open: list[str] = []
+        self.pictures = 0
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.loads += [value for key, value in given.items() if key in ("src", "href") and value]
+        self.pictures += tag == "img"
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_needs_nothing_else_and_is_whole(run: Path) -> None:
+    text = write(run).read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.open == []
+    assert page.pictures >= 4  # three scans and the night
+    assert [load for load in page.loads if not load.startswith("data:image/png;base64,")] == []
+    assert "<script" not in text
+    assert re.findall(r"url\(|@import", text) == []
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "SIMULATED",
+        "3 scans, tip-shape-changed flagged once, 1 restart",
+        "60 min (60 s real); all is done",
+        "2 × pulse",
+        "prefers-color-scheme:dark",
+        "@media print",
+        "signal 9",
+        "at most &lt;10&gt; V",
+        "series &lt;b&gt;",
+    ],
+)
+def test_the_page_says(run: Path, said: str) -> None:
+    assert said in write(run).read_text(encoding="utf-8")
+
+
+def test_nothing_of_others_becomes_markup(run: Path) -> None:
+    text = write(run).read_text(encoding="utf-8")
+    assert "series <b>" not in text
+    assert "<10>" not in text
+
+
+def test_the_night_is_drawn_beside_it(run: Path) -> None:
+    write(run)
+    assert (run / pictures.NIGHT).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_picture_that_a_component_has_drawn_is_left_alone(run: Path) -> None:
+    (run / pictures.NIGHT).write_bytes(b"\x89PNG as it was")
+    write(run)
+    assert (run / pictures.NIGHT).read_bytes() == b"\x89PNG as it was"
+
+
+def test_writing_again_is_the_same(run: Path) -> None:
+    first = write(run).read_bytes()
+    assert write(run).read_bytes() == first
+    assert [file.name for file in run.iterdir() if file.name.startswith(".report")] == []
+
+
+def test_without_a_record_there_is_no_report(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no record"):
+        write(tmp_path)
+    assert not (tmp_path / REPORT_FILE).exists()
+
+
+def test_a_scan_whose_file_is_gone_is_told_without_a_picture(run: Path) -> None:
+    next((run / "scans").iterdir()).unlink()
+    assert "no values" in write(run).read_text(encoding="utf-8")
+
+
+def test_the_same_refusal_is_told_once_with_how_often(run: Path) -> None:
+    (refused,) = told(run).refusals
+    assert (refused.count, refused.who, refused.last_ns - refused.first_ns) == (2, "corrector", S)
+
+
+def test_a_problem_is_told_with_who_repaired_it(run: Path) -> None:
+    (problem,) = told(run).problems
+    assert (problem.by, problem.lasted_ns(0 if problem.end_ns is None else problem.end_ns)) == ("judge", 100 * S)
+    assert told(run).repairs(problem) == ["corrector"]
+
+
+def test_time_is_shared_out(run: Path) -> None:
+    shares = dict(told(run).shares(told(run).overview.controls))
+    assert shares["corrector"] == 90 * S
+    assert shares["series <b>"] == (1498 + 2001) * S
+
+
+def test_of_many_scans_the_interrupted_and_some_between_are_shown(run: Path) -> None:
+    with open_run(run) as opened:
+        row = opened.scans[0]
+    many = [type(row)(**{**fields_of(row), "number": k, "interrupted": k == 777}) for k in range(1000)]
+    shown = pictures.chosen(many)
+    assert len(shown) == pictures.MOST
+    assert {0, 777, 999} <= {one.number for one in shown}
+    assert [one.number for one in shown] == sorted(one.number for one in shown)
+
+
+def fields_of(row: object) -> dict[str, object]:
+    return {name: getattr(row, name) for name in row.__slots__}  # type: ignore[attr-defined]
+
+
+def test_what_can_not_be_told_apart_is_one_bar(run: Path) -> None:
+    night = told(run)
+    night.overview.states.spans.clear()
+    for k in range(20_000):  # in an hour: several for each pixel
+        begin = night.start_ns + k * 180_000_000
+        night.overview.states.spans.append(Span("scanning", begin, begin + 100_000_000))
+    assert time_line.draw(night).count("<rect") < 1000
+
+
+def test_a_run_of_which_nothing_is_recorded_has_a_report(tmp_path: Path) -> None:
+    Store(tmp_path, About({"experiment": "empty"})).close()
+    text = write(tmp_path).read_text(encoding="utf-8")
+    assert Page(text).open == []
+    assert "0 scans" in text
