@@ -37,6 +37,10 @@ if TYPE_CHECKING:
     from afspm.runtime.process import Context
 
 _RECONNECT_S = 1.0
+_STARTS_S = 2.0
+"""So long, real time, a controller may take that is started together with its translator (an emulated one): until then
+it is looked for every `_SOON_S`, and nothing is wrong."""
+_SOON_S = 0.1
 
 
 class Translator:
@@ -80,6 +84,7 @@ class Translator:
         self._live = LiveLines(microscope)
         self._paced = ScopeState.UNDEFINED
         self._retry_at_s = self._all_at_s = 0.0
+        self._began_s = self._clock.monotonic_s()
         self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
@@ -176,12 +181,13 @@ class Translator:
         return True
 
     def _lose(self, error: Exception) -> None:
-        self._retry_at_s = self._clock.monotonic_s() + _RECONNECT_S
+        now_s = self._clock.monotonic_s()
+        starts = isinstance(error, LOST) and not self._started and now_s - self._began_s < _STARTS_S
+        self._retry_at_s = now_s + (_SOON_S if starts else _RECONNECT_S)
         was_connected, self._connected = self._connected, False
         complaint = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
-        new = complaint != self._complaint
-        self._complaint = complaint
-        if was_connected or new:
+        if not starts and (was_connected or complaint != self._complaint):
+            self._complaint = complaint
             self._log.error("the controller can't be reached or trusted, it is tried again: %s", complaint)
         if was_connected or not self._told_lost:
             # what it was doing is remembered: it may still be at it when it is found again

@@ -214,7 +214,7 @@ def test_ctrl_c_in_the_middle_of_a_scan_puts_everything_back(file: Path) -> None
 def test_a_translator_that_does_not_find_its_controller_is_said_to_with_what_it_said_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "STARTED_S", 5.0)
+    monkeypatch.setattr(bench, "STARTED_S", 8.0)
     (tmp_path / "deaf.py").write_text(
         "from afspm.microscopes.simulator import Simulator\n\n\n"
         "class Deaf(Simulator):\n"

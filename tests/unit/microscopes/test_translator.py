@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
@@ -355,6 +356,37 @@ def test_a_controller_found_confused_by_a_request_does_nothing_of_it(bench: Any)
     assert (response.code, bench.microscope.done) == (ControlResponse.NO_RESPONSE, [])
     assert "ValueError: 0x1f" in response.reason
     assert bench.heard() == ["UNDEFINED"]
+
+
+def test_a_controller_that_starts_with_its_translator_is_waited_for_and_nothing_is_wrong(
+    bench: Any, caplog: Any
+) -> None:
+    caplog.set_level(logging.INFO)
+    bench.microscope.lost = True
+    bench.start()
+    bench.look(1.8)
+    assert caplog.records == []
+    bench.look(0.3)
+    (told,) = caplog.records
+    assert told.levelno == logging.ERROR
+    assert "unplugged" in told.message
+    bench.look(1.0)
+    bench.microscope.lost = False
+    bench.look(0.9)
+    assert len(caplog.records) == 1
+    bench.look(0.2)
+    assert caplog.records[-1].message == "the controller answers"
+
+
+def test_a_controller_that_starts_late_is_found_soon(bench: Any, caplog: Any) -> None:
+    caplog.set_level(logging.INFO)
+    bench.microscope.lost = True
+    bench.start()
+    assert bench.translator.wait_s() == pytest.approx(0.1)
+    bench.microscope.lost = False
+    bench.look(0.11)
+    assert "ScanParameters2d" in bench.heard()
+    assert caplog.records == []
 
 
 def test_a_request_that_was_done_before_the_controller_was_lost_stays_a_success(bench: Any) -> None:
