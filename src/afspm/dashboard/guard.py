@@ -20,7 +20,7 @@ PUBLIC = (ENTRANCE, "/assets/dashboard.css")
 _HEADERS = (
     (b"x-frame-options", b"DENY"),
     (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
+    (b"referrer-policy", b"same-origin"),
     # nothing comes from anywhere else, and nothing goes there
     (
         b"content-security-policy",

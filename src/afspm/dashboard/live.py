@@ -9,12 +9,14 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from afspm.dashboard.bell import Bell
 from afspm.dashboard.drawing import Drawer, Drawn, Look, number_or_none
 from afspm.dashboard.frames import Frame
 from afspm.dashboard.levelling import Levelling
-from afspm.dashboard.palettes import PALETTES
-from afspm.dashboard.pictures import Contrast
+from afspm.dashboard.palettes import LEVELS, PALETTES
+from afspm.dashboard.pictures import Contrast, png
 from afspm.dashboard.profiles import profile
 from afspm.dashboard.record import Archive
 from afspm.dashboard.watch import Watch
@@ -42,7 +44,8 @@ class Live:
         self._waiting = 0
 
     def add_to(self, app: FastAPI) -> None:
-        """Serve /live/image, /live/value, /live/profile."""
+        """Serve /live/image, /live/value, /live/profile and /live/palette."""
+        app.get("/live/palette/{name}.png", response_model=None)(self._palette)
         app.get("/live/image", response_model=None)(self._image)
         app.get("/live/value", response_model=None)(self._value)
         app.get("/live/profile", response_model=None)(self._profile)
@@ -92,23 +95,31 @@ class Live:
             "unit": drawn.frame.unit,
         }
 
+    async def _palette(self, name: str) -> Response:
+        """A colour map as a picture one pixel wide, the highest value on top."""
+        from fastapi.responses import Response
+
+        if name not in PALETTES:
+            return Response(status_code=404)
+        return Response(png(np.arange(LEVELS, dtype=np.uint8)[:, None], name), media_type="image/png")
+
     async def _wait_for_newer(self, channel: str, after: int) -> bool:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
         end_s, growing_s = now_s + POLL_S, now_s + GROWING_S
         self._waiting += 1
         try:
-            if after:  # many viewers at full speed get fewer pictures each, and not the experiment less time
-                await asyncio.sleep(FINISHED_S * max(1, self._waiting // 4))
+            # many viewers at full speed get fewer pictures each, and not the experiment less time
+            finished_s = now_s + FINISHED_S * max(1, self._waiting // 4)
             while True:
                 number, complete = self._newest(channel)
+                due_s = now_s if not after else finished_s if complete else growing_s
                 now_s = loop.time()
-                if number > after and (complete or not after or now_s >= growing_s):
+                if number > after and now_s >= due_s:
                     return True
-                until_s = growing_s if number > after else end_s
                 if now_s >= end_s:
                     return False
-                await self._bell.wait(until_s - now_s)
+                await self._bell.wait((due_s if number > after else end_s) - now_s)
         finally:
             self._waiting -= 1
 

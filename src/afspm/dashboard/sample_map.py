@@ -39,11 +39,15 @@ class MapContent:
     shown: tuple[int, str] | None = None
 
 
-def map_html(content: MapContent) -> str:
-    """The map as HTML; scans have their time and channel as data-time and data-channel, spectra their time."""
+def map_html(content: MapContent, *, whole: bool = True) -> str:
+    """The map as HTML; scans have their time and channel as data-time and data-channel, spectra their time.
+
+    Args:
+        whole: all of what the limits allow; else the part where something was measured, and what is set now.
+    """
     places, left_out = places_of(content.scans)
     spectra = [one for one in content.spectra if one.position_m is not None][-MOST_PLACES:]
-    frame = _frame(content, places, spectra)
+    frame = _frame(content, places, spectra, whole=whole)
     if frame is None:
         return '<p class="nothing">No place is known yet.</p>'
     shapes = [
@@ -60,7 +64,7 @@ def map_html(content: MapContent) -> str:
         f'<figure class="map" role="img" aria-label="Map of the sample: {words}">'
         f'<div class="map-area" style="aspect-ratio:{frame.width:.6g}/{frame.height:.6g}">'
         f'<svg viewBox="0 0 {frame.width:.6g} {frame.height:.6g}">{"".join(shapes)}</svg>{ticks}</div>'
-        f"{_drift_words(content)}{more}</figure>"
+        f"{_keys(content, spectra)}{_drift_words(content)}{more}</figure>"
     )
 
 
@@ -101,15 +105,19 @@ class _Frame:
 
 
 def _frame(
-    content: MapContent, places: Sequence[tuple[ScanTaken, int]], spectra: Sequence[SpectrumTaken]
+    content: MapContent,
+    places: Sequence[tuple[ScanTaken, int]],
+    spectra: Sequence[SpectrumTaken],
+    *,
+    whole: bool,
 ) -> _Frame | None:
     points = [one.region.corners_m() for one, _ in places]
     points += [np.array([one.position_m]) for one in spectra]
     if content.current is not None:
         points.append(content.current.corners_m())
-    if content.limits is not None:
+    if content.limits is not None and (whole or not points):
         points.append(_limits(content))
-    if content.probe_m is not None:
+    if content.probe_m is not None and (whole or not points):
         points.append(np.array([content.probe_m]))
     if not points:
         return None
@@ -176,6 +184,17 @@ def _ticks(frame: _Frame) -> str:
             text = f"{value:g}".replace("-", "−")
             parts.append(f'<span class="tick-{"xy"[axis]}" style="{side}:{at:.2f}%">{text}</span>')
     return f'{"".join(parts)}<span class="map-unit">{unit}</span>'
+
+
+def _keys(content: MapContent, spectra: Sequence[SpectrumTaken]) -> str:
+    keys = {
+        "scan": ("scans; click one to see it", bool(content.scans)),
+        "current": ("set now", content.current is not None),
+        "spectrum": ("spectra", bool(spectra)),
+        "limits": ("limits", content.limits is not None),
+    }
+    shown = "".join(f'<span class="key-{name}">{text}</span>' for name, (text, is_there) in keys.items() if is_there)
+    return f'<div class="map-keys">{shown}</div>'
 
 
 def _drift_words(content: MapContent) -> str:

@@ -32,7 +32,7 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
 
 def position(xy_m: tuple[float, float]) -> str:
     """ "(1.2, −0.5) µm"."""
-    factor, unit = scale(max(abs(xy_m[0]), abs(xy_m[1])), "m")
+    factor, unit = scale(max(abs(xy_m[0]), abs(xy_m[1])) or 1e-9, "m")
     x, y = (f"{v * factor:.4g}".replace("-", "−") for v in xy_m)
     return f"({x}, {y}) {unit}"
 

@@ -1,0 +1,69 @@
+"""The web application: NiceGUI's page, what it fetches by itself, the entrance, and the guard before all of it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from afspm.dashboard.access import Access, Visitor, is_loopback
+from afspm.dashboard.audience import Audience
+from afspm.dashboard.bell import Bell
+from afspm.dashboard.content import Contents
+from afspm.dashboard.entrance import add_entrance
+from afspm.dashboard.guard import VISITOR, App, Guard
+from afspm.dashboard.live import Live
+from afspm.dashboard.record import Archive
+from afspm.dashboard.steering import Steering
+from afspm.dashboard.watch import Watch
+from afspm.model import Region
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+ASSETS = Path(__file__).with_name("assets")
+
+
+def application(
+    watch: Watch,
+    steering: Steering,
+    access: Access,
+    archive: Archive,
+    *,
+    title: str,
+    limits: Region | None,
+    simulated: bool,
+    host: str,
+    encrypted: bool,
+) -> tuple[App, Callable[[float], bool]]:
+    """The application, once a process; and what waits until all pages have been told of the end, so many seconds."""
+    os.environ.setdefault("NICEGUI_STORAGE_PATH", str(Path(os.devnull).parent / "afspm-keeps-nothing"))
+    from fastapi import FastAPI
+    from fastapi.staticfiles import StaticFiles
+    from nicegui import ui
+
+    from afspm.dashboard.page import Page, Services
+
+    bell = Bell()
+    watch.on_change(bell.ring)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI):  # type: ignore[no-untyped-def]  # an async iterator that starlette knows
+        bell.hang_up()
+        yield
+
+    app = FastAPI(lifespan=lifespan, openapi_url=None)
+    add_entrance(app, access, title, encrypted=encrypted, only_here=is_loopback(host))
+    Live(watch, bell, archive).add_to(app)
+    app.mount("/assets", StaticFiles(directory=ASSETS))
+    audience = Audience()
+    services = Services(watch, Contents(watch, limits), steering, audience, title, simulated)
+
+    def page() -> None:
+        request = ui.context.client.request
+        Page(services, getattr(request.state, VISITOR, Visitor()))
+
+    ui.run_with(app, root=page, title=title, show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
+    return Guard(app, access, host), audience.wait_told

@@ -1,0 +1,396 @@
+// The picture of a scan: axes, colour bar, scale bar, zoom, values under the pointer, profile, and places to measure at.
+
+import { drawAxis, drawScaleBar, fitted, plain, quantity, scale, ticks } from "./axes.js";
+import { Pictures, Questions } from "./fetching.js";
+import { Geometry } from "./geometry.js";
+import { drawProfile } from "./profile.js";
+
+const MARGIN = { left: 58, right: 78, top: 22, bottom: 40 };
+const MOST_ZOOM = 64;
+
+export class ImageView {
+  constructor(root) {
+    this.root = root;
+    this.find = (name) => root.querySelector(`[data-part="${name}"]`);
+    this.canvas = this.find("canvas");
+    this.head = this.bitmap = this.geometry = this.line = this.drag = this.cursor = this.profile = null;
+    this.view = { u: 0, v: 0, zoom: 1 };
+    this.tool = "look";
+    this.pinned = null;
+    this.bar = new Image();
+    this.bar.onload = () => this.draw();
+    this.pictures = new Pictures((head, bitmap) => this.show(head, bitmap), (text) => this.say(text));
+    this.values = new Questions("/live/value", (found, asked) => this.showValue(found, asked));
+    this.profiles = new Questions("/live/profile", (found) => this.showProfile(found));
+    this.#listen();
+    new ResizeObserver(() => this.draw()).observe(this.canvas);
+    new MutationObserver(() => this.draw()).observe(document.body, { attributeFilter: ["class"] });
+    this.fetch();
+  }
+
+  /** What is asked for with every question about the picture. */
+  look() {
+    const chosen = Object.fromEntries(["channel", "levelling", "contrast", "palette"].map((n) => [n, this.find(n).value]));
+    return this.pinned ? { ...chosen, ...this.pinned } : chosen;
+  }
+
+  fetch() {
+    const palette = this.find("palette").value;
+    if (this.bar.dataset.name !== palette) {
+      this.bar.dataset.name = palette;
+      this.bar.src = `/live/palette/${palette}.png`;
+    }
+    this.pictures.want(this.look());
+  }
+
+  /** A finished scan instead of the newest; null: the newest again. */
+  pin(scan) {
+    this.pinned = scan;
+    if (scan) this.#offer([...this.#channels(), scan.channel]);
+    if (scan) this.find("channel").value = scan.channel;
+    this.root.classList.toggle("pinned", Boolean(scan));
+    this.resetView();
+    this.fetch();
+  }
+
+  /** Channels that there are; the one chosen stays. */
+  setChannels(channels) {
+    if (channels.join("\n") !== this.#channels().join("\n")) this.#offer(channels);
+  }
+
+  /** Whether places for scans and spectra may be chosen here. */
+  setSteering(may) {
+    this.root.classList.toggle("may-measure", may);
+    if (!may && (this.tool === "scan" || this.tool === "spectrum")) this.choose("look");
+  }
+
+  show(head, bitmap) {
+    this.bitmap?.close();
+    const other = !this.head || ["center", "size", "angle", "shape"].some((n) => String(head[n]) !== String(this.head[n]));
+    Object.assign(this, { head, bitmap });
+    if (other) {
+      this.resetView();
+      this.line = this.profile = null;
+    }
+    this.draw();
+    const text = head.time_ns ? "" : `, ${head.rows} of ${head.shape[0]} lines`;
+    this.say(`${head.channel}: ${head.shape[1]} × ${head.shape[0]} px, ${quantity(head.size[0], "m")} × `
+      + `${quantity(head.size[1], "m")}${head.angle ? `, turned by ${plain(head.angle * 180 / Math.PI)}°` : ""}${text}`);
+    Object.assign(this.canvas.dataset, { number: head.number, time: head.time_ns ?? "", rows: head.rows, at: Date.now() });
+    if (this.cursor) this.#askValue();
+    if (this.line) this.#askProfile();
+  }
+
+  say(text) {
+    this.find("caption").textContent = text;
+  }
+
+  choose(tool) {
+    this.tool = tool;
+    for (const button of this.root.querySelectorAll("[data-tool]")) {
+      button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
+    }
+    this.find("hint").textContent = {
+      look: "Drag to move, turn the wheel or pinch to zoom.",
+      profile: "Drag a line over the picture.",
+      scan: "Drag a rectangle to scan, or click for the middle of a scan of the same size.",
+      spectrum: "Click where the spectrum is to be taken.",
+    }[tool];
+    if (tool !== "profile") this.line = this.profile = null;
+    this.find("profile").hidden = tool !== "profile";
+    this.draw();
+  }
+
+  resetView() {
+    this.view = { u: 0, v: 0, zoom: 1 };
+  }
+
+  zoomBy(factor, about = null) {
+    if (!this.geometry) return;
+    const centre = [this.geometry.box.x + this.geometry.box.width / 2, this.geometry.box.y + this.geometry.box.height / 2];
+    const screen = about ?? centre;
+    const before = this.geometry.fromScreen(screen);
+    this.view.zoom = Math.min(MOST_ZOOM, Math.max(1, this.view.zoom * factor));
+    this.#measure();
+    const after = this.geometry.fromScreen(screen);
+    this.view.u += before[0] - after[0];
+    this.view.v += before[1] - after[1];
+    this.draw();
+  }
+
+  draw() {
+    this.#fitHeight();
+    const area = fitted(this.canvas);
+    if (!area) return;
+    if (!this.head) {
+      area.context.fillText("No scan yet.", 16, 26);
+      return;
+    }
+    this.#measure(area);
+    this.#drawPicture(area);
+    this.#drawAxes(area);
+    this.#drawBar(area);
+    this.#drawMarks(area);
+    if (this.profile) drawProfile(this.find("profile"), this.profile);
+  }
+
+  showValue(found, asked) {
+    if (!this.cursor) return;
+    const [x, y] = this.geometry.place(this.geometry.fromPixel([asked.column, asked.row]));
+    const far = scale(Math.max(Math.abs(x), Math.abs(y)), "m");
+    const where = `(${plain(x * far.factor, 5)}, ${plain(y * far.factor, 5)}) ${far.unit}`;
+    // in the unit of the colour bar, whatever the value: numbers that jump between units can't be compared
+    const of = scale(Math.max(Math.abs(this.head.low), Math.abs(this.head.high)), found.unit);
+    const value = found.value === null ? "not measured" : `${plain(found.value * of.factor, 6)} ${of.unit}`;
+    const levelled = found.value === null || this.head.levelling === "none" ? ""
+      : `, levelled ${plain(found.levelled * of.factor)} ${of.unit}`;
+    const readout = this.find("readout");
+    readout.textContent = `${value}${levelled} at ${where}`;
+    Object.assign(readout.dataset, { value: found.value ?? "", column: asked.column, row: asked.row, number: found.number ?? "" });
+  }
+
+  showProfile(found) {
+    this.profile = found;
+    this.draw();
+  }
+
+  // --- within ---
+
+  #channels() {
+    return [...this.find("channel").options].map((option) => option.value);
+  }
+
+  #offer(channels) {
+    const select = this.find("channel"), before = select.value;
+    select.replaceChildren(...[...new Set(channels)].map((name) => new Option(name, name)));
+    if (channels.includes(before)) select.value = before;
+    else if (!this.pinned && channels.length) this.fetch();
+  }
+
+  /** As high as the picture needs, within what the window has. */
+  #fitHeight() {
+    if (!this.head) return;
+    const { width } = this.canvas.getBoundingClientRect();
+    const [along, across] = this.head.size;
+    const wanted = MARGIN.top + MARGIN.bottom + ((width - MARGIN.left - MARGIN.right) * across) / along;
+    const height = `${Math.round(Math.min(Math.max(wanted, 180), Math.max(300, window.innerHeight * 0.74)))}px`;
+    if (this.canvas.style.height !== height) this.canvas.style.height = height;
+  }
+
+  #measure(area = null) {
+    const { width, height } = area ?? this.canvas.getBoundingClientRect();
+    const box = { x: MARGIN.left, y: MARGIN.top, width: Math.max(20, width - MARGIN.left - MARGIN.right),
+      height: Math.max(20, height - MARGIN.top - MARGIN.bottom) };
+    this.geometry = new Geometry(this.head, box, this.view);
+  }
+
+  #drawPicture({ context }) {
+    const { box, whole } = this.geometry;
+    const [x, y] = this.geometry.toScreen([-whole[0] / 2, whole[1] / 2]);
+    context.save();
+    context.beginPath();
+    context.rect(box.x, box.y, box.width, box.height);
+    context.clip();
+    context.globalAlpha = 0.16;
+    context.fillRect(box.x, box.y, box.width, box.height); // what was not measured
+    context.globalAlpha = 1;
+    context.imageSmoothingEnabled = whole[0] * this.geometry.perMetre < this.head.shape[1];
+    context.drawImage(this.bitmap, x, y, whole[0] * this.geometry.perMetre, whole[1] * this.geometry.perMetre);
+    if (this.head.newest_row !== null && this.head.newest_row !== undefined && !this.head.time_ns) {
+      const at = this.geometry.toScreen(this.geometry.fromPixel([0, this.head.newest_row]))[1];
+      context.fillStyle = getComputedStyle(this.canvas).getPropertyValue("--accent");
+      context.fillRect(box.x, at - 1, box.width, 2);
+    }
+    context.restore();
+    context.strokeRect(box.x, box.y, box.width, box.height);
+  }
+
+  #drawAxes({ context }) {
+    const [[left, right], [low, high]] = this.geometry.range();
+    const turned = this.head.angle !== 0;
+    const from = turned ? [this.head.size[0] / 2, this.head.size[1] / 2] : this.head.center;
+    drawAxis(context, this.geometry.box, left + from[0], right + from[0], "m", "x", turned ? "along" : "x");
+    drawAxis(context, this.geometry.box, low + from[1], high + from[1], "m", "y", turned ? "across" : "y");
+    drawScaleBar(context, this.geometry.box, this.geometry.box.width / this.geometry.perMetre);
+  }
+
+  #drawBar({ context }) {
+    const { box } = this.geometry, x = box.x + box.width + 14, wide = 14;
+    if (this.bar.complete && this.bar.naturalWidth) context.drawImage(this.bar, x, box.y, wide, box.height);
+    context.strokeRect(x, box.y, wide, box.height);
+    const { low, high, unit } = this.head;
+    const found = scale(Math.max(Math.abs(low), Math.abs(high)), unit);
+    context.textAlign = "left";
+    context.textBaseline = "middle";
+    for (const value of ticks(low * found.factor, high * found.factor, Math.max(2, box.height / 48))) {
+      const at = (value / found.factor - low) / (high - low);
+      context.fillText(plain(value), x + wide + 5, box.y + box.height * (1 - at));
+    }
+    context.textBaseline = "bottom";
+    context.fillText(found.unit ? `[${found.unit}]` : "", x, box.y - 5);
+  }
+
+  #drawMarks({ context, accent }) {
+    context.save();
+    context.strokeStyle = accent;
+    context.lineWidth = 2;
+    if (this.line) {
+      const [a, b] = this.line.map((place) => this.geometry.toScreen(place));
+      if (this.tool === "scan") context.strokeRect(Math.min(a[0], b[0]), Math.min(a[1], b[1]), Math.abs(a[0] - b[0]), Math.abs(a[1] - b[1]));
+      else {
+        context.beginPath();
+        context.moveTo(...a);
+        context.lineTo(...b);
+        context.stroke();
+      }
+    }
+    if (this.cursor) {
+      const [x, y] = this.geometry.toScreen(this.geometry.fromPixel(this.cursor));
+      context.lineWidth = 1;
+      context.beginPath();
+      for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+        context.moveTo(x + 4 * dx, y + 4 * dy);
+        context.lineTo(x + 12 * dx, y + 12 * dy);
+      }
+      context.stroke();
+    }
+    context.restore();
+  }
+
+  #askValue() {
+    const [column, row] = this.cursor;
+    this.values.ask({ ...this.look(), column, row });
+  }
+
+  #askProfile() {
+    const [a, b] = this.line.map((place) => this.geometry.pixel(place));
+    this.profiles.ask({ ...this.look(), x0: a[0], y0: a[1], x1: b[0], y1: b[1] });
+  }
+
+  #point(screen) {
+    if (!this.geometry?.contains(screen)) return;
+    const [rows, columns] = this.head.shape;
+    const [column, row] = this.geometry.pixel(this.geometry.fromScreen(screen)).map(Math.round);
+    this.#moveCursor([Math.min(columns - 1, Math.max(0, column)), Math.min(rows - 1, Math.max(0, row))]);
+  }
+
+  #moveCursor(pixel) {
+    this.cursor = pixel;
+    this.#askValue();
+    this.draw();
+  }
+
+  #measureAt(place, size = null) {
+    const [x, y] = this.geometry.place(place);
+    const { size: all, angle, shape } = this.head;
+    const name = this.tool === "scan" ? "scan_here" : "spectrum_here";
+    emitEvent(name, { x, y, width: size?.[0] ?? all[0], height: size?.[1] ?? all[1], angle, rows: shape[0], columns: shape[1] });
+  }
+
+  #listen() {
+    for (const name of ["channel", "levelling", "contrast", "palette"]) {
+      this.find(name).addEventListener("change", () => {
+        if (name === "channel" && this.pinned) this.pinned = { ...this.pinned, channel: this.find("channel").value };
+        this.fetch();
+      });
+    }
+    this.root.addEventListener("click", (event) => {
+      const { tool, zoom } = event.target.closest("button")?.dataset ?? {};
+      if (tool) this.choose(tool);
+      if (zoom === "0") this.resetView();
+      else if (zoom) this.zoomBy(Number(zoom));
+      if (zoom) this.draw();
+      if (event.target.dataset.part === "live") this.pin(null);
+    });
+    const { canvas } = this;
+    canvas.addEventListener("wheel", (event) => {
+      if (!this.geometry?.contains([event.offsetX, event.offsetY])) return;
+      event.preventDefault();
+      this.zoomBy(Math.exp(-event.deltaY * 0.0015), [event.offsetX, event.offsetY]);
+    }, { passive: false });
+    this.fingers = new Map();
+    canvas.addEventListener("pointerdown", (event) => this.#down(event));
+    canvas.addEventListener("pointermove", (event) => this.#move(event));
+    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => this.#up(event));
+    canvas.addEventListener("keydown", (event) => this.#key(event));
+  }
+
+  #down(event) {
+    const screen = [event.offsetX, event.offsetY];
+    if (!this.geometry?.contains(screen)) return;
+    this.canvas.setPointerCapture(event.pointerId);
+    this.fingers.set(event.pointerId, screen);
+    const place = this.geometry.fromScreen(screen);
+    this.drag = { screen, place, view: { ...this.view }, moved: false };
+    if (this.tool === "profile" || this.tool === "scan") this.line = [place, place];
+    this.#point(screen);
+  }
+
+  #move(event) {
+    const screen = [event.offsetX, event.offsetY];
+    if (this.fingers.size === 2 && this.fingers.has(event.pointerId)) {
+      this.#pinch(event.pointerId, screen);
+      return;
+    }
+    if (!this.drag || !this.fingers.has(event.pointerId)) {
+      this.#point(screen);
+      return;
+    }
+    this.drag.moved ||= Math.hypot(screen[0] - this.drag.screen[0], screen[1] - this.drag.screen[1]) > 4;
+    if (this.tool === "look") {
+      this.view.u = this.drag.view.u - (screen[0] - this.drag.screen[0]) / this.geometry.perMetre;
+      this.view.v = this.drag.view.v + (screen[1] - this.drag.screen[1]) / this.geometry.perMetre;
+    } else if (this.line) {
+      this.line[1] = this.geometry.fromScreen(screen);
+      if (this.tool === "profile") this.#askProfile();
+    }
+    this.#point(screen);
+    this.draw();
+  }
+
+  #pinch(id, screen) {
+    const distance = () => {
+      const [a, b] = [...this.fingers.values()];
+      return Math.hypot(a[0] - b[0], a[1] - b[1]);
+    };
+    const before = distance();
+    this.fingers.set(id, screen);
+    if (before > 0) this.zoomBy(distance() / before, screen);
+    this.drag = null;
+  }
+
+  #up(event) {
+    const { drag } = this;
+    this.fingers.delete(event.pointerId);
+    this.drag = null;
+    if (!drag || event.type === "pointercancel") return;
+    if (this.tool === "spectrum") this.#measureAt(this.geometry.fromScreen([event.offsetX, event.offsetY]));
+    if (this.tool === "scan") {
+      const [a, b] = this.line;
+      if (drag.moved) this.#measureAt([(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], [Math.abs(a[0] - b[0]), Math.abs(a[1] - b[1])]);
+      else this.#measureAt(a);
+      this.line = null;
+      this.draw();
+    }
+  }
+
+  #key(event) {
+    if (!this.head || event.ctrlKey || event.metaKey || event.altKey) return;
+    const [rows, columns] = this.head.shape;
+    const step = event.shiftKey ? 10 : 1;
+    const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
+    if (moves[event.key]) {
+      const [column, row] = this.cursor ?? [columns >> 1, rows >> 1];
+      const [dx, dy] = moves[event.key];
+      this.#moveCursor([Math.min(columns - 1, Math.max(0, column + dx)), Math.min(rows - 1, Math.max(0, row + dy))]);
+    } else if (event.key === "+" || event.key === "=") this.zoomBy(1.5);
+    else if (event.key === "-") this.zoomBy(1 / 1.5);
+    else if (event.key === "0") {
+      this.resetView();
+      this.draw();
+    } else if (event.key === "Enter" && this.cursor && (this.tool === "scan" || this.tool === "spectrum")) {
+      this.#measureAt(this.geometry.fromPixel(this.cursor));
+    } else return;
+    event.preventDefault();
+  }
+}

@@ -1,0 +1,125 @@
+"""`Dashboard`: the component that shows an experiment in the browser, and steers it for whoever may."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from afspm.dashboard.access import Access, is_loopback, secret_in
+from afspm.dashboard.allowed import allowed_region
+from afspm.dashboard.record import Archive
+from afspm.dashboard.server import USUAL_PORT, PageServer, listening
+from afspm.dashboard.watch import Watch
+from afspm.errors import ConfigError, FileError
+from afspm.runtime.component import Component
+
+if TYPE_CHECKING:
+    from afspm.runtime.process import Context
+
+TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
+
+
+class Dashboard(Component):
+    """Serves one page. It only subscribes, and asks through the scheduler in the names of persons.
+
+    Args:
+        host: the address to listen at. At any other than this computer's own a password or token is needed.
+        port: 0 for any that is free; None: 8080, or any if that is taken. A restart takes the same one.
+        password_hash: of the password, as `afspm dashboard --make-password` prints it. The password itself, or a token
+            for programs and links, may be in the environment: AFSPM_DASHBOARD_PASSWORD, AFSPM_DASHBOARD_TOKEN.
+        certificate, certificate_key: PEM files, for https.
+
+    Raises:
+        ConfigError: others could come in without a password, the port is taken …
+    """
+
+    operates = True
+    longest_step_s = 60.0  # the first import of everything, on a busy computer
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        password_hash: str = "",
+        certificate: Path | None = None,
+        certificate_key: Path | None = None,
+    ) -> None:
+        if (certificate is None) != (certificate_key is None):
+            raise ConfigError("certificate and certificate_key belong together", where="dashboard")
+        self._host, self._port = host, port
+        self._password_hash = password_hash
+        self._certificate = None if certificate is None else Path(certificate)
+        self._certificate_key = None if certificate_key is None else Path(certificate_key)
+        self._server: PageServer | None = None
+
+    def run_process(self, context: Context) -> int:
+        self._context = context
+        return super().run_process(context)
+
+    def on_start(self) -> None:
+        from afspm.dashboard.application import application
+        from afspm.dashboard.steering import Steering
+
+        launch = self._context.launch
+        state_dir = Path(launch.state_dir) if launch.state_dir else None
+        secret = secret_in(state_dir / f"{self.name}.secret" if state_dir else None)
+        access = Access(self._host, self._password_hash, self.clock.monotonic_s, secret)
+        bound = listening(self._host, self._port, self._usual_ports())
+        self._watch = Watch(self.clock, self._context.problems)
+        self._steering = Steering(launch, self.clock, self._watch)
+        folder = self.run_dir if launch.run_dir else None
+        app, self._told = application(
+            self._watch,
+            self._steering,
+            access,
+            Archive(folder),
+            title=_title(self.run_dir),
+            limits=allowed_region(self.run_dir),
+            simulated=self.simulated,
+            host=self._host,
+            encrypted=self._certificate is not None,
+        )
+        self._server = PageServer(app, bound, self._certificate, self._certificate_key)
+        self._server.start()
+        self._say_where(bound.getsockname()[1])
+
+    def on_message(self, envelope: str, message: Any) -> None:
+        time_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
+        self._watch.take(envelope.partition("_")[0], message, time_ns, envelope)
+
+    def on_end(self) -> None:
+        if self._server is None:
+            return
+        self._watch.tell(ended=True)
+        self._told(TOLD_WITHIN_S)
+        self._steering.close()
+        self._server.stop()
+
+    def _usual_ports(self) -> tuple[int, ...]:
+        before = self.memory.get("port")
+        return (before, USUAL_PORT) if isinstance(before, int) else (USUAL_PORT,)
+
+    def _say_where(self, port: int) -> None:
+        scheme = "http" if self._certificate is None else "https"
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        url = f"{scheme}://{host}:{port}"
+        self.memory.update({"port": port, "url": url})
+        self.memory.save()
+        self.log.info("the dashboard is at %s", url)
+        if self._certificate is None and not is_loopback(self._host):
+            self.log.warning(
+                "the dashboard is not encrypted, and others can reach it: set certificate and certificate_key"
+            )
+
+
+NAME: Final = "dashboard"
+
+
+def _title(run_dir: Path) -> str:
+    """The name of the experiment."""
+    try:
+        name = json.loads((run_dir / "run.json").read_text(encoding="utf-8")).get("name")
+    except (OSError, ValueError, FileError, AttributeError):
+        name = None
+    return str(name) if name else "afspm"
