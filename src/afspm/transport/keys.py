@@ -125,7 +125,7 @@ def _read(file: Path, name: str) -> dict[str, bytes]:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
-            f"the key can't be read: {error}", where=str(file), hint=f"make it with: afspm keys … {name}"
+            f"the key can't be read: {error}", where=str(file), hint=f"make it with: afspm keys FILE --also {name}"
         ) from error
     entries = {key: value.encode() for key, value in _ENTRY.findall(text)}
     if "public-key" not in entries:

@@ -1,0 +1,74 @@
+"""An experiment with keys on an emulated controller, and the checks of its translator."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from afspm.supervisor.ports import FreePorts
+
+DEADLINE_S = 60.0
+AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
+EXPERIMENT = """
+[clock]
+speed = 60.0
+
+[controller]
+component = true
+class = "NanonisEmulator"
+surface = "particles"
+port = {port}
+
+[microscope]
+component = true
+class = "Nanonis"
+address = "127.0.0.1:{port}"
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[details]
+component = true
+class = "ScanList"
+regions = [{{ center = ["0 nm", "0 nm"], size = ["500 nm", "500 nm"] }}]
+pixels = [32, 24]
+end_when_done = true
+
+[security]
+keys = "keys"
+"""
+
+
+def afspm(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*AFSPM, *arguments], cwd=cwd, capture_output=True, text=True, timeout=DEADLINE_S, check=False
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With the experiment file, and keys for each of its processes."""
+    (tmp_path / "experiment.toml").write_text(EXPERIMENT.format(port=FreePorts().take()), encoding="utf-8")
+    assert afspm("keys", "experiment.toml", cwd=tmp_path).returncode == 0
+    return tmp_path
+
+
+def test_an_experiment_with_keys_scans_on_an_emulated_controller(folder: Path) -> None:
+    done = afspm("run", "experiment.toml", cwd=folder)
+    assert done.returncode == 0, done.stdout
+    assert "scan 1 of 1 at" in done.stdout
+
+
+def test_the_checks_want_a_key_of_their_own_and_say_which_and_then_find_all_as_it_should_be(folder: Path) -> None:
+    checks = ("test-translator", "experiment.toml", "-k", "published", "-k", "frame/set", "-k", "refused/nan")
+    refused = afspm(*checks, cwd=folder)
+    assert refused.returncode == 1
+    assert "afspm keys FILE --also translator_test" in " ".join(refused.stderr.split())
+    assert afspm("keys", "experiment.toml", "--also", "translator_test", cwd=folder).returncode == 0
+    done = afspm(*checks, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "passed" in done.stdout
