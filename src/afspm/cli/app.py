@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from afspm.cli import check, drift, emulate, graph, keys, new, run, status, steer, test_translator
+from afspm.cli import check, drift, emulate, graph, keys, new, report, run, status, steer, test_translator
 
 app = typer.Typer(
     name="afspm",
@@ -21,6 +21,7 @@ app.command("pause")(steer.pause)
 app.command("resume")(steer.resume)
 app.command("end")(steer.end)
 app.command("problems")(steer.problems)
+app.command("report")(report.report)
 app.command("check")(check.check)
 app.command("graph")(graph.graph)
 app.command("keys")(keys.keys)

@@ -1,0 +1,136 @@
+"""`Notifier`: tells people of what needs them while the experiment goes on. Part of it where its file has [notify]."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from afspm.components import notices
+from afspm.components.notices import (
+    GIVEN_UP,
+    MOST_TRIES,
+    MOST_WAITING,
+    OCCASIONS,
+    UNSOLVED,
+    NotDelivered,
+    Notice,
+    Targets,
+)
+from afspm.errors import ConfigError
+from afspm.model import ControlState, ProcessCondition, ProcessStates
+from afspm.runtime.component import Component
+from afspm.units import Duration
+
+LAST_TRIES = 2  # the end of the experiment does not wait for more
+
+
+class Notifier(Component):
+    """Calls a command, a webhook or both when a problem stays unsolved and when a component is given up.
+
+    It only listens, and what it waits for holds up nobody. What can't be delivered is tried again, later and later,
+    for half an hour; killed and started again, it goes on with that, and tells nothing twice that was delivered. Of
+    the end of the experiment the supervisor tells, which sees how it ended.
+
+    Args:
+        command: program and arguments, run where the experiment file is; the notice is JSON on its standard input.
+        webhook: where that JSON is posted to; "$NAME" is taken from the environment.
+        on: of what to tell: "unsolved-problem", "given-up".
+        unsolved_after: how long a problem may be flagged before it counts as unsolved, experiment time.
+        folder: of the experiment file.
+    """
+
+    listens: ClassVar = ("ControlState", "ProcessStates")
+    notifies: ClassVar[bool] = True
+    period_s = 1.0
+    period_time: Literal["experiment", "real"] = "real"
+
+    def __init__(
+        self,
+        command: list[str] | None = None,
+        webhook: str = "",
+        on: list[str] | None = None,
+        unsolved_after: Duration = 900.0,
+        folder: str = "",
+    ) -> None:
+        self.targets = Targets(tuple(command or ()), webhook, folder)
+        self.on = tuple(OCCASIONS if on is None else on)
+        self.unsolved_after = unsolved_after
+        if not self.targets.ways:
+            raise ConfigError("nobody to tell", where="[notify]", hint="it needs a `command` or a `webhook`")
+        if unknown := [one for one in self.on if one not in OCCASIONS]:
+            raise ConfigError(f"[notify] on: {unknown[0]!r} never happens", hint=f"known: {', '.join(OCCASIONS)}")
+
+    def on_start(self) -> None:
+        self.memory.setdefault("flagged", {})
+        self.memory.setdefault("told", [])
+        self.memory.setdefault("waiting", [])
+        self._due_s: dict[str, float] = {}
+        if self.targets.webhook:
+            notices.address(self.targets.webhook)  # what can't work is to be known now, not in the night
+
+    def on_control(self, control_state: ControlState) -> None:
+        since_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
+        before: dict[str, int] = self.memory["flagged"]
+        now = {str(number): before.get(str(number), since_ns) for number in control_state.problems}
+        if now != before:
+            self.memory["flagged"] = now
+            self.memory.save()
+
+    def on_process_states(self, states: ProcessStates) -> None:
+        for state in states.processes:
+            if state.condition is ProcessCondition.GIVEN_UP:
+                how = f": {state.last_exit}" if state.last_exit else ""
+                self._tell(GIVEN_UP, f"{state.name} {state.starts}", f"{state.name} is given up{how}")
+
+    def on_tick(self) -> None:
+        now_ns = self.clock.now_ns()
+        for number, since_ns in self.memory["flagged"].items():
+            if now_ns - since_ns >= self.unsolved_after * 1e9:
+                name, minutes = self.scope.problems.name(int(number)), (now_ns - since_ns) / 60e9
+                text = f"{name} has been flagged for {minutes:.0f} min, and nobody has solved it"
+                self._tell(UNSOLVED, f"{number} {since_ns}", text)
+        self._deliver_what_is_due()
+
+    def on_end(self) -> None:
+        for waiting in self.memory["waiting"][-LAST_TRIES:]:
+            self._try(waiting)
+
+    def _tell(self, what: str, which: str, text: str) -> None:
+        """Have it delivered, once."""
+        key = f"{what} {which}"
+        if what not in self.on or key in self.memory["told"]:
+            return
+        self.log.warning("%s", text)
+        name, run = notices.facts_of(Path(self.run_dir))
+        notice = Notice(what, name, run, self.clock.now_ns(), text, self.simulated)
+        new = [{"notice": dict(vars(notice)), "way": way, "tries": 0} for way in self.targets.ways]
+        self.memory["waiting"] = [*self.memory["waiting"], *new][-MOST_WAITING:]
+        self.memory["told"] = [*self.memory["told"], key]
+        self.memory.save()
+
+    def _deliver_what_is_due(self) -> None:
+        for waiting in tuple(self.memory["waiting"]):
+            if self.clock.monotonic_s() >= self._due_s.get(_key(waiting), 0.0):
+                self._try(waiting)
+                return  # one a tick: in between, what was published is heard
+
+    def _try(self, waiting: dict[str, Any]) -> None:
+        key, way = _key(waiting), waiting["way"]
+        try:
+            self.targets.deliver(Notice(**waiting["notice"]), way)
+        except (NotDelivered, ConfigError) as error:
+            waiting["tries"] += 1
+            self._due_s[key] = self.clock.monotonic_s() + notices.delay_s(waiting["tries"])
+            if waiting["tries"] < MOST_TRIES:
+                self.log.info("nobody told yet, it is tried again: %s", error)
+                self.memory.save()
+                return
+            self.log.error("given up telling of it: %s", error)
+        self.memory["waiting"] = [one for one in self.memory["waiting"] if _key(one) != key]
+        self.memory.save()
+        self._due_s.pop(key, None)
+
+
+def _key(waiting: dict[str, Any]) -> str:
+    notice = waiting["notice"]
+    return f"{waiting['way']} {notice['what']} {notice['time_ns']} {notice['text']}"

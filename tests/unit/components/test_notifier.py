@@ -1,0 +1,258 @@
+"""People are told: when, once, again if that fails, and without giving secrets away."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from runtime_lab import FakeClock
+
+from afspm import model
+from afspm.components import notices
+from afspm.components.notices import NotDelivered, Notice, Targets
+from afspm.components.notifier import Notifier
+from afspm.errors import ConfigError
+from afspm.model import ControlMode, ControlState, ProblemNames, ProcessCondition
+from afspm.runtime.memory import Memory
+
+SECRET = "T0PSECRET"
+NOTICE = Notice("end", "night", "runs/night-1", 1_700_000_000_000_000_000, "the experiment has ended", simulated=True)
+
+
+class Hook(ThreadingHTTPServer):
+    """A server that keeps what is posted to it, and answers with `codes` in turn (the last again and again)."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.codes = [200]
+        self.got: list[dict[str, object]] = []
+        threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}/hooks/{SECRET}"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: Hook
+
+    def do_POST(self) -> None:
+        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        code = self.server.codes.pop(0) if len(self.server.codes) > 1 else self.server.codes[0]
+        if code == 200:
+            self.server.got.append(body)
+        self.send_response(code)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def hook() -> Iterator[Hook]:
+    server = Hook()
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+class Night:
+    """A notifier in an experiment: its lives share a clock and a memory."""
+
+    def __init__(self, folder: Path, **settings: object) -> None:
+        self.folder, self.settings, self.clock = folder, settings, FakeClock()
+        (folder / "run.json").write_text('{"name": "night"}', encoding="utf-8")
+        self.start()
+
+    def start(self) -> None:
+        class Scope:
+            problems = ProblemNames()
+
+        self.notifier = Notifier(**self.settings)  # type: ignore[arg-type]
+        self.notifier.clock, self.notifier.log = self.clock, logging.getLogger("afspm.notifier")
+        self.notifier.memory = Memory(self.folder / "notifier.json")
+        self.notifier.run_dir, self.notifier.simulated, self.notifier.packet = self.folder, True, None
+        self.notifier.scope = Scope()  # type: ignore[assignment]
+        self.notifier.on_start()
+
+    def control(self, *problems: int) -> None:
+        self.notifier.on_control(ControlState(ControlMode.AUTOMATED, None, problems))
+
+    def given_up(self, name: str, last_exit: str = "") -> None:
+        state = model.ProcessState(name, "component", ProcessCondition.GIVEN_UP, 1, 0.0, 3, 0, last_exit)
+        self.notifier.on_process_states(model.ProcessStates(1, "lab", (state,)))
+
+    def passes(self, seconds: int) -> None:
+        """Time passes, with a tick every ten seconds."""
+        for _ in range(seconds // 10):
+            self.clock.passed_s += 10.0
+            self.notifier.on_tick()
+
+
+def test_a_problem_that_nobody_solves_is_told_once(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url, unsolved_after=600.0)
+    night.control(1)
+    night.passes(590)
+    assert hook.got == []
+    night.passes(1000)
+    (told,) = hook.got
+    assert (told["what"], told["experiment"], told["run"]) == ("unsolved-problem", "night", str(tmp_path))
+    assert "tip-shape-changed has been flagged for 10 min" in str(told["text"])
+    assert told["simulated"] is True
+    assert str(told["time"]).endswith("+00:00")
+
+
+def test_a_problem_that_is_solved_in_time_is_not_told(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url, unsolved_after=600.0)
+    for _ in range(5):
+        night.control(1)
+        night.passes(590)
+        night.control()
+    assert hook.got == []
+
+
+def test_another_problem_meanwhile_does_not_begin_the_time_anew(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url, unsolved_after=600.0)
+    night.control(1)
+    night.passes(300)
+    night.control(1, 4)
+    night.passes(310)
+    assert [str(told["text"]).split()[0] for told in hook.got] == ["tip-shape-changed"]
+
+
+def test_a_component_that_is_given_up_is_told_once(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url)
+    for _ in range(3):  # a supervisor says so again and again
+        night.given_up("judge", "exit code 1")
+        night.passes(10)
+    assert [told["text"] for told in hook.got] == ["judge is given up: exit code 1"]
+
+
+def test_only_what_is_wanted_is_told(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url, on=["unsolved-problem"])
+    night.given_up("judge")
+    night.passes(100)
+    assert hook.got == []
+
+
+def test_what_fails_is_tried_again_later_and_later(tmp_path: Path, hook: Hook) -> None:
+    hook.codes = [500, 503, 200]
+    night = Night(tmp_path, webhook=hook.url)
+    night.given_up("judge")
+    night.passes(60)
+    assert len(hook.got) == 1
+    assert [notices.delay_s(tries) for tries in (1, 2, 3, 20)] == [2.0, 4.0, 8.0, notices.LONGEST_DELAY_S]
+
+
+def test_what_never_succeeds_is_given_up_and_said(tmp_path: Path, hook: Hook, caplog: pytest.LogCaptureFixture) -> None:
+    hook.codes = [500]
+    night = Night(tmp_path, webhook=hook.url)
+    night.given_up("judge")
+    night.passes(3600)
+    assert night.notifier.memory["waiting"] == []
+    assert "given up telling of it: 127.0.0.1 answers 500" in caplog.text
+
+
+def test_a_notifier_that_is_killed_goes_on_and_tells_nothing_twice(tmp_path: Path, hook: Hook) -> None:
+    hook.codes = [500, 200]
+    night = Night(tmp_path, webhook=hook.url, unsolved_after=100.0)
+    night.control(1)
+    night.passes(50)
+    night.start()
+    night.control(1)  # replayed
+    night.passes(60)
+    night.start()  # told, but not delivered yet
+    night.passes(60)
+    night.start()
+    night.control(1)
+    night.passes(600)
+    assert len(hook.got) == 1
+
+
+def test_each_way_is_tried_by_itself(tmp_path: Path, hook: Hook) -> None:
+    hook.codes = [500, 200]
+    night = Night(tmp_path, webhook=hook.url, command=recording(tmp_path))
+    night.given_up("judge")
+    night.passes(100)
+    assert len(hook.got) == 1
+    assert len(recorded(tmp_path)) == 1
+
+
+def test_no_log_holds_the_secret(tmp_path: Path, hook: Hook, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("DEBUG")
+    hook.codes = [404]
+    url = hook.url
+    for webhook in (url, f"http://127.0.0.1:1/{SECRET}", f"http://nowhere.invalid/{SECRET}"):
+        night = Night(tmp_path, webhook=webhook, command=[sys.executable, "-c", "exit(3)", SECRET])
+        night.given_up(f"judge {webhook[:18]}")
+        night.passes(100)
+    assert "tried again" in caplog.text
+    assert SECRET not in caplog.text
+
+
+def recording(folder: Path) -> list[str]:
+    """A command that writes down what it gets."""
+    code = "import sys, os; open(sys.argv[1], 'a').write(sys.stdin.read() + '|' + os.environ['AFSPM_WHAT'] + chr(10))"
+    return [sys.executable, "-c", code, str(folder / "told.txt")]
+
+
+def recorded(folder: Path) -> list[str]:
+    return (folder / "told.txt").read_text(encoding="utf-8").splitlines()
+
+
+def test_a_command_gets_the_notice(tmp_path: Path) -> None:
+    Targets(recording(tmp_path)).deliver(NOTICE, "command")
+    body, what = recorded(tmp_path)[0].split("|")
+    assert json.loads(body) == {
+        "what": "end",
+        "experiment": "night",
+        "run": "runs/night-1",
+        "time": "2023-11-14T22:13:20+00:00",
+        "text": "the experiment has ended",
+        "simulated": True,
+    }
+    assert what == "end"
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [("import sys; sys.exit('no network')", "ended with 1: no network"), ("while True: pass", "took longer")],
+)
+def test_a_command_that_fails_is_said(monkeypatch: pytest.MonkeyPatch, code: str, said: str) -> None:
+    monkeypatch.setattr(notices, "TIMEOUT_S", 0.5)
+    with pytest.raises(NotDelivered, match=said):
+        Targets([sys.executable, "-c", code]).deliver(NOTICE, "command")
+
+
+def test_a_program_that_is_not_there_is_said() -> None:
+    with pytest.raises(NotDelivered, match="no-such-program can't be run"):
+        Targets(["/nowhere/no-such-program"]).deliver(NOTICE, "command")
+
+
+def test_a_webhook_may_be_named_by_the_environment() -> None:
+    assert notices.address("$HOOK", {"HOOK": "https://chat.example.org/x"}) == "https://chat.example.org/x"
+    with pytest.raises(ConfigError, match="no environment variable 'HOOK'"):
+        notices.address("$HOOK", {})
+
+
+@pytest.mark.parametrize(
+    "wrong", ["ftp://a.example", "file:///etc/passwd", "chitchat", "http://", "https://u:pw@a.example"]
+)
+def test_what_is_no_address_is_refused_without_repeating_it(wrong: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        notices.address(wrong)
+    assert wrong not in str(refused.value)
+
+
+def test_nobody_to_tell_is_an_error() -> None:
+    with pytest.raises(ConfigError, match="nobody to tell"):
+        Notifier()
+    with pytest.raises(ConfigError, match="'dawn' never happens"):
+        Notifier(webhook="http://a.example", on=["dawn"])
