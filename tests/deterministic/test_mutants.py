@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from afspm.logic import arbitration
+from afspm.logic import arbitration, chronicle
 from afspm.logic.arbitration import Do, Event, Row
 from afspm.logic.cache import Cache
+from afspm.logic.chronicle import Chronicle
 from afspm.logic.desk import Desk
 from afspm.logic.forwarding import Forwarder
 from afspm.logic.lease import Lease
 from afspm.logic.once import OnceTable
 from afspm.logic.scheduling import SchedulerCore
 from afspm.logic.sessions import Hearing, Sessions
+from afspm.model import JournalEntries
 from afspm.testing.deterministic.invariants import InvariantViolated
 from afspm.testing.deterministic.night import Fault, Night, Plan, plan
 
@@ -165,7 +168,61 @@ def replay_envelope_by_envelope(patch: Patch) -> None:
     patch.setattr(Cache, "replay", replay)
 
 
+def answers_are_written_down_once_more(patch: Patch) -> None:
+    real = Chronicle.take
+
+    def take(self: Chronicle) -> JournalEntries:
+        taken, before = real(self), self.__dict__.setdefault("before", JournalEntries(()))
+        self.__dict__["before"] = JournalEntries(taken.entries[-1:])
+        return JournalEntries((*before.entries, *taken.entries))
+
+    patch.setattr(Chronicle, "take", take)
+
+
+def every_fiftieth_answer_is_not_written_down(patch: Patch) -> None:
+    real, count = Chronicle.answered, itertools.count(1)
+
+    def answered(self: Chronicle, *args: Any) -> None:
+        if next(count) % 50:
+            real(self, *args)
+
+    patch.setattr(Chronicle, "answered", answered)
+
+
+def changes_of_control_are_not_written_down(patch: Patch) -> None:
+    patch.setattr(Chronicle, "_say", lambda self, who, what, reason="": None)
+
+
+def entries_are_held_back(patch: Patch) -> None:
+    patch.setattr(SchedulerCore, "_entries_due_s", lambda self: None)
+
+
+def entries_are_published_at_once(patch: Patch) -> None:
+    patch.setattr(chronicle, "PERIOD_S", 0.0)
+
+
+def entries_backwards(patch: Patch) -> None:
+    real = Chronicle.take
+    patch.setattr(Chronicle, "take", lambda self: JournalEntries(real(self).entries[::-1]))
+
+
+def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
+    real = Cache.restore
+
+    def restore(self: Cache, packets: Any, *args: Any) -> None:
+        real(self, [entry for entry in packets if entry[0].envelope != chronicle.ENTRIES], *args)
+
+    patch.setattr(Cache, "restore", restore)
+
+
 MUTANTS = [
+    answers_are_written_down_once_more,
+    every_fiftieth_answer_is_not_written_down,
+    changes_of_control_are_not_written_down,
+    entries_are_held_back,
+    entries_are_published_at_once,
+    entries_backwards,
+    entries_are_not_kept_over_a_kill,
     flag_leaves_control,
     two_in_control,
     anybody_while_flagged,

@@ -39,6 +39,13 @@ def test_a_quiet_night_is_full_of_scans() -> None:
     assert outcome.given_up == []
 
 
+def test_what_happens_in_a_night_is_written_down_and_orders_are_carried_out() -> None:
+    night = Night(Plan(seed=4, hours=8.0, cast=("experiment", "stranger", "listener")))
+    night.run()
+    assert night.invariants.written.entries > 300
+    assert 0 < night.teller.ordered <= night.components["experiment"].life // 2
+
+
 def test_the_long_run_tells_what_it_did(capsys: pytest.CaptureFixture[str]) -> None:
     assert longrun.main(["--nights", "2", "--seed", "5"]) == 0
     assert "every invariant held" in capsys.readouterr().out

@@ -238,11 +238,13 @@ class Teller(Client):
             for name in self.codec.decode(response.payload) if response.code == _OK else ():
                 self.ordered += 1
                 self.restart(name)
-            yield from self.sleep(2.0)
+            yield from self.sleep(5.0)
 
 
 class Listener(Client):
-    """Only listens, as a visualiser does."""
+    """Only listens, to everything, as a visualiser does."""
+
+    listens = ("",)
 
     def behave(self) -> Doing:
         while True:

@@ -33,11 +33,13 @@ class Client(Process):
     Attributes:
         identity: what it calls itself to the scheduler; an impostor's differs from its `name`.
         knows_ids: ours sends ids and repeats a request that is not answered; one of version 1 does neither.
+        listens: how the envelopes begin that it subscribes to.
         on_received: called with every packet that reaches it.
     """
 
     knows_ids = True
     connects = True  # at its start
+    listens: tuple[str, ...] = ("Scan2d", "ScopeStateMsg", "ControlState")
 
     def __init__(
         self,
@@ -80,7 +82,7 @@ class Client(Process):
         self._forget()
         if self.connects:
             self.connect()
-        self._feed = Feed(self.timeline, self._weather, self, self._scheduler)
+        self._feed = Feed(self.timeline, self._weather, self, self._scheduler, self.listens)
         self._doing = self.behave()
         self.later(0.0, self._go_on)
 

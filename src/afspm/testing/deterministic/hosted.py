@@ -16,9 +16,11 @@ from afspm.microscopes.microscope import Microscope
 from afspm.microscopes.translator import Translator
 from afspm.model import Packet, Request, Response
 from afspm.runtime.component import Component
+from afspm.runtime.host import MEASURED
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.memory import Memory
 from afspm.runtime.process import Activity, Context
+from afspm.runtime.view import KEPT
 from afspm.testing.deterministic.baton import Baton
 from afspm.testing.deterministic.network import ControlLine, Feed, Weather
 from afspm.testing.deterministic.process import Process
@@ -155,7 +157,7 @@ class HostedComponent(HostedProcess):
         self._inbox = []
         self._newest = {}
         self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.name)
-        self._feed = Feed(self.timeline, self._weather, self, self._scheduler)
+        self._feed = Feed(self.timeline, self._weather, self, self._scheduler, sorted({*KEPT, *MEASURED}))
 
     def disconnect(self) -> None:
         self._line.close()

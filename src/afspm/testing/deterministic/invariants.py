@@ -294,7 +294,7 @@ class Invariants:
 
     def has_all(self, client: Client, cached: Sequence[Packet]) -> None:
         """In calm weather a component has, of every envelope, what the cache held a moment ago."""
-        for packet in cached:
+        for packet in (packet for packet in cached if packet.envelope.startswith(client.listens)):
             have = client.newest.get(packet.envelope)
             self._must(
                 have is not None and have[0] >= (packet.time_ns or 0),
