@@ -1,0 +1,97 @@
+"""What follows the end of a run."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+
+import pytest
+
+from afspm.clock import ExperimentClock
+from afspm.components import notices
+from afspm.components.notices import OCCASIONS, Targets
+from afspm.record.report import REPORT_FILE
+from afspm.record.store import Store
+from afspm.supervisor import aftermath
+from afspm.supervisor.aftermath import Ended
+from afspm.supervisor.ending import Why
+from afspm.supervisor.supervisor import Outcome, Report
+
+
+class Log:
+    """Keeps what is written."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[int, str]] = []
+
+    def write(self, name: str, level: int, text: str) -> None:
+        self.lines.append((level, text))
+
+
+def told(folder: Path, why: Why, on: tuple[str, ...] = OCCASIONS) -> list[dict[str, object]]:
+    """What a command is told of a run that ended so."""
+    file = folder / "told.txt"
+    code = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
+    reports = (Report("judge", 3, True, "exit code 1"), Report("series", 1, False, "done"))
+    outcome = Outcome(why, "the microscope is given up", reports, 60.0)
+    targets = Targets([sys.executable, "-c", code, str(file)])
+    aftermath.tell(Ended("night", folder, outcome, True), targets, on, ExperimentClock.real(), Log())  # type: ignore[arg-type]
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+@pytest.mark.parametrize(
+    ("why", "on", "what"),
+    [
+        (Why.EXPERIMENT_ENDED, OCCASIONS, "end"),
+        (Why.STOPPED, ("end",), "end"),
+        (Why.LOST, OCCASIONS, "given-up"),
+        (Why.LOST, ("end",), "end"),
+    ],
+)
+def test_the_end_is_told_with_how_it_ended(tmp_path: Path, why: Why, on: tuple[str, ...], what: str) -> None:
+    (notice,) = told(tmp_path, why, on)
+    assert (notice["what"], notice["experiment"], notice["run"]) == (what, "night", str(tmp_path))
+    assert notice["text"] == "the microscope is given up; given up: judge"
+
+
+def test_who_does_not_want_to_know_is_not_told(tmp_path: Path) -> None:
+    assert told(tmp_path, Why.EXPERIMENT_ENDED, ("unsolved-problem",)) == []
+
+
+def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(notices, "FIRST_DELAY_S", 0.01)
+    monkeypatch.setattr(aftermath, "TOLD_WITHIN_S", 0.5)
+    log, count = Log(), tmp_path / "count"
+    code = "import sys; open(sys.argv[1], 'a').write('x'); sys.exit('no network')"
+    ended = Ended("night", tmp_path, Outcome(Why.ALL_DONE, "all is done", (), 1.0), False)
+    targets = Targets([sys.executable, "-c", code, str(count)])
+    aftermath.tell(ended, targets, ("end",), ExperimentClock.real(), log)  # type: ignore[arg-type]
+    assert len(count.read_text()) >= 2
+    assert [level for level, _ in log.lines] == [logging.ERROR]
+    assert "nobody could be told" in log.lines[0][1]
+
+
+def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
+    Store(tmp_path).close()
+    log = Log()
+    aftermath.report(tmp_path, log)  # type: ignore[arg-type]
+    assert (tmp_path / REPORT_FILE).is_file()
+    assert log.lines == []
+
+
+def test_without_a_record_there_is_none_and_no_word_of_it(tmp_path: Path) -> None:
+    log = Log()
+    aftermath.report(tmp_path, log)  # type: ignore[arg-type]
+    assert log.lines == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_report_that_fails_is_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "journal.sqlite").write_bytes(b"not a database at all, but long enough to be looked at" * 20)
+    log = Log()
+    aftermath.report(tmp_path, log)  # type: ignore[arg-type]
+    ((level, text),) = log.lines
+    assert level == logging.WARNING
+    assert text.startswith("no report: ")
