@@ -48,7 +48,7 @@ def watch(where: Where = RUNS) -> None:
     console = _console()
     with looking(where, lines=True) as follower, contextlib.suppress(KeyboardInterrupt):
         told = about(follower, fancy=can_show_blocks())
-        if console.is_terminal:
+        if console.is_terminal and not console.is_dumb_terminal:
             _live(follower, told, console)
         else:
             _in_lines(follower, told)

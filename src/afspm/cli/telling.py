@@ -84,7 +84,7 @@ def summary(seen: Overview, about: About, now_ns: int) -> str:
 def _label(name: str) -> Text:
     from rich.text import Text
 
-    return Text(f"{name:11}", "dim")
+    return Text.assemble((f"{name:11}", "dim"))
 
 
 def _head(seen: Overview, about: About, now_ns: int) -> Text:
