@@ -51,7 +51,7 @@ def watch(where: Where = RUNS) -> None:
         if console.is_terminal and not console.is_dumb_terminal:
             _live(follower, told, console)
         else:
-            _in_lines(follower, told)
+            _in_lines(follower)
         typer.echo("the experiment has ended")
 
 
@@ -85,7 +85,7 @@ def _room(follower: Follower, told: About, console: Console) -> int:
     return max(0, console.height - taken - 1)
 
 
-def _in_lines(follower: Follower, told: About) -> None:
+def _in_lines(follower: Follower) -> None:
     from afspm.cli import telling
 
     said, seen = "", len(follower.overview.log)
@@ -95,7 +95,7 @@ def _in_lines(follower: Follower, told: About) -> None:
         key = str((overview.control, overview.status))
         if key != said:
             said = key
-            typer.echo(telling.summary(overview, told, follower.clock.now_ns()))
+            typer.echo(telling.summary(overview, follower.clock.now_ns()))
         fresh = list(overview.log)
         if last is not None and last in fresh:
             fresh = fresh[len(fresh) - fresh[::-1].index(last) :]

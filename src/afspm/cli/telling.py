@@ -68,16 +68,16 @@ def screen(seen: Overview, about: About, now_ns: int, *, silent_s: float = 0.0, 
     if silent_s > OLD_S:
         told = f"no news for {silent_s:.0f} s: the scheduler is being started again, or can't be reached"
         lines.append(Text(told, "bold yellow"))
-    lines += [_control(seen, now_ns), *_problems(seen, now_ns), _microscope(seen, about, now_ns)]
+    lines += [_control(seen, now_ns), *_problems(seen, now_ns), _scanning(seen, about, now_ns)]
     lines += [*_progress(seen, about, now_ns), *_processes(seen, now_ns), *_refusals(seen), *_log(seen, log_lines)]
     for line in lines:
         line.no_wrap, line.overflow = False, "fold"
     return Group(*lines)
 
 
-def summary(seen: Overview, about: About, now_ns: int) -> str:
+def summary(seen: Overview, now_ns: int) -> str:
     """The most important in one line."""
-    parts = [_control(seen, now_ns), *_problems(seen, now_ns), _microscope(seen, about, now_ns)]
+    parts = [_control(seen, now_ns), *_problems(seen, now_ns), _microscope(seen, now_ns)]
     return "; ".join(" ".join(line.plain.split()) for line in parts)
 
 
@@ -133,7 +133,7 @@ def _problems(seen: Overview, now_ns: int) -> Iterator[Text]:
         yield line
 
 
-def _microscope(seen: Overview, about: About, now_ns: int) -> Text:
+def _microscope(seen: Overview, now_ns: int) -> Text:
     line = _label("microscope")
     if seen.status is None:
         return line.append("has not been heard of yet")
@@ -141,12 +141,17 @@ def _microscope(seen: Overview, about: About, now_ns: int) -> Text:
     line.append(seen.status.state.name.lower().replace("_", " "))
     if seen.status.paused:
         line.append(", paused", "yellow")
-    line.append(_since(now.start_ns if now else None, now_ns))
-    if seen.status.state is ScopeState.SCANNING and (progress := seen.scan_progress(now_ns)) is not None:
+    return line.append(_since(now.start_ns if now else None, now_ns))
+
+
+def _scanning(seen: Overview, about: About, now_ns: int) -> Text:
+    """What the microscope does, and how far it is with a scan."""
+    line = _microscope(seen, now_ns)
+    if seen.status is None or seen.status.state is not ScopeState.SCANNING:
+        return line
+    if (progress := seen.scan_progress(now_ns)) is not None:
         line.append(f"  {_bar(progress[0], about)} {_left(progress[1], about)}")
-    if seen.status.state is ScopeState.SCANNING and (size := _size(seen)):
-        line.append(f"  {size}", "dim")
-    return line
+    return line.append(f"  {_size(seen)}", "dim")
 
 
 def _size(seen: Overview) -> str:
