@@ -157,14 +157,14 @@ class Access:
 
     def cookie(self, person: str) -> str:
         """What the browser shows next time."""
-        body = _text(f"{int(self._now_s())}|{person}".encode())
+        body = base64.urlsafe_b64encode(f"{int(self._now_s())}|{person}".encode()).decode()
         return f"{body}.{self._signature(body)}"
 
     def _signed(self, cookie: str) -> Visitor | None:
         body, _, signature = cookie.partition(".")
-        if not signature or not hmac.compare_digest(self._signature(body), signature):
+        if not signature or not hmac.compare_digest(self._signature(body).encode(), signature.encode()):
             return None
-        since, _, person = base64.b64decode(body).decode().partition("|")
+        since, _, person = base64.urlsafe_b64decode(body).decode().partition("|")
         return Visitor(person) if self._now_s() - float(since) < REMEMBERED_S else None
 
     def _signature(self, body: str) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
+from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, is_loopback, secret_in
 from afspm.dashboard.allowed import allowed_region
 from afspm.dashboard.record import Archive
@@ -64,7 +65,7 @@ class Dashboard(Component):
         launch = self._context.launch
         state_dir = Path(launch.state_dir) if launch.state_dir else None
         secret = secret_in(state_dir / f"{self.name}.secret" if state_dir else None)
-        access = Access(self._host, self._password_hash, self.clock.monotonic_s, secret)
+        access = Access(self._host, self._password_hash, ExperimentClock.real().now_s, secret)
         bound = listening(self._host, self._port, self._usual_ports())
         self._watch = Watch(self.clock, self._context.problems)
         self._steering = Steering(launch, self.clock, self._watch)
@@ -111,9 +112,6 @@ class Dashboard(Component):
             self.log.warning(
                 "the dashboard is not encrypted, and others can reach it: set certificate and certificate_key"
             )
-
-
-NAME: Final = "dashboard"
 
 
 def _title(run_dir: Path) -> str:

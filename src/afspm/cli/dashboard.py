@@ -1,0 +1,118 @@
+"""`afspm dashboard`: the page of an experiment that runs already, here or on another computer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from afspm.experiment import Experiment
+
+RUNS = Path("runs")
+NAME = "dashboard"
+NAME_OF_CLASS = "Dashboard"
+
+
+def dashboard(
+    where: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN|FILE",
+            help="The folder of a run, a folder of runs (its newest is meant), or the experiment file.",
+        ),
+    ] = RUNS,
+    host: Annotated[
+        str, typer.Option(help="The address to listen at; others than this computer's own need a password.")
+    ] = "127.0.0.1",
+    port: Annotated[int | None, typer.Option(help="By default 8080, or any that is free.", show_default=False)] = None,
+    certificate: Annotated[Path | None, typer.Option(help="PEM file, for https.", show_default=False)] = None,
+    certificate_key: Annotated[Path | None, typer.Option(help="PEM file, its key.", show_default=False)] = None,
+    make_password: Annotated[
+        bool, typer.Option("--make-password", help="Ask for a password, print the line for the file, and end.")
+    ] = False,
+) -> None:
+    """Show a running experiment in the browser, and steer it.
+
+    It joins the run as a notebook would: the experiment does not notice when it comes and goes. With an experiment file
+    of which nothing runs here it connects to where the file says that the scheduler is. A password for others is in the
+    environment: AFSPM_DASHBOARD_PASSWORD.
+    """
+    if make_password:
+        _print_password()
+        return
+    settings: dict[str, Any] = {
+        "host": host, "port": port, "certificate": certificate, "certificate_key": certificate_key,
+    }  # fmt: skip
+    folder = _running_here(where)
+    if folder is not None:
+        raise typer.Exit(_join(folder, settings))
+    raise typer.Exit(_start_part(where))
+
+
+def with_dashboard(files: list[Path]) -> Experiment:
+    """The experiment, with a dashboard if its file has none."""
+    from afspm import dashboard
+    from afspm.experiment import load
+
+    experiment = load(*files)
+    if NAME_OF_CLASS in {path.rpartition(".")[2] for path in experiment.resolved.class_paths.values()}:
+        return experiment
+    return load(*files, Path(dashboard.__file__).with_name("assets") / "dashboard.toml")
+
+
+def _print_password() -> None:
+    from afspm.dashboard.access import hashed
+
+    password = typer.prompt("Password", hide_input=True, confirmation_prompt=True)
+    typer.echo(f'password_hash = "{hashed(password)}"')
+
+
+def _running_here(where: Path) -> Path | None:
+    """The folder of the run that is meant; None: the file is of one that was started elsewhere."""
+    from afspm.errors import FileError
+    from afspm.runtime.connect import ENDED, find_run
+    from afspm.runtime.following import facts_of
+
+    try:
+        folder = find_run(where)
+    except FileError:
+        if where.suffix == ".toml" and where.is_file():
+            return None
+        raise
+    if not facts_of(folder).get(ENDED):
+        return folder
+    if where.suffix == ".toml":
+        return None
+    raise FileError("this run has ended", where=str(folder), hint="its report.html tells how it was")
+
+
+def _join(folder: Path, settings: dict[str, Any]) -> int:
+    import logging
+    import sys
+
+    from afspm.dashboard import Dashboard
+    from afspm.dashboard.joining import join, url_in
+    from afspm.runtime.exit_codes import ExitCode
+    from afspm.runtime.following import facts_of
+
+    url = url_in(facts_of(folder).get("processes"), folder, NAME)
+    if url is not None:
+        typer.echo(f"this run has a dashboard already: {url}")
+        return 0
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    code = join(folder, Dashboard(**settings), NAME)
+    return 0 if code in (ExitCode.ENDED, ExitCode.DONE, ExitCode.ORPHAN) else 1
+
+
+def _start_part(file: Path) -> int:
+    """The dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
+    import sys
+
+    from afspm.supervisor import run as running
+
+    experiment = with_dashboard([file])
+    names = [name for name, path in experiment.resolved.class_paths.items() if path.endswith(f".{NAME_OF_CLASS}")]
+    ended = running.run(experiment, running.Options(only=tuple(names)), terminal=sys.stdout)
+    return ended.outcome.exit_code

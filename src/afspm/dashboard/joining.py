@@ -1,0 +1,74 @@
+"""A dashboard beside an experiment that runs already, as somebody who joins it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from afspm.clock import ExperimentClock
+from afspm.dashboard.dashboard import Dashboard
+from afspm.runtime.connect import guest_of
+from afspm.runtime.messages import register_all
+from afspm.runtime.process import Activity, Context
+from afspm.transport.launching import open_port
+from afspm.transport.port import ParentGone, Port
+
+
+def join(folder: Path, dashboard: Dashboard, name: str) -> int:
+    """Show the run in `folder` until it ends, or Ctrl-C; returns an exit code of components.
+
+    Args:
+        name: whom the scheduler knows it as; it has to have the role `operate` to command the microscope in MANUAL.
+
+    Raises:
+        FileError, ConfigError: there is no run in the folder, or nobody in it to connect to; the address is taken …
+    """
+    launch = guest_of(folder, name)
+    register_all(launch.messages)
+    launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / "state"))
+    clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
+    port = open_port(launch, clock)
+    context = Context(
+        launch,
+        clock,
+        open_port=lambda: port,
+        log=logging.getLogger(f"afspm.{name}"),
+        activity=Activity(clock),
+        session=os.urandom(4).hex(),
+    )
+    with _ended_by_ctrl_c(port):
+        return dashboard.run_process(context)
+
+
+@contextmanager
+def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
+    """While in the block Ctrl-C is what the end of the parent is to a component: the page says good-bye."""
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        port.wake_up(ParentGone())
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def url_in(launch_facts: object, folder: Path, name: str) -> str | None:
+    """Where the dashboard that the run was started with is; None if it has none of this name."""
+
+    if not isinstance(launch_facts, dict) or name not in launch_facts:
+        return None
+    try:
+        url = json.loads((folder / "state" / f"{name}.json").read_text(encoding="utf-8")).get("url")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return url if isinstance(url, str) else None

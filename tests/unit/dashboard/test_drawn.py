@@ -1,0 +1,293 @@
+"""Map, time line, curves, words: what is in the HTML."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from afspm.dashboard.content import log_html, process_words, refusals_html
+from afspm.dashboard.curves import drift_html, spectrum_html
+from afspm.dashboard.plots import Axis, Curve, plot, round_ticks, thinned
+from afspm.dashboard.sample_map import MapContent, map_html, places_of
+from afspm.dashboard.time_line import COLUMNS, stretches, time_line_html
+from afspm.dashboard.words import duration, position, quantity, scale
+from afspm.model import (
+    ControlMode,
+    ControlState,
+    Frame,
+    JournalEntry,
+    LogLine,
+    ProcessCondition,
+    ProcessState,
+    Region,
+    ScopeState,
+    ScopeStatus,
+    Spectrum,
+)
+from afspm.record.overview import DriftPoint, Overview, ScanTaken, Span, SpectrumTaken
+
+S = 1_000_000_000
+HERE = Region((0.0, 0.0), (1e-6, 1e-6))
+
+
+def taken(time_s: float, region: Region = HERE, channel: str = "Height", **more: bool) -> ScanTaken:
+    return ScanTaken(round(time_s * S), None, channel, "m", region, (8, 8), holder="series", **more)
+
+
+def shapes(html: str, style: str) -> list[ElementTree.Element]:
+    found = ElementTree.fromstring(re.search(r"<svg.*?</svg>", html, re.DOTALL).group())  # type: ignore[union-attr]
+    return [shape for shape in found if style in (shape.get("class") or "").split()]
+
+
+def corners(shape: ElementTree.Element) -> np.ndarray:
+    return np.array([point.split(",") for point in (shape.get("points") or "").split()], dtype=float)
+
+
+# --- the map ---
+
+
+def test_scans_lie_where_they_were_taken_turned_and_with_y_upwards() -> None:
+    high = Region((3e-6, 4e-6), (2e-6, 1e-6), 0.5)
+    html = map_html(MapContent([taken(1), taken(2, high)]))
+    drawn = {shape.get("data-time"): corners(shape) for shape in shapes(html, "scan")}
+    low_px, high_px = drawn[str(S)], drawn[str(2 * S)]
+    per_m = (high_px.mean(axis=0)[0] - low_px.mean(axis=0)[0]) / 3e-6
+    assert per_m > 0
+    assert (high_px.mean(axis=0)[1] - low_px.mean(axis=0)[1]) / -4e-6 == pytest.approx(per_m, rel=1e-3)
+    wanted = (high.corners_m() - np.array(high.center_m)) * per_m * np.array([1, -1])
+    assert np.allclose(high_px - high_px.mean(axis=0), wanted, atol=0.1)
+
+
+def test_a_click_knows_which_scan_and_channel_is_meant() -> None:
+    (shape,) = shapes(map_html(MapContent([taken(7, channel='A "B"')])), "scan")
+    assert (shape.get("data-time"), shape.get("data-channel")) == (str(7 * S), 'A "B"')
+
+
+def test_scans_of_one_place_are_one_on_the_map_and_the_newest_is_meant() -> None:
+    places, left_out = places_of([taken(i, channel=c) for i in range(1, 50) for c in ("Height", "Phase")])
+    assert left_out == 0
+    ((newest, count),) = places
+    assert (newest.time_ns, count) == (49 * S, 49)
+
+
+def test_ten_thousand_places_are_drawn_as_far_as_that_makes_sense_and_the_rest_is_told() -> None:
+    scans = [taken(i, Region((i * 1e-6, 0.0), (1e-6, 1e-6))) for i in range(10_000)]
+    html = map_html(MapContent(scans))
+    assert "8500 older places are not drawn" in html
+    assert len(shapes(html, "scan")) == 1500
+
+
+def test_what_is_set_the_limits_the_probe_and_spectra_are_on_it() -> None:
+    spectrum = SpectrumTaken(5 * S, "IV", (1e-7, 2e-7), Frame.TIP, ("V",), ("V",))
+    limits = Region((0.0, 0.0), (20e-6, 20e-6))
+    html = map_html(MapContent([taken(1)], [spectrum], HERE.moved_to((1e-6, 0.0)), limits, probe_m=(0.0, 0.0)))
+    assert [len(shapes(html, style)) for style in ("current", "limits", "spectrum", "probe")] == [1, 1, 1, 1]
+    assert shapes(html, "spectrum")[0].get("data-spectrum") == str(5 * S)
+
+
+def test_the_part_where_something_was_measured_fills_the_map_unless_all_limits_are_wanted() -> None:
+    content = MapContent([taken(1)], limits=Region((0.0, 0.0), (1e-3, 1e-3)))
+    near, whole = (np.ptp(corners(shapes(map_html(content, whole=w), "scan")[0])) for w in (False, True))
+    assert near > 600
+    assert whole < 2
+
+
+def test_the_limits_move_over_a_sample_that_drifts() -> None:
+    mapping = np.array([[1.0, 0.0, -2e-6], [0.0, 1.0, 0.0]])
+    content = MapContent([taken(1)], limits=Region((0.0, 0.0), (4e-6, 4e-6)), tip_to_sample=mapping)
+    html = map_html(content)
+    limits, scan = corners(shapes(html, "limits")[0]), corners(shapes(html, "scan")[0])
+    assert (limits.mean(axis=0)[0] - scan.mean(axis=0)[0]) / np.ptp(limits[:, 0]) == pytest.approx(-0.5, abs=1e-3)
+    assert "the sample has moved by (2, 0)" in html.replace("-0", "0")
+
+
+def test_an_interrupted_scan_is_marked() -> None:
+    assert shapes(map_html(MapContent([taken(1, interrupted=True)])), "cut")
+
+
+def test_an_empty_map_says_so() -> None:
+    assert "No place is known" in map_html(MapContent())
+
+
+# --- the time line ---
+
+
+def test_a_stretch_is_where_its_time_is() -> None:
+    found = stretches([Span("a", 0, 50 * S), Span("b", 50 * S, None)], 0, 100 * S)
+    assert [(one.label, one.begin, one.end) for one in found] == [("a", 0, COLUMNS // 2), ("b", COLUMNS // 2, COLUMNS)]
+
+
+def test_a_night_of_many_changes_takes_no_more_room_than_the_picture_has() -> None:
+    spans = [Span("scanning" if i % 2 else "free", i * S, (i + 1) * S) for i in range(20_000)]
+    found = stretches(spans, 0, 20_000 * S)
+    assert len(found) <= COLUMNS
+    assert all(a.end <= b.begin for a, b in itertools.pairwise(found))
+    assert sum(one.count for one in found) == 20_000
+
+
+def test_of_several_in_one_column_the_longest_is_shown() -> None:
+    spans = [Span("short", 0, S // 1000), Span("long", S // 1000, S // 4), Span("rest", S // 4, None)]
+    assert stretches(spans, 0, 1000 * S)[0].label == "long"
+
+
+def test_the_time_line_has_control_mode_state_problems_and_processes() -> None:
+    overview = Overview()
+    overview.take("ControlState", ControlState(ControlMode.AUTOMATED, "series"), S)
+    overview.take("ScopeStateMsg", ScopeStatus(ScopeState.SCANNING), 2 * S)
+    overview.take("ControlState", ControlState(ControlMode.AUTOMATED, None, (1,)), 3 * S)
+    html = time_line_html(overview, 10 * S)
+    for part in ("series", "automated", "scanning", "tip-shape-changed"):
+        assert part in html
+
+
+def test_names_from_outside_are_text_and_never_html() -> None:
+    overview = Overview()
+    evil = '<img src=x onerror="alert(1)">'
+    overview.take("ControlState", ControlState(ControlMode.AUTOMATED, evil), S)
+    overview.take("ScopeStateMsg", ScopeStatus(ScopeState.FREE), 2 * S)
+    line = LogLine(S, evil, "INFO", evil)
+    entry = JournalEntry(S, "request", evil, evil, 1, evil)
+    spectrum = Spectrum((0.0, 0.0), evil, (evil, evil), ("V", evil), np.ones((3, 2)), S)
+    for html in (
+        time_line_html(overview, 9 * S), log_html([line], frozenset(), "INFO"), refusals_html([entry]),
+        map_html(MapContent([taken(1, channel=evil)])), spectrum_html([(S, spectrum)], ""),
+    ):  # fmt: skip
+        assert "<img" not in html
+        assert "&lt;img" in html
+
+
+# --- lists ---
+
+
+def test_the_log_is_filtered_by_component_level_and_text_newest_first() -> None:
+    lines = [
+        LogLine(1 * S, "series", "INFO", "scan 1"),
+        LogLine(2 * S, "series", "WARNING", "slow"),
+        LogLine(3 * S, "tip", "ERROR", "Scan lost"),
+        LogLine(4 * S, "tip", "DEBUG", "scan detail"),
+    ]
+
+    def texts(*arguments: object) -> list[str]:
+        return re.findall(r"<span>(.*?)</span>", log_html(lines, *arguments))  # type: ignore[arg-type]
+
+    assert texts(frozenset(), "INFO") == ["Scan lost", "slow", "scan 1"]
+    assert texts(frozenset({"series"}), "INFO") == ["slow", "scan 1"]
+    assert texts(frozenset(), "WARNING") == ["Scan lost", "slow"]
+    assert texts(frozenset(), "DEBUG", "SCAN") == ["scan detail", "Scan lost", "scan 1"]
+    assert texts(frozenset({"nobody"}), "INFO") == []
+
+
+def test_a_long_log_is_shown_to_a_bounded_length() -> None:
+    lines = [LogLine(i, "a", "INFO", str(i)) for i in range(2000)]
+    html = log_html(lines, frozenset(), "INFO")
+    assert html.count("<li") == 300
+    assert "<span>1999</span>" in html
+
+
+def test_refusals_come_with_who_what_and_why() -> None:
+    html = refusals_html([JournalEntry(S, "request", "dashboard:Ada", "set bias to 9 V", 9, "above max = 6 V")])
+    assert "dashboard:Ada" in html
+    assert "set bias to 9 V" in html
+    assert "above max = 6 V" in html
+
+
+def test_a_process_is_told_of_in_words() -> None:
+    busy = ProcessState("series", "component", ProcessCondition.BUSY, S, 12.4, 3, 7, "killed: frozen")
+    condition, since, restarts = process_words(busy, 100 * S)
+    assert (condition, since, restarts) == ("busy", "on its step for 12 s", "restarted 2 times (last: killed: frozen)")
+    fine = ProcessState("series", "component", ProcessCondition.ALIVE, S)
+    assert process_words(fine, 100 * S)[2] == ""
+
+
+# --- curves ---
+
+
+def test_drift_is_drawn_against_time_and_its_state_told() -> None:
+    points = [DriftPoint(i * S, (i * 1e-9, -i * 1e-9), (1e-9, 0.0), correcting=True) for i in range(10)]
+    html = drift_html(points)
+    assert html.count("<path") == 2
+    assert "corrected" in html
+    lost = drift_html([*points, DriftPoint(11 * S, (0.0, 0.0), (0.0, 0.0), lost=True, reason="no overlap")])
+    assert "The sample is lost: no overlap" in lost
+
+
+def test_no_drift_is_said() -> None:
+    assert "Nobody tracks drift" in drift_html([])
+
+
+def test_a_spectrum_is_drawn_with_those_before_it_behind() -> None:
+    values = np.stack([np.linspace(-1, 1, 50), np.linspace(0, 1e-9, 50)], axis=1)
+    spectra = [(i * S, Spectrum((0.0, 0.0), "IV", ("V", "I"), ("V", "A"), values, i * S)) for i in range(1, 4)]
+    html = spectrum_html(spectra, "I")
+    assert html.count("<path") == 3
+    assert "I [nA]" in html or "I [pA]" in html
+
+
+def test_a_spectrum_of_one_variable_is_no_error() -> None:
+    spectrum = Spectrum(None, "", ("V",), ("V",), np.ones((3, 1)), S)
+    assert "no curve" in spectrum_html([(S, spectrum)], "I")
+
+
+def test_peaks_survive_thinning() -> None:
+    y = np.zeros(100_000)
+    y[31_234] = 5.0
+    x, thin = thinned(np.arange(100_000.0), y)
+    assert thin.max() == 5.0
+    assert len(thin) <= 700
+    assert (np.diff(x) > 0).all()
+
+
+def test_a_gap_is_not_drawn_over() -> None:
+    y = np.array([0.0, 1.0, np.nan, 1.0, 0.0])
+    html = plot([Curve(np.arange(5.0), y, "curve-a")], Axis("x"), Axis("y"), "t")
+    path = re.search(r' d="(.*?)"', html)
+    assert path is not None
+    assert path.group(1).count("M") == 2
+
+
+@pytest.mark.parametrize("y", [np.full(3, np.nan), np.zeros(0)])
+def test_nothing_to_draw_is_said(y: np.ndarray) -> None:
+    assert "nothing yet" in plot([Curve(np.arange(float(len(y))), y, "a")], Axis("x"), Axis("y"), "t")
+
+
+def test_ticks_are_round_and_inside() -> None:
+    assert round_ticks(-0.26, 1.03) == [-0.2, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0] or round_ticks(-0.26, 1.03) == [
+        0.0,
+        0.5,
+        1.0,
+    ]
+    for low, high in ((1e-9, 3e-9), (-7.0, 1000.0), (5.0, 5.0)):
+        assert all(low - 1e-9 * high <= tick <= high * (1 + 1e-9) for tick in round_ticks(low, high))
+
+
+# --- words ---
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(1.234e-8, "m", "12.34 nm"), (0.0, "m", "0 m"), (9.9999e-7, "m", "1 µm"), (-3.0, "V", "-3 V"), (5.0, "", "5"),
+     (0.001, "counts", "0.001 counts"), (float("nan"), "m", "–"), (None, "m", "–"), (2e-6, "m/s", "2 µm/s")],
+)  # fmt: skip
+def test_quantities_read_well(value: float | None, unit: str, text: str) -> None:
+    assert quantity(value, unit) == text
+
+
+def test_the_prefix_and_the_factor_belong_together() -> None:
+    factor, unit = scale(3e-7, "m")
+    assert (3e-7 * factor, unit) == (pytest.approx(300.0), "nm")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.2, "0 s"), (59.6, "1 min 00 s"), (8, "8 s"), (725, "12 min 05 s"), (12_000, "3 h 20 min")]
+)
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_positions_read_well() -> None:
+    assert position((1.2e-6, -5e-7)) == "(1.2, −0.5) µm"
+    assert position((0.0, 0.0)) == "(0, 0) nm"
