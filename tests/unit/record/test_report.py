@@ -121,7 +121,7 @@ def test_the_page_needs_nothing_else_and_is_whole(run: Path) -> None:
     text = write(run).read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
-    assert page.pictures >= 4  # three scans and the night
+    assert page.pictures == 3  # the scans
     assert [load for load in page.loads if not load.startswith("data:image/png;base64,")] == []
     assert "<script" not in text
     assert re.findall(r"url\(|@import", text) == []
@@ -153,13 +153,16 @@ def test_nothing_of_others_becomes_markup(run: Path) -> None:
 
 def test_the_night_is_drawn_beside_it(run: Path) -> None:
     write(run)
-    assert (run / pictures.NIGHT).read_bytes().startswith(b"\x89PNG")
+    assert (run / pictures.OWN_NIGHT).read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_picture_that_a_component_has_drawn_is_left_alone(run: Path) -> None:
-    (run / pictures.NIGHT).write_bytes(b"\x89PNG as it was")
-    write(run)
-    assert (run / pictures.NIGHT).read_bytes() == b"\x89PNG as it was"
+def test_what_a_component_has_drawn_is_shown_instead(run: Path) -> None:
+    write(run)  # while it still goes on
+    drawn = (run / pictures.OWN_NIGHT).read_bytes()
+    (run / pictures.NIGHT).write_bytes(drawn)
+    text = write(run).read_text(encoding="utf-8")
+    assert not (run / pictures.OWN_NIGHT).exists()
+    assert text.count("night.png") == 1
 
 
 def test_writing_again_is_the_same(run: Path) -> None:

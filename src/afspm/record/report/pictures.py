@@ -23,6 +23,8 @@ from afspm.record.tables import ScanRow
 
 MOST = 98
 NIGHT, OFFSET = "night.png", "drift_offset.png"
+"""As components draw them."""
+OWN_NIGHT, OWN_OFFSET = "report.png", "report_drift.png"
 _TOPOGRAPHY = ("height", "topo", "z ", "z")
 _log = logging.getLogger("afspm.report")
 
@@ -76,20 +78,28 @@ def topography(scans: ScanSet) -> str:
 
 
 def draw(run: Run, story: Story, shown: Sequence[Small]) -> None:
-    """Draw the night, and drift against time, where no component has done so, as far as matplotlib is there."""
+    """Draw the night and drift against time, where no component has, as far as matplotlib is there."""
     if importlib.util.find_spec("matplotlib") is None:
         return
-    if not (run.folder / NIGHT).exists() and any(small.picture is not None for small in shown):
+    if _is_ours(run.folder, OWN_NIGHT, NIGHT) and any(small.picture is not None for small in shown):
         from afspm.record import night_figure
 
         record = night_of(run, story, shown)
         numbers = {number: story.overview.problems.name(number) for number in record.problems}
-        night_figure.draw(record, run.folder / NIGHT, numbers, title=story.name, simulated=story.simulated)
-    if not (run.folder / OFFSET).exists() and len(story.overview.drift) > 1:
+        night_figure.draw(record, run.folder / OWN_NIGHT, numbers, title=story.name, simulated=story.simulated)
+    if _is_ours(run.folder, OWN_OFFSET, OFFSET) and len(story.overview.drift) > 1:
         from afspm.drift.figures import offsets, style
 
         title = f"{story.name} (simulated)" if story.simulated else story.name
-        style.save(offsets.draw(drift_of(run), title=title), run.folder / OFFSET)
+        style.save(offsets.draw(drift_of(run), title=title), run.folder / OWN_OFFSET)
+
+
+def _is_ours(folder: Path, own: str, components: str) -> bool:
+    """Whether a figure is ours to draw. One drawn while the run went on is taken away if a component has drawn it."""
+    if (folder / components).exists():
+        (folder / own).unlink(missing_ok=True)
+        return False
+    return True
 
 
 def night_of(run: Run, story: Story, shown: Sequence[Small]) -> NightRecord:
@@ -134,6 +144,7 @@ def drift_of(run: Run) -> Any:
 
 
 def figures(folder: Path) -> list[Path]:
-    """The pictures in the run folder: the night first, then those of drift, then whatever else."""
-    found = sorted(folder.glob("*.png"))
-    return sorted(found, key=lambda path: (path.name != NIGHT, not path.name.startswith("drift_offset"), path.name))
+    """The pictures for the page: the night first, then drift, then whatever else there is in the run folder."""
+    found = [path for path in folder.glob("*.png") if path.name != OWN_NIGHT]  # the page has all that is in that
+    first = (NIGHT, OFFSET, OWN_OFFSET)
+    return sorted(found, key=lambda path: (first.index(path.name) if path.name in first else len(first), path.name))
