@@ -72,7 +72,17 @@ def night() -> list[tuple[float, object]]:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    folder = tmp_path / "night-1"
+    return recorded(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report that is only looked at."""
+    return write(recorded(tmp_path_factory.mktemp("report")))
+
+
+def recorded(into: Path) -> Path:
+    folder = into / "night-1"
     folder.mkdir()
     facts = {"name": "night", "clock": {"origin_s": 0.0, "start_s": START / S, "speed": 60.0}, "ended": "all is done"}
     (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
@@ -117,8 +127,8 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_needs_nothing_else_and_is_whole(run: Path) -> None:
-    text = write(run).read_text(encoding="utf-8")
+def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
+    text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
     assert page.pictures == 3  # the scans
@@ -141,19 +151,18 @@ def test_the_page_needs_nothing_else_and_is_whole(run: Path) -> None:
         "series &lt;b&gt;",
     ],
 )
-def test_the_page_says(run: Path, said: str) -> None:
-    assert said in write(run).read_text(encoding="utf-8")
+def test_the_page_says(report: Path, said: str) -> None:
+    assert said in report.read_text(encoding="utf-8")
 
 
-def test_nothing_of_others_becomes_markup(run: Path) -> None:
-    text = write(run).read_text(encoding="utf-8")
+def test_nothing_of_others_becomes_markup(report: Path) -> None:
+    text = report.read_text(encoding="utf-8")
     assert "series <b>" not in text
     assert "<10>" not in text
 
 
-def test_the_night_is_drawn_beside_it(run: Path) -> None:
-    write(run)
-    assert (run / pictures.OWN_NIGHT).read_bytes().startswith(b"\x89PNG")
+def test_the_night_is_drawn_beside_it(report: Path) -> None:
+    assert (report.parent / pictures.OWN_NIGHT).read_bytes().startswith(b"\x89PNG")
 
 
 def test_what_a_component_has_drawn_is_shown_instead(run: Path) -> None:
