@@ -170,6 +170,7 @@ class Microscope(ABC):
         self.poll_period_s = poll_period_s
         self.result_timeout_s = result_timeout_s
         self.live_lines_s = live_lines_s
+        self._told: dict[str, Value] = {}
 
     def patience_s(self, of_s: float) -> float:
         """How long to wait, in experiment seconds, for what takes the controller `of_s` at most on its own computer:
@@ -229,7 +230,7 @@ class Microscope(ABC):
         return None
 
     def read(self, wanted: Collection[str]) -> dict[str, Value]:
-        """The values of parameters by their generic names, in SI.
+        """The values of parameters by their generic names, in SI; others may be among them.
 
         To be written only where a table can't say how the controller has it (a frame given by its centre …).
         """
@@ -238,6 +239,29 @@ class Microscope(ABC):
     def write(self, values: Mapping[str, Value]) -> None:
         """Set parameters by their generic names, in SI; the counterpart of `read`."""
         self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in values.items()})
+
+    def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
+        """Whether two values of a parameter are one to the controller's precision.
+
+        To be written only where a `resolution` in the table can't say it.
+
+        Args:
+            among: the values that `a` was read with.
+        """
+        return self.table[name].same(a, b)
+
+    def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
+        """What `read` gives; what was set is told as it was set, as long as the controller has the same."""
+        found, told = self.read(wanted), self._told
+        return {
+            name: told[name] if name in told and self.same(name, found[name], told[name], found) else found[name]
+            for name in wanted
+        }
+
+    def put_in_force(self, values: Mapping[str, Value]) -> None:
+        """`write` these, and remember them."""
+        self.write(values)
+        self._told.update(values)
 
     def own_actions(self) -> dict[str, Action]:
         """The methods marked with `@action`, by name."""

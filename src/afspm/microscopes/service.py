@@ -100,7 +100,7 @@ class Service:
     def _told(self, request: Request) -> Response:
         asked: Parameter = request.subject
         spec = self._table.find(asked.name)
-        text, unit = spec.told(self._microscope.read([spec.name])[spec.name], asked.unit)
+        text, unit = spec.told(self._microscope.in_force([spec.name])[spec.name], asked.unit)
         payload = encode(Parameter(spec.name, text, unit or None))[1]
         return Response(ControlResponse.SUCCESS, payload, id=request.id)
 
@@ -121,23 +121,23 @@ class Service:
             Refused: PARAM_ERROR: they do not fit together, or the controller made something else of them.
         """
         framed = FRAME if not values.keys().isdisjoint(FRAME) else ()
-        before = self._microscope.read({*values, *(name for name in framed if name in self._table)})
+        before = self._microscope.in_force({*values, *(name for name in framed if name in self._table)})
         check_together({**before, **values}, self._table, self._microscope.max_pixels)
         former = {name: before[name] for name in values}
         about_to_act()
         try:
-            self._microscope.write(values)
-            after = self._microscope.read(values)
+            self._microscope.put_in_force(values)
+            after = self._microscope.in_force(values)
         except LOST:
             raise
         except Exception:
             with contextlib.suppress(Exception):  # the first error is the one to tell
-                self._microscope.write(former)
+                self._microscope.put_in_force(former)
             raise
         for name, value in values.items():
             spec = self._table[name]
             if not spec.same(after[name], value):
-                self._microscope.write(former)
+                self._microscope.put_in_force(former)
                 made, asked = spec.quantity(after[name]), spec.quantity(value)
                 raise refuse_value(name, f"the controller made {made} of {asked}; nothing was changed")
 

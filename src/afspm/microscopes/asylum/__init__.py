@@ -77,7 +77,6 @@ class Asylum(Microscope):
         self._move_s = move_s
         self._reply_timeout_s = reply_timeout_s
         self._session: Session | None = None
-        self._told: dict[str, Value] = {}
         self._own: dict[str, Callable[[Session], Value]] = {
             FEEDBACK_ON: Session.feedback_on,
             ENGAGED: lambda session: session.doing().engaged,
@@ -127,19 +126,14 @@ class Asylum(Microscope):
     # --- parameters ---
 
     def read(self, wanted: Collection[str]) -> dict[str, Value]:
-        """What is in force: as it was set, where that is the same to Asylum's precision."""
+        """What Asylum has."""
         found: dict[str, Value] = {name: self._kept[name] for name in wanted if name in self._kept}
         found |= {name: self._own[name](self._igor) for name in wanted if name in self._own}
         if not NAMES.isdisjoint(wanted):
             found |= generic(self._igor.values(GLOBALS))
         if not set(POSITION).isdisjoint(wanted):
             found |= zip(POSITION, self._probe_m(), strict=True)
-        found |= self._read_table([name for name in wanted if name not in found])
-        told = self._told
-        return {
-            name: told[name] if name in told and self.table[name].same(found[name], told[name]) else found[name]
-            for name in wanted
-        }
+        return found | self._read_table([name for name in wanted if name not in found])
 
     def write(self, values: Mapping[str, Value]) -> None:
         """What belongs together at once, the rest one by one."""
@@ -154,7 +148,6 @@ class Asylum(Microscope):
         if FEEDBACK_ON in left and not self._igor.do("AfspmFeedback", int(bool(left.pop(FEEDBACK_ON)))):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum could not switch the feedback")
         super().write(left)
-        self._told.update(values)
 
     def get(self, vendor: str) -> Value:
         """A number or a text of Asylum's, by its name."""
@@ -174,10 +167,10 @@ class Asylum(Microscope):
         return found | super().read([name for name in wanted if name not in found])
 
     def _frame_in_force(self) -> Region:
-        return frame(self.read(FRAME))[0]
+        return frame(self.in_force(FRAME))[0]
 
     def _write_frame(self, framed: Mapping[str, Value]) -> None:
-        wanted = asylums(framed, self.read(NAMES))
+        wanted = asylums(framed, self.in_force(NAMES))
         there = self._igor.values(list(wanted))
         for name, value in wanted.items():
             if there[name] != value:

@@ -77,7 +77,6 @@ class Gxsm(Microscope):
         self._reply_timeout_s = reply_timeout_s
         self._whole_table = self.table
         self._refs: dict[str, str] = {}
-        self._set: dict[str, Value] = {}
         self._asking: Asking | None = None
 
     def connect(self) -> None:
@@ -110,7 +109,7 @@ class Gxsm(Microscope):
             self._harvest,
             self.clock,
             self.log,
-            set_frame=lambda: frame(self.read(FRAME)),
+            set_frame=lambda: frame(self.in_force(FRAME)),
             shows_s=self.patience_s(SHOWS_S),
             saves=self._saves,
             scan_dir=self._scan_dir,
@@ -160,7 +159,7 @@ class Gxsm(Microscope):
     # --- parameters ---
 
     def read(self, wanted: Collection[str]) -> dict[str, Value]:
-        """What is in force: as it was set, where GXSM has the same to its precision."""
+        """What GXSM has, and what is kept for it."""
         found: dict[str, Value] = {}
         if not set(Frame.names).isdisjoint(wanted):
             found.update(self._frame.read())
@@ -170,12 +169,7 @@ class Gxsm(Microscope):
             found[FEEDBACK_ON] = self._activity.doing().feedback_on
         found[names.SPEC_KIND] = str(self._kept[names.SPEC_KIND])
         found[names.CONTROLLER] = f"GXSM ({self._hardware.value})"
-        found.update(super().read([name for name in wanted if name not in found]))
-        return {name: self._as_set(name, found[name]) for name in wanted}
-
-    def _as_set(self, name: str, value: Value) -> Value:
-        known = self._set.get(name, value)
-        return known if self.table[name].same(value, known) else value
+        return found | super().read([name for name in wanted if name not in found])
 
     def write(self, values: Mapping[str, Value]) -> None:
         """The frame first, which the tip's place depends on."""
@@ -190,7 +184,6 @@ class Gxsm(Microscope):
             self._kept[names.SPEC_KIND] = values[names.SPEC_KIND]
         own = {*framed, *position, names.SPEC_KIND}
         super().write({name: value for name, value in values.items() if name not in own})
-        self._set.update(values)
 
     def get(self, vendor: str) -> Value:
         """By GXSM's name."""

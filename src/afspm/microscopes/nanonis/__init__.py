@@ -13,9 +13,9 @@ from afspm.microscopes.in_force import FRAME, frame
 from afspm.microscopes.microscope import ControllerLost, Microscope, action
 from afspm.microscopes.nanonis import fetched, groups, protocol
 from afspm.microscopes.nanonis.activity import Activity
+from afspm.microscopes.nanonis.float32 import same_float32
 from afspm.microscopes.nanonis.harvest import SCAN, Harvest
 from afspm.microscopes.nanonis.session import MODULES, Session
-from afspm.microscopes.nanonis.told import Told
 from afspm.microscopes.parameters import Value
 from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
@@ -81,7 +81,6 @@ class Nanonis(Microscope):
         self._autosave = autosave
         self._grabbing = fetched.Grabbing(grabbed_rows, grabbed_backward)
         self._session: Session | None = None
-        self._told = Told()
         self._probe = groups.Probe()
         self._groups: list[groups.Group] = []
 
@@ -131,14 +130,16 @@ class Nanonis(Microscope):
     # --- parameters ---
 
     def read(self, wanted: Collection[str]) -> dict[str, Value]:
-        """What is in force: as it was set, where Nanonis has it to a float32."""
+        """What Nanonis has, by groups, and what is kept for it."""
         found: dict[str, Value] = {}
         for group in self._groups:
             if not set(group.names).isdisjoint(wanted):
                 found.update(group.read(self._ask))
-        found.update(super().read([name for name in wanted if name not in found]))
-        exact = self._told.exactly(found)
-        return {name: exact[name] for name in wanted}
+        return found | super().read([name for name in wanted if name not in found])
+
+    def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
+        """Nanonis has most as float32."""
+        return same_float32(name, a, b, among)
 
     def write(self, values: Mapping[str, Value]) -> None:
         """Each group by one command, those of a single value last."""
@@ -150,7 +151,6 @@ class Nanonis(Microscope):
             elif asked:
                 group.write(self._ask, asked)
         super().write(left)
-        self._told.keep(values)
 
     def get(self, vendor: str) -> Value:
         """By the name of a pair of functions: "Bias." is Bias.Get."""
@@ -195,7 +195,7 @@ class Nanonis(Microscope):
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """From Nanonis' memory, where lines that were not scanned yet are NaN."""
-        region, _ = frame(self.read(FRAME))
+        region, _ = frame(self.in_force(FRAME))
         return fetched.new_lines(fetched.images(self._ask, self._grabbing), region, start)
 
     # --- actions ---
@@ -205,7 +205,7 @@ class Nanonis(Microscope):
         """Scan the frame once, in the direction of `x-scan-direction`."""
         self._activity.refuse_safe_tip()
         self._prepare_panel()
-        self._activity.begin_scan(frame(self.read(FRAME))[0])
+        self._activity.begin_scan(frame(self.in_force(FRAME))[0])
         start = 0
         try:
             self._ask("Scan.Action", start, int(self._kept[names.SCAN_DIRECTION] == names.UP))
