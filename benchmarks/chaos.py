@@ -53,7 +53,16 @@ MINUTES, PERIOD_MINUTES = 90, 10
 SCANS = MINUTES // PERIOD_MINUTES + 1
 SPEED = 480.0
 DEADLINE_S = 240.0
-ROLES = ("scheduler", "microscope", "series", "tip_classifier", "tip_corrector", "metadata", "night_picture")
+ROLES = (
+    "scheduler",
+    "microscope",
+    "series",
+    "tip_classifier",
+    "tip_corrector",
+    "metadata",
+    "night_picture",
+    "recorder",
+)
 CLOCK = ExperimentClock.real()
 
 MOMENTS = (
@@ -213,7 +222,7 @@ def found_wrong(folder: Path) -> Iterator[str]:
         yield f"not every channel is in the table as often: {dict(channels)}"
     if len(set(Counter(row["time"] for row in rows).values())) != 1:
         yield "a scan has fewer rows than another"
-    saved = Counter(file.name for file in (folder / "scans").iterdir() if not file.name.startswith("."))
+    saved = Counter(file.name for file in (folder / "scans").glob("scan-*.nc"))
     listed = Counter(Path(row["filename"]).name for row in rows if row["channel"] == "Height")
     if saved != listed:
         yield f"saved and not in the table: {dict(saved - listed)}; the other way round: {dict(listed - saved)}"

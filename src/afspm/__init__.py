@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from afspm.files import read
     from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
+    from afspm.record.run import open_run
     from afspm.runtime.component import Component
     from afspm.runtime.connect import connect
     from afspm.runtime.scope import Scope
@@ -26,6 +27,7 @@ __all__ = [
     "ScopeState",
     "Spectrum",
     "connect",
+    "open_run",
     "read",
 ]
 
@@ -33,6 +35,7 @@ _HOMES = {
     "Component": "afspm.runtime.component",
     "Scope": "afspm.runtime.scope",
     "connect": "afspm.runtime.connect",
+    "open_run": "afspm.record.run",
     "read": "afspm.files",
 }
 

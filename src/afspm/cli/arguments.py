@@ -16,6 +16,15 @@ Files = Annotated[
     ),
 ]
 
+FilesUnlessResumed = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="FILE [OVERLAY…]",
+        help="The experiment file; each further file is laid over it and needs to hold only what differs.",
+        show_default=False,
+    ),
+]
+
 
 def names_in(given: list[str] | None) -> tuple[str, ...]:
     """Names given by repeating the option, by commas, or both."""

@@ -25,6 +25,8 @@ from afspm.drift.stack import corrected
 from afspm.drift.trackers import tracker
 from afspm.errors import AfspmError, FileError, InvalidValue
 from afspm.files import FORMATS, FileContent, read
+from afspm.record.journal import JOURNAL_FILE
+from afspm.record.measured import SUFFIX as RECORDED
 from afspm.study.recorded import Series, series
 from afspm.study.workers import on_cores
 
@@ -89,7 +91,10 @@ def _files(paths: Sequence[Path]) -> Iterator[Path]:
             yield path
             continue
         folder = path / _SCANS_OF_A_RUN if (path / _SCANS_OF_A_RUN).is_dir() else path
-        yield from sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in FORMATS)
+        found = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in FORMATS)
+        of_the_controller = [file for file in found if file.suffix != RECORDED]
+        # the record has the same scans once more, where drift was compensated in sample coordinates
+        yield from of_the_controller if (path / JOURNAL_FILE).exists() and of_the_controller else found
 
 
 def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registration:

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import Files, names_in
+from afspm.cli.arguments import FilesUnlessResumed, names_in
 
 if TYPE_CHECKING:
-    from afspm.experiment import Start
+    from afspm.experiment import Experiment, Start
 
 
 def run(
-    files: Files,
+    files: FilesUnlessResumed = None,
     only: Annotated[
         list[str] | None,
         typer.Option(
@@ -34,6 +34,14 @@ def run(
             min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.", show_default=False
         ),
     ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Go on with a run that was killed or stopped, in its folder; the newest, of a folder of runs.",
+            show_default=False,
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check, say what would be started, and start nothing.")
     ] = False,
@@ -48,18 +56,10 @@ def run(
     import logging
     import sys
 
-    from afspm.cli import check
     from afspm.experiment import load
+    from afspm.supervisor import resuming
     from afspm.supervisor import run as running
 
-    experiment = load(*files)
-    findings = experiment.check()
-    if findings:
-        from rich.console import Console
-
-        check.show(findings, Console(stderr=True, highlight=False))
-    if any(finding.is_error for finding in findings):
-        raise typer.Exit(1)
     options = running.Options(
         runs=runs,
         only=names_in(only),
@@ -67,12 +67,35 @@ def run(
         speed=speed,
         log_level=logging.DEBUG if verbose else logging.INFO,
     )
+    if resume is not None:
+        if files or only or without or speed or dry_run:
+            raise typer.BadParameter("a run is resumed as it was begun: give nothing else", param_hint="--resume")
+        found = resuming.find(resume)
+        _check(found.experiment)
+        raise typer.Exit(resuming.resume(found, options, terminal=sys.stdout).outcome.exit_code)
+    if not files:
+        raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
+    experiment = load(*files)
+    _check(experiment)
     if dry_run:
         for start in running.dry_run(experiment, options):
             typer.echo(_told(start))
         return
     ended = running.run(experiment, options, terminal=sys.stdout)
     raise typer.Exit(ended.outcome.exit_code)
+
+
+def _check(experiment: Experiment) -> None:
+    """Show what is wrong or doubtful. Raises typer.Exit if something is wrong."""
+    from afspm.cli import check
+
+    findings = experiment.check()
+    if findings:
+        from rich.console import Console
+
+        check.show(findings, Console(stderr=True, highlight=False))
+    if any(finding.is_error for finding in findings):
+        raise typer.Exit(1)
 
 
 def _told(start: Start) -> str:

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from afspm.components.log_collector import LogCollector
     from afspm.components.metadata import Metadata
     from afspm.components.night_picture import NightPicture
+    from afspm.components.notifier import Notifier
     from afspm.components.planned_scans import RegionGrid, ScanList, ScanSeries
+    from afspm.components.recorder import Recorder
     from afspm.components.rescanner import Rescanner
     from afspm.components.spectroscopy_grid import SpectroscopyGrid
     from afspm.components.tip_classifier import TipClassifier
@@ -27,6 +29,8 @@ _MODULES = {
     "LogCollector": "log_collector",
     "Metadata": "metadata",
     "NightPicture": "night_picture",
+    "Notifier": "notifier",
+    "Recorder": "recorder",
     "RegionGrid": "planned_scans",
     "Rescanner": "rescanner",
     "ScanList": "planned_scans",
@@ -44,6 +48,8 @@ __all__ = [
     "LogCollector",
     "Metadata",
     "NightPicture",
+    "Notifier",
+    "Recorder",
     "RegionGrid",
     "Rescanner",
     "ScanList",

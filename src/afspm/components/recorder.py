@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -42,6 +43,7 @@ class Recorder(Component):
         launch = context.launch
         run_dir = Path(launch.run_dir or ".")
         context.activity.longest_step_s = self.longest_step_s
+        logging.getLogger("h5py").setLevel(logging.WARNING)  # else it tells of every number that it converts
         port = context.open_port()
         source = launch.sockets.subscribe[0] if launch.sockets.subscribe else ""
         writer = Writer(

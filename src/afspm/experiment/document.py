@@ -16,11 +16,17 @@ from afspm.experiment.findings import Findings, Place
 
 @dataclass
 class Document:
-    """The merged tables, and where each key was set last."""
+    """The merged tables, and where each key was set last.
+
+    Attributes:
+        homes: the folders that relative file names are meant from, and where modules are found; empty: those of the
+            files. (An expanded file is in the folder of its run, and speaks of files beside the one it was made of.)
+    """
 
     files: tuple[Path, ...]
     data: dict[str, Any] = field(default_factory=dict)
     places: dict[lines.Path, Place] = field(default_factory=dict)
+    homes: tuple[Path, ...] = ()
 
     def place(self, *path: str | int) -> Place:
         """Where `path` was set: its own line, or that of the nearest thing around it."""
@@ -32,17 +38,17 @@ class Document:
 
     def folder_of(self, *path: str | int) -> Path:
         """The folder of the file that set `path`; relative file names in it are meant from there."""
-        return Path(self.place(*path).file).resolve().parent
+        return self.homes[0] if self.homes else Path(self.place(*path).file).resolve().parent
 
     @property
     def folders(self) -> list[Path]:
         """The folders of the files, the first file's first; modules beside a file are found there."""
-        return list(dict.fromkeys(file.resolve().parent for file in self.files))
+        return list(self.homes or dict.fromkeys(file.resolve().parent for file in self.files))
 
 
-def read(files: Sequence[Path], findings: Findings) -> Document:
+def read(files: Sequence[Path], findings: Findings, homes: Sequence[Path] = ()) -> Document:
     """Read the files and lay each over those before it: tables merge, of anything else the later wins."""
-    document = Document(tuple(files))
+    document = Document(tuple(files), homes=tuple(homes))
     for file in files:
         text = _text(file, findings)
         data = None if text is None else _parse(text, file, findings)

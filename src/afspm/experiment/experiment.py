@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +12,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import document as documents
 from afspm.experiment import parts as sorting
+from afspm.experiment import recording
 from afspm.experiment.findings import Finding, Findings
 from afspm.experiment.parts import Role
 from afspm.runtime.launch import Launch
@@ -65,14 +66,25 @@ class Experiment:
         return self._document.folders[0]
 
     @property
+    def folders(self) -> list[Path]:
+        """Those of all files, absolute; modules in them are found."""
+        return self._document.folders
+
+    @property
     def component_names(self) -> list[str]:
-        """All processes of the experiment: translator and scheduler too, in the order of the file."""
+        """All processes of the experiment: translator, scheduler and recorder too, in the order of the file."""
+        self.resolved  # noqa: B018  (adds what is part of every experiment)
         return [part.name for part in self.parts.components]
 
     @property
     def keys_folder(self) -> Path | None:
         """The folder of [security] keys, absolute; None: no keys are used."""
         return self.resolved.keys_folder
+
+    @property
+    def recorders(self) -> list[str]:
+        """Those who keep the record of a run: by default one."""
+        return [name for name, component in self.resolved.classes.items() if recording.records(component)]
 
     def check(self) -> list[Finding]:
         """Everything that is wrong or doubtful; nothing is started. Errors first, then by line."""
@@ -164,6 +176,16 @@ class Experiment:
         from afspm.experiment.expanded import to_toml
 
         return to_toml(self)
+
+
+def load_expanded(path: Path, homes: Sequence[Path]) -> Experiment:
+    """Read the experiment file of a run, as it was expanded.
+
+    Args:
+        homes: the folders of the files that it was made of (`Experiment.folders`).
+    """
+    found = Findings()
+    return Experiment(documents.read([path], found, homes), found)
 
 
 def load(path: str | Path, *overlays: str | Path) -> Experiment:

@@ -12,7 +12,7 @@ from afspm.experiment.findings import Findings, Place, closest, nearest
 from afspm.experiment.known import COMPONENT_ALIASES, WIRE_CLASSES, WIRE_KEYS, Wire
 from afspm.experiment.references import References
 
-SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart")
+SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart", "record", "notify")
 
 # Keys of a component's table that are for us; everything else is a setting of its class or command.
 OWN_KEYS: Final = frozenset(
@@ -42,6 +42,7 @@ class Part:
         command: program and arguments; empty for a Python class.
         settings: what goes to the constructor, still with units.
         own: the keys of the table that are for us (wiring, envelopes, role …).
+        implied: it is not in the file, but part of every experiment; it runs where the scheduler does.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Part:
     settings: Mapping[str, Any]
     own: Mapping[str, Any]
     place: Place
+    implied: bool = False
 
 
 @dataclass

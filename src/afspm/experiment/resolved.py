@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import AfspmError, InvalidValue
-from afspm.experiment import abilities, caching, classes, limits, planned, sections, settings, wiring
+from afspm.experiment import abilities, caching, classes, limits, notifying, planned, recording, sections, settings, wiring
 from afspm.experiment.abilities import Abilities
 from afspm.experiment.caching import Caching
 from afspm.experiment.classes import Declared
@@ -35,6 +35,7 @@ class Resolved:
     security: sections.Security
     messages: tuple[str, ...]
     restart: sections.Restart
+    notify: sections.Notify
     problems: ProblemNames
     named_problems: dict[str, int]
     refused: set[str] = field(default_factory=set)
@@ -102,6 +103,7 @@ def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:
         security=section(sections.Security, "security"),
         messages=_messages(parts.variables.get("messages", []), document, findings),
         restart=section(sections.Restart, "restart"),
+        notify=section(sections.Notify, "notify"),
         problems=ProblemNames(named),
         named_problems=named,
     )
@@ -110,6 +112,12 @@ def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:
     with classes.importing_from(document.folders):
         for part in parts.components:
             _resolve_part(part, resolved)
+        recorder = recording.implied(resolved, section(sections.Record, "record"))
+        notifier = notifying.implied(resolved, resolved.notify)
+        for added in filter(None, (recorder, notifier)):
+            parts.components.append(added)
+            resolved.wires[added.name] = wiring.read_wires(added, document.place, findings)
+            _resolve_part(added, resolved)
         _resolve_sections(resolved)
     resolved.net = wiring.connect(parts.components, resolved.roles, resolved.declared, resolved.wires, document.place)
     return resolved

@@ -85,6 +85,24 @@ class Restart(Section):
     healthy: PositiveDuration = 30.0
 
 
+class Record(Section):
+    """[record]: what is kept of a run, beside what components write."""
+
+    on: bool = True
+    scans: bool = True
+    """Scans and spectra, too, each as a file."""
+
+
+class Notify(Section):
+    """[notify]: who is told, outside of the experiment, of what."""
+
+    command: tuple[str, ...] = ()
+    webhook: str = ""
+    on: tuple[Literal["end", "unsolved-problem", "given-up"], ...] = ("end", "unsolved-problem", "given-up")
+    unsolved_after: PositiveDuration = 900.0
+    """Experiment time for which a problem may be flagged before it counts as unsolved."""
+
+
 S = TypeVar("S", bound=Section)
 
 

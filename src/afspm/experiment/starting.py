@@ -27,8 +27,11 @@ def starts(
 ) -> list[Start]:
     """The processes chosen, translator and scheduler first; clock and folders are still to be added."""
     resolved = experiment.resolved
-    chosen = _chosen(experiment.component_names, only, without)
+    chosen = _with_implied(_chosen(experiment.component_names, only, without), resolved, set(only), set(without))
     links = {name: _without_gone(resolved.net.links[name], resolved, set(without)) for name in chosen}
+    for part in resolved.parts.components:
+        if part.implied and part.name in chosen:
+            links[part.name] = _reachable(links[part.name], resolved, chosen)
     _require_addresses(resolved, links, chosen, piecemeal=bool(only))
     addresses = resolved.net.addresses(take_address)
     parts = sorted(
@@ -45,6 +48,13 @@ def _chosen(names: list[str], only: Collection[str], without: Collection[str]) -
     return {name for name in names if (not only or name in only) and name not in without}
 
 
+def _with_implied(chosen: set[str], resolved: Resolved, only: set[str], without: set[str]) -> set[str]:
+    """What is not in the file is started where the scheduler is."""
+    here = any(part.name in chosen for part in resolved.with_role(Role.SCHEDULER))
+    implied = {part.name for part in resolved.parts.components if part.implied} - only
+    return chosen | (implied - without) if here else chosen - implied
+
+
 def _without_gone(links: wiring.Links, resolved: Resolved, without: set[str]) -> wiring.Links:
     """A component left out, of no address that anybody could know, is not there: nobody listens to it."""
     gone = {
@@ -53,6 +63,13 @@ def _without_gone(links: wiring.Links, resolved: Resolved, without: set[str]) ->
         if slot.owner in without and slot.address is None and resolved.roles[slot.owner] is Role.COMPONENT
     }
     return replace(links, subscribe=tuple(source for source in links.subscribe if source not in gone))
+
+
+def _reachable(links: wiring.Links, resolved: Resolved, chosen: set[str]) -> wiring.Links:
+    """Nobody has to write down an address for the sake of what is not in the file."""
+    slots = resolved.net.slots
+    unknown = {key for key, slot in slots.items() if slot.address is None and slot.owner not in chosen}
+    return replace(links, subscribe=tuple(source for source in links.subscribe if source not in unknown))
 
 
 def _require_addresses(
@@ -64,7 +81,10 @@ def _require_addresses(
         piecemeal: those that are not chosen run elsewhere; else they may just have been left out.
     """
     missing = set()
+    implied = {part.name for part in resolved.parts.components if part.implied}
     for name, link in resolved.net.links.items() if piecemeal else links.items():
+        if name in implied:
+            continue
         for key in (link.control, *links.get(name, link).subscribe):
             slot = resolved.net.slots.get(key or "")
             if slot is not None and slot.address is None and (slot.owner in chosen) != (name in chosen):

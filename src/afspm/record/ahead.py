@@ -146,6 +146,13 @@ def recorded_until(file: Path) -> int:
         return -1
 
 
+def expect_record(state_dir: Path) -> None:
+    """There will be a record of this run: what is published is to be kept until it is in it. Raises OSError."""
+    file = state_dir / RECORDED_FILE
+    if not file.exists():
+        say_recorded(file, -1)
+
+
 def say_recorded(file: Path, time_ns: int) -> None:
     """Everything up to that time is in the record, and on disk. Raises OSError."""
     aside = file.with_name(f".{file.name}.{os.getpid()}")

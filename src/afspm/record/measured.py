@@ -42,7 +42,6 @@ class MeasuredFiles:
         self._facts = facts
         self._problems = problems
         for kind in (SCANS, SPECTRA):
-            (folder / kind).mkdir(parents=True, exist_ok=True)
             for half in (folder / kind).glob(f"*{SUFFIX}{PART}"):  # of a process that was killed
                 half.unlink(missing_ok=True)
 
@@ -213,6 +212,7 @@ def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
 def write_synced(path: Path, data: bytes) -> None:
     """Write a file so that it is there as a whole or not at all, after a power cut too. Raises OSError."""
     part = path.with_name(path.name + PART)
+    path.parent.mkdir(exist_ok=True)
     try:
         with part.open("wb") as file:
             file.write(data)

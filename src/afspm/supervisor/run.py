@@ -13,6 +13,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
 from afspm.experiment.wiring import connectable
+from afspm.record import ahead
 from afspm.runtime.connect import ENDED, GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor import common_clock, run_folder, summary
@@ -20,6 +21,8 @@ from afspm.supervisor.log import SUPERVISOR, RunLog
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.supervisor import Outcome, Supervisor
 from afspm.supervisor.task import from_start
+
+HOW, HOMES, ONLY, WITHOUT = "how", "homes", "only", "without"
 
 
 @dataclass(frozen=True)
@@ -62,21 +65,47 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     names = [start.launch.name for start in first]
     clock = _common_clock(experiment, first, clock, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, _now())
+    with run_folder.locked(folder):
+        run_folder.write_experiment(folder, experiment.expanded())
+        return go(experiment, options, clock, folder, experiment.name, terminal, names)
+
+
+def go(
+    experiment: Experiment,
+    options: Options,
+    clock: ExperimentClock,
+    folder: Path,
+    name: str,
+    terminal: TextIO | None,
+    names: Sequence[str],
+) -> Run:
+    """Run an experiment in a folder that is there, and locked, until it ends.
+
+    Args:
+        name: of the experiment; names: of its processes.
+    """
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:
         starts = _starts(experiment, options, clock, FreePorts(), folder)
-        run_folder.write_experiment(folder, experiment.expanded())
-        facts = run_facts(experiment.name, starts, clock)
+        facts = {**run_facts(name, starts, clock), **_to_resume(experiment, options)}
         run_folder.write_run(folder, facts)
-        log.write(SUPERVISOR, logging.INFO, f"{experiment.name}: {len(starts)} processes, into {folder}")
+        if {start.launch.name for start in starts} & set(experiment.recorders):
+            ahead.expect_record(folder / run_folder.STATE_DIR)
+        log.write(SUPERVISOR, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
         supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy())
         outcome = supervisor.run()
-        run_folder.write_run(folder, {**facts, ENDED: outcome.text})
+        run_folder.write_run(folder, {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()})
         for line in summary.lines(outcome, folder):
             log.write(SUPERVISOR, logging.INFO, line)
     finally:
         log.close()
     return Run(folder, outcome)
+
+
+def _to_resume(experiment: Experiment, options: Options) -> dict[str, object]:
+    """What else run.json says, so that the run can be resumed with that file alone."""
+    only = [*options.only, *(experiment.recorders if options.only else ())]
+    return {HOMES: list(map(str, experiment.folders)), ONLY: only, WITHOUT: list(options.without)}
 
 
 def dry_run(experiment: Experiment, options: Options = Options()) -> list[Start]:

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import afspm
+
 DEADLINE_S = 60.0
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 Run = Callable[..., "AfspmRun"]
@@ -184,7 +186,7 @@ def require_each_row_once(run: AfspmRun, scans: int) -> None:
 
 def require_each_once(run: AfspmRun, scans: int) -> None:
     """Every scan asked for was measured once, saved once, and seen once by a subscriber."""
-    saved = sorted(file.name for file in (run.folder / "scans").iterdir() if not file.name.startswith("."))
+    saved = sorted(file.name for file in (run.folder / "scans").glob("scan-*.nc"))
     seen = run.witnessed()
     channels = {channel for channel, _, _ in seen}
     assert channels
@@ -192,3 +194,17 @@ def require_each_once(run: AfspmRun, scans: int) -> None:
     for channel in channels:
         assert len([key for key in seen if key[0] == channel]) == scans, f"{channel}: {seen}\n{run.output}"
     assert len(saved) == scans, f"{saved}\n{run.output}"
+    require_recorded_once(run.folder, channels, saved, run.output)
+
+
+def require_recorded_once(folder: Path, channels: set[str], saved: list[str], told: str = "") -> None:
+    """Every scan is in the record once, with all its channels, and its file there is the only one."""
+    with afspm.open_run(folder) as record:
+        rows = record.scans.where(lambda row: not row.interrupted)
+        assert [Path(row.filename).name for row in rows] == saved, told
+        assert {tuple(sorted(channel for channel, _ in row.channels)) for row in rows} == {tuple(sorted(channels))}, (
+            told
+        )
+        files = sorted(file.relative_to(folder).as_posix() for file in (folder / "scans").glob("*.h5*"))
+        assert sorted(row.file for row in record.scans if row.file) == files, told
+        assert all(set(record.scan(row)) == channels for row in rows), told

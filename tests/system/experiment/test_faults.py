@@ -30,7 +30,7 @@ beat_period = 0.25
 missed_beats = 6
 """
 # the series last: what else is still being restarted has caught up when it has taken its last scan
-EACH = ("metadata", "tip_classifier", "tip_corrector", "microscope", "scheduler", "series")
+EACH = ("recorder", "metadata", "tip_classifier", "tip_corrector", "microscope", "scheduler", "series")
 
 
 @pytest.mark.parametrize("when", ["while scanning", "between scans"])

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from experiment_lab import Run, require_each_once
+from experiment_lab import Run, require_each_once, require_recorded_once
 
 from afspm.clock import ExperimentClock
 from afspm.supervisor.ports import FreePorts
@@ -49,14 +49,14 @@ def test_an_unknown_name_is_told_and_nothing_starts(run: Run, tmp_path: Path) ->
 def test_a_dry_run_says_what_it_would_start(run: Run, tmp_path: Path) -> None:
     one = run("--dry-run", "--without", "witness,series")
     assert one.end() == 0
-    assert [line.split(" ")[0] for line in one.lines if "(" in line] == ["microscope", "scheduler"]
+    assert [line.split(" ")[0] for line in one.lines if "(" in line] == ["microscope", "scheduler", "recorder"]
     assert not (tmp_path / "runs").exists()
 
 
 def test_part_of_an_experiment_can_be_left_out(run: Run) -> None:
     one = run("--without", "witness", over="[series]\nend_when_done = true\n")
     assert one.end() == 0
-    one.wait_for("ran: microscope, scheduler, series$")
+    one.wait_for("ran: microscope, scheduler, series, recorder$")
 
 
 def test_an_experiment_can_be_started_in_two_parts(run: Run) -> None:
@@ -72,8 +72,10 @@ def test_an_experiment_can_be_started_in_two_parts(run: Run) -> None:
     assert decides.end() == 0, decides.output + acts.output
     assert acts.end() == 0, acts.output
     decides.wait_for("ran: series, witness$")
-    acts.wait_for("ran: microscope, scheduler$")
-    assert len(list((acts.folder / "scans").iterdir())) == 4
+    acts.wait_for("ran: microscope, scheduler, recorder$")
+    saved = sorted(file.name for file in (acts.folder / "scans").glob("scan-*.nc"))
+    assert len(saved) == 4
+    require_recorded_once(acts.folder, {channel for channel, _, _ in decides.witnessed()}, saved, acts.output)
     assert set(decides.witnessed().values()) == {1}
     assert decides.facts()["clock"] == acts.facts()["clock"], "each part has a time of its own"
 

@@ -26,7 +26,7 @@ def test_check_of_a_good_file_ends_with_0(write: Write, runner: CliRunner) -> No
     write(CORRECTOR)
     result = runner.invoke(app, ["check", "night.toml"])
     assert result.exit_code == 0
-    assert "night: 3 processes, nothing wrong" in result.output
+    assert "night: 4 processes, nothing wrong" in result.output
 
 
 def test_check_tells_every_error_with_file_and_line_and_ends_with_1(write: Write, runner: CliRunner) -> None:
@@ -63,7 +63,7 @@ def test_keys_makes_a_pair_for_each_process_and_person_and_leaves_old_ones(
     write(CORRECTOR)
     assert runner.invoke(app, ["keys", "night.toml", "--also", "ana"]).exit_code == 0
     public = {file.stem for file in (tmp_path / "keys" / "public").iterdir()}
-    assert public == {"repair", "scheduler", "microscope", "ana"}
+    assert public == {"repair", "scheduler", "microscope", "recorder", "ana"}
     before = (tmp_path / "keys" / "public" / "ana.key").read_text()
     result = runner.invoke(app, ["keys", "night.toml", "--also", "ana"])
     assert "there already" in result.output

@@ -12,8 +12,8 @@ from afspm.experiment.known import WIRE_KEYS, WIRE_SETTINGS, Wire
 from afspm.experiment.parts import DECLARED_KEYS, OWN_KEYS, SECTIONS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "experiment-file.md").read_text(encoding="utf-8")
-MODELS = [sections.Clock, sections.Control, sections.Roles, sections.Security, sections.Restart, caching.Cache,
-          caching.Rule, limits.ParameterLimit, limits.ActionLimit, limits.Whole, limits.Box]  # fmt: skip
+MODELS = [sections.Clock, sections.Control, sections.Roles, sections.Security, sections.Restart, sections.Record,
+          caching.Cache, caching.Rule, limits.ParameterLimit, limits.ActionLimit, limits.Whole, limits.Box]  # fmt: skip
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)

@@ -46,7 +46,51 @@ def test_wiring_left_out_connects_everything(write: Write) -> None:
 
 def test_translator_and_scheduler_come_first(write: Write) -> None:
     found = starts(write(CORRECTOR))
-    assert [start.role for start in found.values()] == [Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT]
+    assert [start.role for start in found.values()] == [
+        Role.TRANSLATOR,
+        Role.SCHEDULER,
+        Role.COMPONENT,
+        Role.COMPONENT,
+    ]
+
+
+def test_a_recorder_is_part_of_every_experiment(write: Write) -> None:
+    experiment = write(CORRECTOR)
+    assert experiment.recorders == ["recorder"]
+    launch = starts(experiment)["recorder"].launch
+    assert (launch.class_, launch.settings, launch.envelopes) == ("afspm.components.recorder.Recorder", {}, None)
+
+
+def test_the_file_may_do_without_a_recorder_or_have_its_own(write: Write) -> None:
+    assert set(starts(write(CORRECTOR + "[record]\non = false\n"))) == {"microscope", "scheduler", "repair"}
+    own = '[keeper]\ncomponent = true\nclass = "Recorder"\nscans = false\n'
+    assert set(starts(write(CORRECTOR + own))) == {"microscope", "scheduler", "repair", "keeper"}
+    assert starts(write(CORRECTOR + "[record]\nscans = false\n"))["recorder"].launch.settings == {"scans": False}
+
+
+def test_a_component_called_recorder_keeps_its_name(write: Write) -> None:
+    experiment = write(CORRECTOR.replace("repair", "recorder"))
+    assert set(starts(experiment)) == {"microscope", "scheduler", "recorder", "recorder2"}
+    assert experiment.recorders == ["recorder2"]
+
+
+def test_the_recorder_is_started_where_the_scheduler_is(write: Write) -> None:
+    addresses = '[microscope]\npublisher = "tcp://127.0.0.1:9000"\ncontrol_server = "tcp://127.0.0.1:9001"\n'
+    scheduler = '[scheduler]\npubsubcache = "tcp://127.0.0.1:9002"\nrouter = "tcp://127.0.0.1:9003"\n'
+    experiment = write(PEAKS, addresses + scheduler)
+    assert set(starts(experiment, only=["scheduler"])) == {"scheduler", "recorder"}
+    assert set(starts(experiment, only=["peaks"])) == {"peaks"}
+    assert set(starts(experiment, only=["recorder"])) == {"recorder"}
+    assert set(starts(experiment, without=["recorder"])) == {"microscope", "scheduler", "peaks"}
+    # where peaks publishes is not written down, and need not be for the recorder's sake
+    assert starts(experiment, only=["scheduler"])["recorder"].launch.sockets.subscribe == ("tcp://127.0.0.1:9002",)
+
+
+def test_the_expanded_file_has_the_recorder_and_means_the_same(write: Write, tmp_path: Path) -> None:
+    text = write(CORRECTOR).expanded()
+    (tmp_path / "again.toml").write_text(text, encoding="utf-8")
+    assert load(tmp_path / "again.toml").component_names == write(CORRECTOR).component_names
+    assert load(tmp_path / "again.toml").recorders == ["recorder"]
 
 
 def test_who_listens_to_what_a_component_publishes_is_connected_to_it(write: Write) -> None:
@@ -127,7 +171,7 @@ def test_a_file_with_errors_starts_nothing(write: Write) -> None:
 
 def test_only_and_without_choose(write: Write) -> None:
     experiment = write(CORRECTOR + CLASSIFIER)
-    assert set(starts(experiment, without=["watch"])) == {"microscope", "scheduler", "repair"}
+    assert set(starts(experiment, without=["watch"])) == {"microscope", "scheduler", "repair", "recorder"}
     with pytest.raises(ConfigError, match="no component 'repiar'"):
         starts(experiment, only=["repiar"])
 

@@ -1,0 +1,42 @@
+"""The recorder, which is part of every experiment whose file does not say otherwise."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+from typing import TYPE_CHECKING, Any
+
+from afspm.experiment.parts import Part, Role
+
+if TYPE_CHECKING:
+    from afspm.experiment.resolved import Resolved
+    from afspm.experiment.sections import Record
+
+NAME = "recorder"
+CLASS = "Recorder"
+
+
+def records(component: Any) -> bool:
+    """Whether a class keeps the record of a run, as it says by an attribute."""
+    return getattr(component, "records", False) is True
+
+
+def implied(resolved: Resolved, section: Record) -> Part | None:
+    """The recorder as [record] wants it; None if it wants none, or the file has one, or there is no scheduler."""
+    there_is_one = any(records(component) for component in resolved.classes.values())
+    if not section.on or there_is_one or not resolved.with_role(Role.SCHEDULER):
+        return None
+    place = resolved.document.place("record")
+    scans = section.scans
+    if scans and importlib.util.find_spec("h5py") is None:
+        scans = False
+        resolved.findings.warning(
+            "scans and spectra are not recorded: h5py is not installed",
+            place,
+            'pip install "afspm[record]"; or say [record] scans = false',
+        )
+    taken = {part.name.casefold() for part in resolved.parts.components}
+    taken |= {name.casefold() for name in (*resolved.parts.variables, *resolved.parts.intermediaries)}
+    names = itertools.chain([NAME], (f"{NAME}{number}" for number in itertools.count(2)))
+    name = next(name for name in names if name not in taken)
+    return Part(name, CLASS, (), {} if scans else {"scans": False}, {}, place, implied=True)

@@ -1,0 +1,146 @@
+"""A run that was killed, or stopped, goes on in its folder: `afspm run --resume`."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TextIO
+
+from afspm.clock import NS_PER_S, ExperimentClock
+from afspm.errors import ConfigError, FileError
+from afspm.experiment import Experiment, load_expanded
+from afspm.record import ahead
+from afspm.record.journal import JOURNAL_FILE, open_to_read
+from afspm.runtime.connect import RUN_FILE, find_run
+from afspm.supervisor import run as running
+from afspm.supervisor import run_folder
+from afspm.supervisor.ending import Why
+from afspm.supervisor.run import HOMES, HOW, ONLY, WITHOUT, Options, Run
+
+_OVER = {Why.EXPERIMENT_ENDED.name.lower(), Why.ALL_DONE.name.lower()}
+_LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
+ZMTP = b"\xff"
+"""What a socket of ZeroMQ says first."""
+GONE_WITHIN_S = 10.0
+STEP_NS = 1_000_000
+"""By so much the time goes on between two lives of a run, so that nothing new happens at a time that has been."""
+
+
+@dataclass(frozen=True)
+class Resumable:
+    """A run that can go on."""
+
+    folder: Path
+    name: str
+    experiment: Experiment
+    facts: dict[str, Any]
+
+
+def find(where: Path) -> Resumable:
+    """The run that is meant: by its folder, or that of all runs (the newest is meant), or the experiment file.
+
+    Raises:
+        FileError: there is no run, or what is needed of it can't be read.
+        ConfigError: it has ended.
+    """
+    folder = find_run(where).resolve()
+    facts = _facts(folder)
+    if facts.get(HOW) in _OVER:
+        raise ConfigError("this run has ended as it should", where=str(folder), hint="`afspm run FILE` begins another")
+    file = folder / run_folder.EXPERIMENT_FILE
+    if not file.is_file() or not (folder / run_folder.STATE_DIR).is_dir():
+        raise FileError("this is not the folder of a run", where=str(folder), hint="it lacks its experiment or state")
+    homes = [Path(home) for home in facts.get(HOMES, [])] or [folder]
+    return Resumable(folder, str(facts.get("name", folder.name)), load_expanded(file, homes), facts)
+
+
+def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -> Run:
+    """Go on with a run until it ends, where every process finds what it remembers. Raises as `run.run`, and
+
+    FileError: it is still going on.
+    """
+    experiment, folder, facts = found.experiment, found.folder, found.facts
+    experiment.require_valid()
+    options = replace(options, only=facts.get(ONLY, ()), without=facts.get(WITHOUT, ()))
+    with run_folder.locked(folder):
+        _wait_until_gone(facts, folder)
+        clock = _clock(experiment, facts, folder)
+        names = list(facts.get("processes", ()))
+        return running.go(experiment, options, clock, folder, found.name, terminal, names)
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    try:
+        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileError(f"can't be read: {error}", where=str(folder / RUN_FILE)) from error
+    if not isinstance(facts, dict):
+        raise FileError("is not what a run leaves", where=str(folder / RUN_FILE))
+    return facts
+
+
+def _clock(experiment: Experiment, facts: dict[str, Any], folder: Path) -> ExperimentClock:
+    """Real time, or the simulated time after the last that anybody has seen."""
+    if not experiment.resolved.simulated:
+        return experiment.clock()
+    before = ExperimentClock.from_dict(facts["clock"])
+    seen_ns = max(last_seen_ns(folder), round(before.start_s * NS_PER_S))
+    return ExperimentClock.starting_now((seen_ns + STEP_NS) / NS_PER_S, before.speed)
+
+
+def last_seen_ns(folder: Path) -> int:
+    """The last time in the experiment that anything of the run's folder knows of; 0 if nothing does."""
+    seen = [0]
+    state = folder / run_folder.STATE_DIR
+    for written in ahead.folders(state):
+        seen += [one.packet.time_ns or 0 for one in ahead.written_ahead(written)]
+    for file in state.glob("*.json"):
+        try:
+            kept = json.loads(file.read_bytes())
+        except (OSError, ValueError):
+            continue
+        translator = kept.get("translator", {}) if isinstance(kept, dict) else {}
+        for values in (kept, translator):
+            if isinstance(values, dict):
+                seen += [values[name] for name in ("last_ns", "seen_ns") if isinstance(values.get(name), int)]
+    if (folder / JOURNAL_FILE).is_file():
+        journal = open_to_read(folder)
+        seen.append(journal.execute("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ''").fetchone()[0])
+        journal.close()
+    return max(seen)
+
+
+def _wait_until_gone(facts: dict[str, Any], folder: Path) -> None:
+    """Whoever lost his parent ends within a moment; two of one name must not be at work in one folder.
+
+    Raises:
+        FileError: somebody stays.
+    """
+    until_s = ExperimentClock.real().monotonic_s() + GONE_WITHIN_S
+    for name, process in facts.get("processes", {}).items():
+        for use in ("publish", "serve"):
+            match = _LOOPBACK.fullmatch(str(process.get(use)))
+            if match is not None and not _is_gone(int(match[2]), until_s):
+                raise FileError(
+                    f"{name} of this run is still running", where=str(folder), hint="end it, then resume the run"
+                )
+
+
+def _is_gone(port: int, until_s: float) -> bool:
+    """Whether nobody listens on a port any more; a connection that is closed says that it is so, or soon will be."""
+    clock = ExperimentClock.real()
+    while (left_s := until_s - clock.monotonic_s()) > 0.0:
+        try:
+            with socket.create_connection(("127.0.0.1", port), timeout=left_s) as peer:
+                if peer.recv(1) not in (b"", ZMTP):
+                    return True  # somebody else has the port by now
+                while peer.recv(1024):
+                    peer.settimeout(max(0.001, until_s - clock.monotonic_s()))
+        except TimeoutError:
+            return False
+        except OSError:
+            return True
+    return False
