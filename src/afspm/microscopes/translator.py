@@ -85,7 +85,7 @@ class Translator:
         self._paced = ScopeState.UNDEFINED
         self._retry_at_s = self._all_at_s = 0.0
         self._began_s = self._clock.monotonic_s()
-        self._complaint = ""
+        self._why_lost = self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
         self._ended = False
@@ -185,10 +185,10 @@ class Translator:
         starts = isinstance(error, LOST) and not self._started and now_s - self._began_s < _STARTS_S
         self._retry_at_s = now_s + (_SOON_S if starts else _RECONNECT_S)
         was_connected, self._connected = self._connected, False
-        complaint = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
-        if not starts and (was_connected or complaint != self._complaint):
-            self._complaint = complaint
-            self._log.error("the controller can't be reached or trusted, it is tried again: %s", complaint)
+        self._why_lost = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
+        if not starts and (was_connected or self._why_lost != self._complaint):
+            self._complaint = self._why_lost
+            self._log.error("the controller can't be reached or trusted, it is tried again: %s", self._complaint)
         if was_connected or not self._told_lost:
             # what it was doing is remembered: it may still be at it when it is found again
             self._told_lost = True
@@ -226,7 +226,7 @@ class Translator:
     def _read(self) -> dict[str, Value]:
         """What is in force; differences below the controller's precision are none."""
         table = self.microscope.table
-        values = self.microscope.read(in_force.watched(table))
+        values = self.microscope.in_force(in_force.watched(table))
         old = self._values
         return {
             name: old[name] if name in old and table[name].same(old[name], value) else value
@@ -266,7 +266,7 @@ class Translator:
         what = tuple(self._values.get(name, 0.0) for name in in_force.EXTENT)
         with contextlib.suppress(*LOST, AfspmError, ArithmeticError):
             if all(what) and names.SCAN_SPEED in self.microscope.table:
-                speed_m_s = float(self.microscope.read([names.SCAN_SPEED])[names.SCAN_SPEED])
+                speed_m_s = float(self.microscope.in_force([names.SCAN_SPEED])[names.SCAN_SPEED])
                 width_m, rows = float(what[0]), float(what[1])
                 return self._clock.real_s(2.0 * width_m * rows / speed_m_s), (*what, speed_m_s)
         return None, what
@@ -313,10 +313,10 @@ class Translator:
 
     def _answer(self, request: Request) -> None:
         if not self._connected:
-            raise ControllerLost("it is being looked for")
+            raise ControllerLost(f"it is being looked for: {self._why_lost}")
         # whether it is free is decided by what it does now, not at the last look
         if not _only_asks(request) and not self._trusting(partial(self._observe, values=False)):
-            raise ControllerLost(self._complaint)
+            raise ControllerLost(self._why_lost)
         answer = self._service.answer(request)
         self._finish(request, answer.response)
         self._play(answer.steps)
