@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from afspm.errors import InvalidValue
-from afspm.experiment import wiring
+from afspm.experiment import notifying, wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
 from afspm.experiment.known import WIRE_SETTINGS
@@ -346,4 +346,5 @@ CHECKS: Final[tuple[Callable[[Resolved], None], ...]] = (
     check_likely_typos,
     check_needs,
     check_handlers,
+    notifying.check,
 )

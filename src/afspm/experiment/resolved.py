@@ -8,7 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import AfspmError, InvalidValue
-from afspm.experiment import abilities, caching, classes, limits, notifying, planned, recording, sections, settings, wiring
+from afspm.experiment import (
+    abilities,
+    caching,
+    classes,
+    limits,
+    notifying,
+    planned,
+    recording,
+    sections,
+    settings,
+    wiring,
+)
 from afspm.experiment.abilities import Abilities
 from afspm.experiment.caching import Caching
 from afspm.experiment.classes import Declared

@@ -1,0 +1,79 @@
+"""[notify]: who is told of what."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from afspm.experiment import Experiment
+
+from .conftest import Write, errors, only_error
+
+HOOK = '[notify]\nwebhook = "https://chat.example.org/hooks/1"\n'
+
+
+def notifier(experiment: Experiment) -> dict[str, object]:
+    assert experiment.check() == []
+    addresses = (f"tcp://127.0.0.1:{port}" for port in range(21_000, 22_000))
+    starts = experiment.launches(take_address=addresses.__next__)
+    (start,) = [start for start in starts if start.launch.class_.endswith(".Notifier")]
+    return dict(start.launch.settings)
+
+
+def test_a_notifier_is_part_of_an_experiment_that_wants_to_tell(write: Write) -> None:
+    experiment = write(HOOK + 'unsolved_after = "10 min"\n')
+    assert notifier(experiment)["unsolved_after"] == 600.0
+    assert "notifier" in experiment.component_names
+
+
+def test_without_it_nobody_is_told(write: Write) -> None:
+    assert "notifier" not in write("").component_names
+
+
+def test_the_end_alone_needs_no_component(write: Write) -> None:
+    experiment = write(HOOK + 'on = ["end"]\n')
+    assert experiment.check() == []
+    assert "notifier" not in experiment.component_names
+
+
+def test_python_is_the_one_that_runs_us(write: Write) -> None:
+    settings = notifier(write('[notify]\ncommand = ["python", "call.py"]\n'))
+    assert settings["command"] == [sys.executable, "call.py"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("[notify]\n", "nobody is told of anything"),
+        ('[notify]\ncommand = ["no-such-program"]\n', "there is no program 'no-such-program'"),
+        ('[notify]\nwebhook = "chat.example.org"\n', "it is not an address"),
+        (HOOK + 'on = ["dawn"]\n', "'dawn'"),
+        (HOOK + "unsolved_after = 0\n", "greater than 0"),
+        (HOOK + 'weebhook = "x"\n', "weebhook is not a setting"),
+    ],
+)
+def test_what_can_not_work_is_an_error(write: Write, wrong: str, said: str) -> None:
+    assert any(said in finding.what for finding in errors(write(wrong)))
+
+
+def test_an_environment_that_lacks_the_address_is_a_warning(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NIGHT_HOOK", raising=False)
+    (finding,) = write('[notify]\nwebhook = "$NIGHT_HOOK"\n').check()
+    assert not finding.is_error
+    assert "NIGHT_HOOK" in finding.what
+    monkeypatch.setenv("NIGHT_HOOK", "https://chat.example.org/hooks/1")
+    assert notifier(write('[notify]\nwebhook = "$NIGHT_HOOK"\n'))["webhook"] == "$NIGHT_HOOK"
+
+
+def test_an_error_does_not_repeat_an_address_that_may_be_a_secret(write: Write) -> None:
+    finding = only_error(write('[notify]\nwebhook = "htps://chat.example.org/T0PSECRET"\n'))
+    assert "T0PSECRET" not in str(finding)
+
+
+def test_what_it_expands_to_reads_back_as_the_same(write: Write) -> None:
+    experiment = write(HOOK)
+    settings = notifier(experiment)
+    again = write(experiment.expanded(), frame="")
+    assert notifier(again) == settings
+    assert [name for name in again.component_names if name.startswith("notifier")] == ["notifier"]
