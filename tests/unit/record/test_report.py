@@ -180,6 +180,13 @@ def test_writing_again_is_the_same(run: Path) -> None:
     assert [file.name for file in run.iterdir() if file.name.startswith(".report")] == []
 
 
+def test_a_run_that_was_resumed_is_told_from_its_first_part_on(run: Path) -> None:
+    facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    facts["clock"]["start_s"] += 1000.0
+    (run / "run.json").write_text(json.dumps(facts), encoding="utf-8")
+    assert told(run).start_ns == START + S
+
+
 def test_without_a_record_there_is_no_report(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no record"):
         write(tmp_path)

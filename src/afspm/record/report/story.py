@@ -96,7 +96,9 @@ def read(run: Run) -> Story:
     """The story of a run. Raises FileError: the record is damaged."""
     overview, scans = run.overview(), run.scans
     clock = run.facts.get("clock") or {}
-    start_ns = round(float(clock["start_s"]) * 1e9) if "start_s" in clock else _first_ns(overview, scans)
+    # the clock of a run that was resumed is that of its last part
+    starts_ns = [*_first_ns(overview, scans), *([round(float(clock["start_s"]) * 1e9)] if clock else [])]
+    start_ns = min(starts_ns, default=0)
     return Story(
         name=run.name,
         folder=run.folder.name,
@@ -144,11 +146,10 @@ def _times(count: int) -> str:
     return {1: "once", 2: "twice"}.get(count, f"{count} times")
 
 
-def _first_ns(overview: Overview, scans: Sequence[ScanRow]) -> int:
+def _first_ns(overview: Overview, scans: Sequence[ScanRow]) -> list[int]:
     lanes = (overview.controls, overview.modes, overview.states)
     times = [lane.spans[0].start_ns for lane in lanes if lane.spans]
-    times += [scan.began_ns or scan.time_ns for scan in scans[:1]]
-    return min(times, default=overview.newest_ns)
+    return times + [scan.began_ns or scan.time_ns for scan in scans[:1]]
 
 
 def states_in_words(label: str) -> str:
