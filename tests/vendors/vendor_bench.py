@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Event, Thread
-from typing import Any, ClassVar, Generic, TypeVar
+from threading import Condition, Event, Thread
+from typing import IO, Any, ClassVar, Generic, TypeVar
 
 import zmq
 
@@ -104,11 +104,39 @@ class Peer:
         self._context.destroy(linger=0)
 
 
+class Said:
+    """What a translator says on its standard error, over all its lives."""
+
+    def __init__(self) -> None:
+        self.text = ""
+        self._more = Condition()
+
+    def listen(self, pipe: IO[bytes]) -> None:
+        """Until there is nobody any more to say anything."""
+        with pipe:
+            for line in pipe:
+                with self._more:
+                    self.text += line.decode()
+                    self._more.notify_all()
+
+    def until(self, *wanted: str) -> None:
+        """Wait until it has said one of these."""
+        with self._more:
+            said = self._more.wait_for(lambda: any(words in self.text for words in wanted), DEADLINE_S)
+            assert said, f"it never said {wanted}:\n{self.text}"
+
+
 class TranslatorProcess:
     """A translator as a process of its own, and the peer that it has; both end with the stack."""
 
     def __init__(
-        self, class_: str, settings: dict[str, Any], folder: Path, stack: ExitStack, clock: ExperimentClock
+        self,
+        class_: str,
+        settings: dict[str, Any],
+        folder: Path,
+        stack: ExitStack,
+        clock: ExperimentClock,
+        said: Said | None = None,
     ) -> None:
         ports = FreePorts()
         serve, publish = f"tcp://127.0.0.1:{ports.take()}", f"tcp://127.0.0.1:{ports.take()}"
@@ -122,9 +150,10 @@ class TranslatorProcess:
             state_dir=str(folder / "state"),
             simulated=clock.real_s(1.0) != 1.0,
         )
-        with (folder / "log.txt").open("ab") as log:
-            command = [sys.executable, "-m", "afspm.runtime.host"]
-            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log)
+        command = [sys.executable, "-m", "afspm.runtime.host"]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+        self._listening = Thread(target=(said or Said()).listen, args=(self._process.stderr,))
+        self._listening.start()
         stack.callback(self._end)
         assert self._process.stdin is not None
         self._process.stdin.write(launch.to_json().encode() + b"\n")
@@ -135,6 +164,7 @@ class TranslatorProcess:
     def kill(self) -> None:
         self._process.kill()
         self._process.wait(DEADLINE_S)
+        self._listening.join(DEADLINE_S)
 
     def _end(self) -> None:
         self.kill()
@@ -183,7 +213,8 @@ class VendorBench(Generic[Emulated]):
         self.folder, self._stack = folder, stack
         self.clock = ExperimentClock.starting_now(speed=speed)
         self.data = folder / self.data_name
-        self._emulator_settings: dict[str, Any] = {"port": 0, "surface": "steps", **emulator}
+        self._said = Said()
+        self._emulator_settings: dict[str, Any] = {"port": FreePorts().take(), "surface": "steps", **emulator}
         self._start_controller()
 
     def _start_controller(self) -> None:
@@ -192,7 +223,6 @@ class VendorBench(Generic[Emulated]):
 
     def start_controller_again(self) -> None:
         """Another one where the last was, which knows nothing of it."""
-        self._emulator_settings["port"] = int(self.address.rpartition(":")[2])
         self._start_controller()
 
     def at_panel(self, do: Callable[[Emulated], object]) -> None:
@@ -215,7 +245,7 @@ class VendorBench(Generic[Emulated]):
     def start(self, **settings: Any) -> Peer:
         """The translator, as a process of its own."""
         given = {"address": self.address, **self.settings, **settings}
-        self._process = TranslatorProcess(self.translator, given, self.folder, self._stack, self.clock)
+        self._process = TranslatorProcess(self.translator, given, self.folder, self._stack, self.clock, self._said)
         return self._process.peer
 
     def kill(self) -> None:
@@ -223,8 +253,12 @@ class VendorBench(Generic[Emulated]):
         self._process.kill()
 
     def said(self) -> str:
-        """The translator's log."""
-        return (self.folder / "log.txt").read_text()
+        """The translator's log: all of it once it is killed, before that as far as it has come."""
+        return self._said.text
+
+    def until_said(self, *wanted: str) -> None:
+        """Wait until the translator's log has one of these in it."""
+        self._said.until(*wanted)
 
 
 OneBench = TypeVar("OneBench", bound=VendorBench[Any])

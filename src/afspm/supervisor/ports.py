@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import random
 import socket
+import sys
+from collections import deque
 
 # Below the range from which systems take the ports of outgoing connections (Linux from 32768, Windows and macOS from
 # 49152). From within it a port would be no choice: while its process is being restarted, a peer that tries again and
 # again may be given that very port by its own system, connect to itself, and keep the process from ever binding it.
 LOWEST, HIGHEST = 20_000, 32_000
 TRIES = 200
+CAN_HOLD = sys.platform == "linux"
+"""Elsewhere a port that one process has bound, without listening, can't be bound by another."""
+_MOST_HELD = 256
+
+_held: deque[int] = deque()  # files of sockets, for as long as this process lasts
 
 
 class FreePorts:
     """Hands out ports of this computer that nobody listens on, each once.
 
-    The port is chosen here and bound by the child, so that a restarted child is found where it was. Between the two
-    another program may take it: the child then fails to bind and says so.
+    The port is chosen here and bound by the child, so that a restarted child is found where it was. On Linux it is held
+    meanwhile: whoever else chooses ports, experiments beside this one for instance, does not find it free, neither
+    before the child has bound it nor while the child is being restarted. On other systems another program may take it:
+    the child then fails to bind and says so.
     """
 
     def __init__(self, host: str = "127.0.0.1") -> None:
@@ -43,9 +53,20 @@ class FreePorts:
 
 
 def _is_free(host: str, port: int) -> bool:
+    """Whether nobody has bound it; if so it is held from now on, where that can be."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         try:
             probe.bind((host, port))
         except OSError:
             return False
+        if CAN_HOLD:
+            _hold(probe)
     return True
+
+
+def _hold(bound: socket.socket) -> None:
+    # bound as the only one, and shared only then, with whoever asks for a shared one and listens: our children do
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    _held.append(bound.detach())
+    if len(_held) > _MOST_HELD:
+        os.close(_held.popleft())

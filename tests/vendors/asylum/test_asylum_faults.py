@@ -49,7 +49,7 @@ def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, 
     made.strike(kind, count=6 if kind == "nan" else 1, duration_s=60.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    assert told in made.said()
+    made.until_said(told)
     scans_again(peer)
 
 
@@ -71,7 +71,7 @@ def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str,
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    assert told in made.said()
+    made.until_said(told)
 
 
 def test_igor_that_vanishes_is_found_again_when_it_is_back(bench: Make, tmp_path: Path) -> None:
@@ -90,8 +90,8 @@ def test_procedures_that_are_not_included_are_asked_for(bench: Make) -> None:
     made = bench(procedures="none")
     peer = made.start()
     peer.until(UNDEFINED)
-    assert "there is no such function (101" in made.said()
-    assert "is afspm.ipf included in Igor's procedures" in made.said()
+    made.until_said("there is no such function (101")
+    made.until_said("is afspm.ipf included in Igor's procedures")
 
 
 def test_the_procedures_of_an_older_afspm_are_enough_to_scan(bench: Make) -> None:
@@ -150,7 +150,7 @@ def test_saving_is_switched_on_where_it_is_off(bench: Make) -> None:
     peer = small(made)
     made.at_panel(lambda emulator: emulator.controller.values.put("SaveImage", 0))
     scans_again(peer)
-    assert "Asylum was not to save (SaveImage)" in made.said()
+    made.until_said("Asylum was not to save (SaveImage)")
 
 
 @pytest.mark.parametrize("kind", ["late-file", "half-file"])
@@ -172,7 +172,7 @@ def test_a_scan_without_a_whole_file_is_told_and_the_next_is_not_taken_for_it(
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
     assert not scans(heard)
-    assert "ended without a result" in made.said()
+    made.until_said("ended without a result")
     assert scans_again(peer)[0].values.shape == (8, 16)
 
 

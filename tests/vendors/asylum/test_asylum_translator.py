@@ -181,7 +181,7 @@ def test_a_frame_that_asylum_makes_of_it_is_told(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.controller.values.put("FastRatio", 1.0))
     scan = scanned(peer)["HeightTrace"]
     assert scan.region.size_m[1] > 2 * TURNED.size_m[1]
-    assert "it is delivered as the file says" in made.said()
+    made.until_said("it is delivered as the file says")
 
 
 # --- parameters ---

@@ -66,7 +66,7 @@ def test_a_bad_answer_has_a_name_and_gxsm_is_found_again(
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    assert told in made.said()
+    made.until_said(told)
     assert scanned(peer)
     assert not Path("evil").exists()
 
@@ -81,7 +81,7 @@ def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, An
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    assert "no answer to" in made.said()
+    made.until_said("no answer to")
     assert peer.get(names.SCAN_RESOLUTION_X) == "16"
 
 
@@ -109,7 +109,7 @@ def test_the_memory_of_a_gxsm_that_has_ended_is_not_believed(bench: Make, left_b
     assert left_behind.exists()
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
-    assert "no process is called" in made.said() or "has ended" in made.said()
+    made.until_said("no process is called", "has ended")
 
 
 @pytest.fixture
@@ -125,7 +125,7 @@ def test_a_script_that_was_stopped_is_missed_until_it_runs_again(bench: Make) ->
     made.strike("script-stopped")
     peer.until(UNDEFINED)
     assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
-    assert "is bridge.py running in GXSM's console?" in made.said()
+    made.until_said("is bridge.py running in GXSM's console?")
     made.at_panel(lambda emulator: emulator.run_script())
     peer.until(FREE)
     assert scanned(peer)
@@ -136,7 +136,7 @@ def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
     peer = made.start()
     peer.until(UNDEFINED)
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.25).code == ControlResponse.NO_RESPONSE
-    assert "start it with LC_NUMERIC=C" in made.said()
+    made.until_said("start it with LC_NUMERIC=C")
     assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.bias_v == 0.1
 
 
@@ -163,7 +163,7 @@ def test_a_scan_that_did_not_begin_is_told_and_an_old_one_not_taken_for_it(bench
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
     assert not scans(heard)
-    assert "did it begin at all" in made.said()
+    made.until_said("did it begin at all")
 
 
 def test_a_scan_without_channels_is_told(bench: Make) -> None:
@@ -172,7 +172,7 @@ def test_a_scan_without_channels_is_told(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.program.channels.clear())
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
-    assert "is a channel set" in made.said()
+    made.until_said("is a channel set")
 
 
 @pytest.mark.parametrize("saving", ["afspm", "gxsm"])
@@ -189,7 +189,7 @@ def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, saving: 
     heard = peer.until(FREE)
     assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
     assert not scans(heard)
-    assert "lacks lines" in made.said()
+    made.until_said("lacks lines")
 
 
 @pytest.mark.parametrize(
@@ -211,7 +211,7 @@ def test_a_channel_that_does_not_come_is_named_and_the_others_are_published(benc
     made.strike(kind, duration_s=1e6)
     found = scanned(peer)  # the last channel is written first
     assert found == ["scan001-M-Xp-ZSmTopo.nc", "scan001-Xm-ZSmTopo.nc", "scan001-Xp-ImTunnel.nc"]
-    assert "GXSM did not save Xp-dFreq.nc" in made.said()
+    made.until_said("GXSM did not save Xp-dFreq.nc")
     assert len(scanned(peer)) == 4, "it is not given up for ever"
 
 
@@ -222,7 +222,7 @@ def test_a_scan_none_of_whose_files_comes_is_broken_off(bench: Make) -> None:
     assert peer.act(names.START_SCAN).ok
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
-    assert "no new file in" in made.said()
+    made.until_said("no new file in")
     assert scanned(peer)
 
 
@@ -249,7 +249,7 @@ def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path:
     peer = small(made, scan_dir=str(tmp_path / "not there"), result_timeout_s=20.0)
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
-    assert "can't be seen from here" in made.said()
+    made.until_said("can't be seen from here")
 
 
 def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
@@ -272,7 +272,7 @@ def test_a_spectrum_that_is_not_saved_is_told(bench: Make) -> None:
     assert peer.act(names.START_SPEC).ok
     heard = peer.until(FREE)
     assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
-    assert "is probe Auto Save on" in made.said()
+    made.until_said("is probe Auto Save on")
 
 
 @pytest.mark.parametrize("kind", ["file-late", "half-file"])

@@ -240,7 +240,7 @@ def test_what_this_hardware_lacks_is_not_supported(bench: Make) -> None:
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.5).ok
     assert peer.set("x-pixel-rate", 4000).ok
     assert peer.act(names.START_SPEC).code == ControlResponse.ACTION_NOT_SUPPORTED
-    assert "unsupported: move-speed, sample-slope-x" in made.said()
+    made.until_said("unsupported: move-speed, sample-slope-x")
     assert peer.get("x-controller") == "GXSM (simulator)"
 
 

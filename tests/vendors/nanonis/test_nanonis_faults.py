@@ -35,7 +35,7 @@ def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, k
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    assert told in made.said()
+    made.until_said(told)
     assert peer.act(names.START_SCAN).ok
     assert scans(peer.until(FREE))
 
@@ -49,7 +49,7 @@ def test_a_dialog_on_its_screen_silences_it_until_it_is_answered(bench: Make) ->
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    assert "Nanonis is silent while a dialog waits for an answer on its screen" in made.said()
+    made.until_said("Nanonis is silent while a dialog waits for an answer on its screen")
 
 
 def test_a_slow_reply_is_waited_for(bench: Make) -> None:
@@ -57,6 +57,7 @@ def test_a_slow_reply_is_waited_for(bench: Make) -> None:
     peer = small(made)
     made.strike("slow", duration_s=0.5)
     assert peer.get(names.TIP_BIAS_VOLTAGE) is not None
+    made.kill()
     assert "can't be reached" not in made.said()
 
 
@@ -131,7 +132,7 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
     assert peer.act(names.START_SCAN).ok
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith("nanonis-0001.npz")
-    assert "unnamed001.sxm): it was fetched from Nanonis" in made.said()
+    made.until_said("unnamed001.sxm): it was fetched from Nanonis")
 
 
 def test_the_name_of_an_older_file_is_not_believed(bench: Make) -> None:
@@ -193,7 +194,7 @@ def test_after_the_safe_tip_nothing_is_measured_until_the_tip_is_brought_back(be
     peer.until(FREE)
     response = peer.act(names.START_SCAN)
     assert "safe tip" in response.reason
-    assert "Nanonis' safe tip has withdrawn the tip" in made.said()
+    made.until_said("Nanonis' safe tip has withdrawn the tip")
     assert peer.act(names.ENGAGE).ok
     peer.until(FREE)
     assert peer.act(names.START_SCAN).ok
@@ -245,5 +246,5 @@ def test_an_address_without_anybody_is_named(bench: Make) -> None:
     peer = made.start()
     response = peer.get_response(names.TIP_BIAS_VOLTAGE)
     assert response.code == ControlResponse.NO_RESPONSE
-    assert "127.0.0.1:1: no connection" in made.said()
-    assert "is Nanonis running" in made.said()
+    made.until_said("127.0.0.1:1: no connection")
+    made.until_said("is Nanonis running")
