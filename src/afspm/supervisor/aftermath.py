@@ -15,11 +15,15 @@ from afspm.clock import Clock
 from afspm.components import notices
 from afspm.components.notices import END, GIVEN_UP, NotDelivered, Notice, Targets, Way
 from afspm.errors import ConfigError
+from afspm.experiment import Role, notifying
 from afspm.record.journal import JOURNAL_FILE
 from afspm.supervisor.ending import Why
 from afspm.supervisor.log import SUPERVISOR
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from afspm.experiment import Experiment, Start
     from afspm.supervisor.log import RunLog
     from afspm.supervisor.supervisor import Outcome
 
@@ -35,6 +39,20 @@ class Ended:
     folder: Path
     outcome: Outcome
     simulated: bool
+
+
+def follow(
+    experiment: Experiment, ended: Ended, starts: Sequence[Start], clock: Clock, log: RunLog, *, with_report: bool
+) -> None:
+    """Write the report if it is wanted and there is a record, and tell whoever [notify] names.
+
+    Of the end of an experiment on several computers that one tells where its scheduler ran.
+    """
+    if with_report:
+        report(ended.folder, log)
+    notify = experiment.resolved.notify
+    if any(start.role is Role.SCHEDULER for start in starts):
+        tell(ended, notifying.targets(notify, experiment.folder), notify.on, clock, log)
 
 
 def report(folder: Path, log: RunLog) -> None:
@@ -63,6 +81,10 @@ def report(folder: Path, log: RunLog) -> None:
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip().splitlines()
         log.write(SUPERVISOR, logging.WARNING, f"no report: {said[-1] if said else f'exit code {done.returncode}'}")
+    else:
+        from afspm.record.report import REPORT_FILE
+
+        log.write(SUPERVISOR, logging.INFO, f"the report is {folder / REPORT_FILE}")
 
 
 def tell(ended: Ended, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:

@@ -78,7 +78,7 @@ def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
     log = Log()
     aftermath.report(tmp_path, log)  # type: ignore[arg-type]
     assert (tmp_path / REPORT_FILE).is_file()
-    assert log.lines == []
+    assert log.lines == [(logging.INFO, f"the report is {tmp_path / REPORT_FILE}")]
 
 
 def test_without_a_record_there_is_none_and_no_word_of_it(tmp_path: Path) -> None:
