@@ -27,16 +27,17 @@ LAST_TRIES = 2  # the end of the experiment does not wait for more
 class Notifier(Component):
     """Calls a command, a webhook or both when a problem stays unsolved and when a component is given up.
 
-    It only listens, and what it waits for holds up nobody. What can't be delivered is tried again, later and later,
-    for half an hour; killed and started again, it goes on with that, and tells nothing twice that was delivered. Of
-    the end of the experiment the supervisor tells, which sees how it ended.
+    [notify] of the experiment file makes it part of an experiment. It only listens, and holds up nobody. What can't be
+    delivered is tried again, later and later, for half an hour; killed and started again, it goes on with that, and
+    tells nothing twice that was delivered. Of the end of the experiment `afspm run` itself tells, which sees how it
+    ended.
 
     Args:
         command: program and arguments, run where the experiment file is; the notice is JSON on its standard input.
         webhook: where that JSON is posted to; "$NAME" is taken from the environment.
         on: of what to tell: "unsolved-problem", "given-up".
         unsolved_after: how long a problem may be flagged before it counts as unsolved, experiment time.
-        folder: of the experiment file.
+        folder: where the command is run; [notify] fills in that of the experiment file.
     """
 
     listens: ClassVar = ("ControlState", "ProcessStates")
