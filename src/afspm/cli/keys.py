@@ -20,17 +20,18 @@ def keys(
         list[str] | None, typer.Option("--also", metavar="NAME", help="A person who is to have a key. Repeatable.")
     ] = None,
 ) -> None:
-    """Make a key pair for each process of an experiment, and for the people named.
+    """Make a key pair for each process of an experiment, for the supervisors, and for the people named.
 
     Keys that are there already are left as they are. Copy public/ to every computer, and of private/ only the keys of
     what runs there.
     """
     from afspm.experiment import load
+    from afspm.logic.telling import SUPERVISOR
     from afspm.transport.keys import generate
 
     experiment = load(*files)
     target = folder or experiment.keys_folder or experiment.folder / "keys"
-    written = generate(target, [*experiment.component_names, *(also or ())])
+    written = generate(target, [*experiment.component_names, SUPERVISOR, *(also or ())])
     for file in written:
         typer.echo(file)
     if not written:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 from afspm.logic.envelopes import Envelopes
 from afspm.model import Packet, PacketHeader
@@ -15,6 +16,7 @@ TIME_STEP_NS = 1_000
 _OVERHEAD_BYTES = 300  # of a kept packet beside its payload, so that a flood of empty ones is bounded too
 _TIMES_REMEMBERED = 4096
 _RECENT = 64
+_NEWEST = 16
 _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than that is not believed
 
 
@@ -113,6 +115,11 @@ class Cache:
             if source_ns is not None:
                 self._saw(source_ns)
             self._keep(packet, source_ns, (history_of or {}).get(packet.envelope, _TIMES_REMEMBERED))
+
+    def holds(self, envelope: str, payload: bytes) -> bool:
+        """Whether one of the newest packets of an envelope is just this."""
+        newest = islice(reversed(self._times.get(envelope, ())), _NEWEST)
+        return any(self._kept[time_ns].packet.payload == payload for time_ns in newest)
 
     def not_before(self, time_ns: int) -> None:
         """What is published from here on is after this time."""

@@ -352,7 +352,9 @@ class SchedulerCore:
             self._desk.answer(event, ControlResponse.FAILURE, why)
             return
         orders = self._telling.orders_for(event.name)
-        self._announce(envelope, event.request.subject.payload, now_ns)
+        payload = event.request.subject.payload
+        if not self._cache.holds(envelope, payload):  # else we were killed before we could answer
+            self._announce(envelope, payload, now_ns)
         self._desk.answer(event, ControlResponse.SUCCESS, payload=self._codec.encode_orders(orders))
 
     def _on_restart(self, event: RequestIn, now_s: float) -> None:

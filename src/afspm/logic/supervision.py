@@ -99,6 +99,7 @@ class ChildWatch:
         self._liveness: Liveness | None = None
         self._began_s = 0.0
         self._again_s = 0.0
+        self._is_ordered = False  # its end is, and that it is started again at once
         self.phase = Phase.IDLE
 
     @property
@@ -133,7 +134,10 @@ class ChildWatch:
         if phase in (Phase.STOPPING, Phase.DONE):
             self.phase = Phase.DONE
             return []
-        if phase is not Phase.KILLING and code in self._policy.final_codes:
+        ordered, self._is_ordered = self._is_ordered, False
+        if ordered and code not in self._policy.quiet_codes:
+            return self._start(now_s)
+        if (phase is not Phase.KILLING or ordered) and code in self._policy.final_codes:
             self.phase = Phase.DONE
             return [Log("DEBUG" if code in self._policy.quiet_codes else "INFO", how)]
         return self._failed(now_s, how)
@@ -145,6 +149,17 @@ class ChildWatch:
             self.phase = Phase.DONE
             return []
         return self._failed(now_s, f"could not be started: {why}")
+
+    def restart(self, now_s: float) -> list[Effect]:
+        """Somebody wants it to be started anew, whatever it does now. That is no failure: it costs no restart."""
+        if self.phase is Phase.STOPPING:
+            return []
+        said = Log("INFO", "is started anew, as ordered")
+        if self.phase in (Phase.RUNNING, Phase.KILLING):
+            is_new = not self._is_ordered
+            self.phase, self._is_ordered = Phase.KILLING, True
+            return [said, Kill("ordered")] if is_new else []
+        return [said, *self._start(now_s)]
 
     def stop(self, now_s: float) -> list[Effect]:
         """Its end is wanted, and the caller has asked it to. Nothing is restarted any more."""

@@ -70,6 +70,8 @@ class RunLog:
         self._wall = ExperimentClock.real()
         self._level = level
         terminal = terminal or sys.stdout
+        self.listener: Callable[[str, int, str], None] = lambda name, level, text: None
+        """Called with each line, as `write` is."""
         self._show = _coloured(terminal) if terminal.isatty() else _plain(terminal)
         self._widest = max(map(len, (SUPERVISOR, *names)))
 
@@ -80,6 +82,7 @@ class RunLog:
             stamp = f"{wall:%Y-%m-%d %H:%M:%S}.{wall.microsecond // 1000:03d}{self._experiment_time()}"
             self._file.write(f"{stamp} {logging.getLevelName(level):8} {name:{self._widest}} {text}\n")
             self._file.flush()
+        self.listener(name, level, text)
         if level >= self._level:
             with contextlib.suppress(OSError, ValueError):
                 self._show(f"{wall:%H:%M:%S}", f"{name:{self._widest}}", level, text)

@@ -16,7 +16,7 @@ from afspm.experiment.wiring import connectable
 from afspm.record import ahead
 from afspm.runtime.connect import ENDED, GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
-from afspm.supervisor import common_clock, run_folder, summary
+from afspm.supervisor import common_clock, reporting, run_folder, summary
 from afspm.supervisor.log import SUPERVISOR, RunLog
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.supervisor import Outcome, Supervisor
@@ -92,7 +92,8 @@ def go(
         if {start.launch.name for start in starts} & set(experiment.recorders):
             ahead.expect_record(folder / run_folder.STATE_DIR)
         log.write(SUPERVISOR, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
-        supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy())
+        reporter = reporting.reporter(experiment, starts, clock)
+        supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy(), reporter)
         outcome = supervisor.run()
         run_folder.write_run(folder, {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()})
         for line in summary.lines(outcome, folder):

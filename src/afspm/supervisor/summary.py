@@ -18,8 +18,10 @@ def lines(outcome: Outcome, folder: Path) -> list[str]:
     told = [f"{outcome.text}, after {_duration(outcome.duration_s)}"]
     told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
-        if report.starts > 1:
-            told.append(f"{report.name} was restarted {_times(report.starts - 1)}")
+        if (restarts := report.starts - 1 - report.ordered) > 0:
+            told.append(f"{report.name} was restarted {_times(restarts)}")
+        if report.ordered:
+            told.append(f"{report.name} was started anew {_times(report.ordered)}, as ordered")
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     told += _measured(folder / TABLE)

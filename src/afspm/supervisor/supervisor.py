@@ -6,6 +6,7 @@ What to do about a child is decided by `logic.supervision.ChildWatch`, how a run
 from __future__ import annotations
 
 import logging
+import math
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,8 @@ from afspm.supervisor import signals
 from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import SUPERVISOR, LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed, describe_exit
+from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter
+from afspm.supervisor.standing import Standing
 from afspm.supervisor.task import Task
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 from afspm.transport.wakeup import WakeUp
@@ -28,17 +31,20 @@ from afspm.transport.wakeup import WakeUp
 _LEVELS = {Why.STOPPED: logging.INFO, Why.LOST: logging.CRITICAL}
 
 
+LOOK_S = 0.1  # between two looks at how it is with the processes, for those who are told
 START_AT_THE_END_S = 15.0  # what is started again at the end has so long to come up
 
 
 @dataclass(frozen=True)
 class Report:
-    """What became of one process: how often it was started, whether it was given up, how it ended last."""
+    """What became of one process: how often it was started, of that how often since it was ordered, whether it was
+    given up, how it ended last."""
 
     name: str
     starts: int
     given_up: bool
     last_exit: str
+    ordered: int = 0
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,7 @@ class _Child:
     process: ChildProcess | None = None
     lines: LineReader = field(default_factory=LineReader)
     starts: int = 0
+    ordered: int = 0
     started_s: float = 0.0
     rescued: bool = False
     up: bool = False
@@ -109,11 +116,21 @@ class _Child:
 class Supervisor:
     """Runs tasks until the experiment ends, everything is done, something essential is lost, or it is stopped."""
 
-    def __init__(self, tasks: Sequence[Task], log: RunLog, clock: Clock, policy: supervision.Policy) -> None:
+    def __init__(
+        self,
+        tasks: Sequence[Task],
+        log: RunLog,
+        clock: Clock,
+        policy: supervision.Policy,
+        reporter: Reporter | None = None,
+    ) -> None:
         self._log = log
+        self._reporter = reporter
+        self._standing = Standing(clock, policy.liveness)
+        self._looked_s = -math.inf
         self._clock = clock
         self._policy = policy
-        self._wakeup: WakeUp[ChildEvent | signals.Signalled] = WakeUp()
+        self._wakeup: WakeUp[ChildEvent | signals.Signalled | News] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
         self._children = {
             task.name: _Child(task, self._beats.listen(task.name), supervision.ChildWatch(policy)) for task in tasks
@@ -124,6 +141,10 @@ class Supervisor:
     def run(self) -> Outcome:
         """Start everything; returns when nothing of it runs any more."""
         began_s = self._clock.monotonic_s()
+        if self._reporter is not None:
+            self._reporter.post = self._wakeup.post
+            self._log.listener = self._reporter.line
+            self._reporter.start()
         try:
             with signals.told(self._wakeup.post, self._wakeup.writer_fileno()):
                 for child in self._children.values():
@@ -131,14 +152,18 @@ class Supervisor:
                 while self._ending is None or any(child.process for child in self._children.values()):
                     self._wait()
                     self._attend()
+                    self._report()
         finally:  # also when an error of ours ends it: nothing may be left behind
             for child in self._children.values():
                 if child.process:
                     child.process.kill()
+            if self._reporter is not None:
+                self._reporter.close()
             self._beats.close()
             self._wakeup.close()
         reports = tuple(
-            Report(child.name, child.starts, child.given_up, child.last_exit) for child in self._children.values()
+            Report(child.name, child.starts, child.given_up, child.last_exit, child.ordered)
+            for child in self._children.values()
         )
         return Outcome(self._ending.why, self._ending.text, reports, self._clock.monotonic_s() - began_s)
 
@@ -167,6 +192,10 @@ class Supervisor:
                     self._on_exited(self._children[event.name], event)
                 case signals.Signalled():
                     self._on_signal(event)
+                case Ordered():
+                    self._on_ordered(event.name)
+                case Complaint():
+                    self._log.write(SUPERVISOR, logging.WARNING, event.text)
 
     def _timeout_s(self) -> float | None:
         """How long there is nothing to do if nothing happens; None: for ever."""
@@ -175,6 +204,8 @@ class Supervisor:
             deadlines = [self._ending.deadline_s()]
         else:
             deadlines = [child.watch.deadline_s() for child in self._children.values()]
+        if self._reporter is not None:
+            deadlines = [*deadlines, self._looked_s + LOOK_S]
         soonest_s = min((s for s in deadlines if s is not None), default=None)
         return None if soonest_s is None else max(0.0, soonest_s - now_s)
 
@@ -210,7 +241,23 @@ class Supervisor:
         else:
             self._ending = self._ending.hurried(self._clock.monotonic_s())
 
+    def _on_ordered(self, name: str) -> None:
+        child = self._children.get(name)
+        if child is None or self._ending is not None:
+            return
+        child.given_up, child.ordered = False, child.ordered + 1
+        self._carry_out(child, child.watch.restart(self._clock.monotonic_s()))
+
     # --- what is done about it ---
+
+    def _report(self) -> None:
+        """Look how it is with all processes, now and then, and have it told."""
+        now_s = self._clock.monotonic_s()
+        if self._reporter is None or now_s < self._looked_s + LOOK_S:
+            return
+        self._looked_s = now_s
+        states, changed = self._standing.of(self._children.values(), now_s)
+        self._reporter.states(states, changed=changed)
 
     def _attend(self) -> None:
         """Do what the time has come for."""

@@ -11,6 +11,7 @@ from supervisor_lab import DEADLINE_S, QUICK, Running, RunTasks, Terminal
 from afspm.clock import ExperimentClock
 from afspm.logic.supervision import Policy
 from afspm.supervisor.log import RunLog
+from afspm.supervisor.reporter import Reporter
 from afspm.supervisor.supervisor import Outcome, Supervisor
 from afspm.supervisor.task import Task
 
@@ -21,12 +22,12 @@ def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
     running: list[Running] = []
     logs: list[RunLog] = []
 
-    def start(*tasks: Task, policy: Policy = QUICK) -> Running:
+    def start(*tasks: Task, policy: Policy = QUICK, reporter: Reporter | None = None) -> Running:
         terminal = Terminal()
         clock = ExperimentClock.real()
         log = RunLog(tmp_path / "log.txt", clock, terminal=terminal, level=0)  # type: ignore[arg-type]
         logs.append(log)
-        supervisor = Supervisor(tasks, log, clock, policy)
+        supervisor = Supervisor(tasks, log, clock, policy, reporter)
         outcomes: list[Outcome] = []
 
         def run() -> None:

@@ -209,3 +209,45 @@ def test_there_is_never_a_second_process_and_nothing_after_the_end(story: list[t
             count([*watch.beat(Beat(call == "closing", age_s), now_s)])
         else:
             count([*watch.tick(now_s)])
+
+
+def ordered(watch: ChildWatch, now_s: float = 100.0) -> list[str]:
+    return [type(effect).__name__ for effect in watch.restart(now_s)]
+
+
+def test_one_that_is_ordered_to_be_started_anew_is_killed_and_started_at_once_however_often() -> None:
+    watch = ChildWatch(Policy(restart=RestartPolicy(budget=0)))
+    watch.begin(0.0)
+    for life in range(20):
+        now_s = 100.0 + life
+        assert ordered(watch, now_s) == ["Log", "Kill"]
+        assert watch.restart(now_s) == []  # it is on its way
+        assert [type(effect).__name__ for effect in watch.exited(-9, now_s)] == ["Start"]
+    assert [type(effect).__name__ for effect in watch.exited(-9, 200.0)] == ["Log", "GiveUp"]  # that was no order
+
+
+def test_one_that_has_ended_waits_or_is_given_up_is_started_when_ordered() -> None:
+    done, waiting, given_up = (ChildWatch(Policy(restart=RestartPolicy(budget=budget))) for budget in (1, 2, 0))
+    for watch in (done, waiting, given_up):
+        watch.begin(0.0)
+    done.exited(0, 1.0)
+    waiting.exited(1, 1.0)
+    waiting.exited(1, 1.1)
+    given_up.exited(1, 1.0)
+    assert waiting.phase is Phase.WAITING
+    assert [ordered(watch) for watch in (done, waiting, given_up)] == [["Log", "Start"]] * 3
+    assert [watch.phase for watch in (done, waiting, given_up)] == [Phase.RUNNING] * 3
+
+
+def test_an_order_does_not_undo_the_end() -> None:
+    watch = ChildWatch(Policy())
+    watch.begin(0.0)
+    watch.restart(1.0)
+    watch.exited(80, 1.1)  # the experiment ended just then
+    assert watch.phase is Phase.DONE
+    watch = ChildWatch(Policy())
+    watch.begin(0.0)
+    watch.stop(1.0)
+    assert watch.restart(1.1) == []
+    assert watch.exited(-9, 1.2) == []
+    assert watch.phase is Phase.DONE

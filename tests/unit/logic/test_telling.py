@@ -67,8 +67,8 @@ def test_what_a_supervisor_tells_is_published_cached_and_not_forwarded(lab: Lab)
     sent = len(lab.forwarded)
     assert orders(lab, tell(lab, states("a"))) == ()
     assert orders(lab, tell(lab, states("a", "b"))) == ()
-    lines = LogLines((LogLine(1, "a", "INFO", "hello"),))
-    for _ in range(3):
+    for n in range(3):
+        lines = LogLines((LogLine(n, "a", "INFO", "hello"),))
         tell(lab, lines)
     assert (cached(lab).count("ProcessStates_host"), cached(lab).count("LogLines")) == (1, 3)
     assert lab.codec.decode(published(lab.effects)[-1].payload) == lines
@@ -166,6 +166,20 @@ def test_orders_outlive_a_kill_of_the_scheduler(lab: Lab) -> None:
     again = Lab(state=state)
     again.connect(HOST)
     assert orders(again, tell(again, states("a"))) == ("a",)
+
+
+def test_what_a_killed_scheduler_had_published_and_not_answered_is_published_once(lab: Lab) -> None:
+    lines = LogLines((LogLine(1, "a", "INFO", "hello"),))
+    tell(lab, lines, id_="supervisor:host/x/1")
+    again = Lab(state=[effect for effect in lab.effects if isinstance(effect, SaveState)][-1].state)
+    again.codec = lab.codec
+    again.core._telling._codec = lab.codec  # type: ignore[attr-defined]
+    again.core._codec = lab.codec  # type: ignore[attr-defined]
+    again.core.restore_cache(list(lab.core.cached()))
+    assert tell(again, lines, id_="supervisor:host/x/1").code == OK
+    assert cached(again).count("LogLines") == 1
+    assert tell(again, LogLines((LogLine(2, "a", "INFO", "hello"),))).code == OK
+    assert cached(again).count("LogLines") == 2
 
 
 def test_after_the_end_last_words_are_taken_and_no_orders(lab: Lab) -> None:

@@ -1,0 +1,41 @@
+"""Who reports to the scheduler of an experiment, wherever that runs."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+from afspm.clock import Clock
+from afspm.experiment import Experiment, Role, Start
+from afspm.experiment.wiring import connectable
+from afspm.logic.telling import SUPERVISOR
+from afspm.runtime.launch import Launch, Sockets
+from afspm.supervisor.reporter import Reporter
+
+_LONGEST = 60
+
+
+def reporter(experiment: Experiment, starts: Sequence[Start], clock: Clock) -> Reporter | None:
+    """One for what is started here; None where the scheduler can't be asked, or is perhaps none of ours."""
+    scheduler = next((start for start in starts if start.role is Role.SCHEDULER), None)
+    here = re.sub(r"[^\w.-]+", "-", platform.node())[:_LONGEST] or "computer"
+    if scheduler is None:
+        launch = experiment.asking([start.launch.name for start in starts])
+        here = f"{here}-{os.getpid()}"  # there may be several parts on one computer
+    else:
+        launch = _local(scheduler)
+    return None if launch is None else Reporter(replace(launch, name=f"{SUPERVISOR}:{here}"), clock, here)
+
+
+def _local(scheduler: Start) -> Launch | None:
+    """How a scheduler is asked that is started here."""
+    launch = scheduler.launch
+    if scheduler.command or launch.sockets.serve is None:
+        return None
+    address, keys = connectable(launch.sockets.serve), launch.keys
+    if keys is not None and "folder" in keys:
+        keys = {"folder": keys["folder"], address: launch.name}
+    return Launch(SUPERVISOR, sockets=Sockets(control=address), keys=keys)

@@ -1,0 +1,47 @@
+"""What is handed to a reporter whose scheduler takes nothing stays within bounds, and nobody waits for it."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from afspm.clock import ExperimentClock
+from afspm.logic.telling import LONGEST
+from afspm.runtime.launch import Launch
+from afspm.supervisor import reporter as reporting
+from afspm.supervisor.reporter import Reporter
+from afspm.wire import encode
+
+
+@pytest.fixture
+def reporter() -> Reporter:
+    """One that was not started: nothing takes what it is given."""
+    return Reporter(Launch("supervisor:lab"), ExperimentClock.real(), "lab")
+
+
+def test_the_oldest_lines_go_and_that_is_said(reporter: Reporter) -> None:
+    for n in range(reporting.MOST_LINES + 7):
+        reporter.line("one", logging.INFO, f"line {n}")
+    lines = reporter._some_lines()
+    assert lines[0].text == "7 lines are left out here: the scheduler did not take them"
+    assert lines[0].level == "WARNING"
+    assert lines[1].text == "line 7"
+    assert reporter._some_lines()[0].text == f"line {len(lines) + 6}"
+
+
+def test_a_batch_is_no_longer_than_the_scheduler_takes(reporter: Reporter) -> None:
+    for _ in range(1000):
+        reporter.line("one", logging.INFO, "µ" * 10_000)
+    lines = reporter._some_lines()
+    assert len(lines[0].text) == reporting.LONGEST_LINE
+    assert len(encode(reporting.LogLines(lines))[1]) <= LONGEST
+
+
+def test_what_is_for_developers_is_left_out(reporter: Reporter) -> None:
+    reporter.line("one", logging.DEBUG, "started, process 7")
+    assert reporter._some_lines() == ()
+
+
+def test_one_that_was_not_started_can_be_closed(reporter: Reporter) -> None:
+    reporter.close()
