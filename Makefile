@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test test-translators check bench bench-drift soak chaos simulate clean
+.PHONY: demo demo-drift test test-translators check bench bench-drift soak chaos simulate power-cut clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -62,6 +62,11 @@ HOURS ?= 20000
 SEED ?= 1
 simulate: $(SETUP)
 	@$(BIN)/python -m afspm.testing.longrun --hours $(HOURS) --seed $(SEED)
+
+## a recorded run whose processes are all killed, and that is resumed, again and again: make power-cut CUTS=100 SEED=1
+CUTS ?= 100
+power-cut: $(SETUP)
+	@$(BIN)/python -m afspm.testing.power_cut --cuts $(CUTS) --seed $(SEED)
 
 clean:
 	rm -rf .venv build runs

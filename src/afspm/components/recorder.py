@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from afspm.runtime.process import Context
 
 EXPERIMENT_FILE = "experiment.toml"
+REST_S = 0.5
+"""Real: for what is said of the end after it."""
 
 
 class Recorder(Component):
@@ -56,24 +59,26 @@ class Recorder(Component):
             wake=port.wake_up,
         )
         writer.start()
+        until_s = math.inf
         try:
-            while True:
-                for incoming in port.poll(None):
+            while (left_s := until_s - context.clock.monotonic_s()) > 0.0:
+                for incoming in port.poll(None if left_s == math.inf else left_s):
                     match incoming:
                         case PacketReceived():
                             writer.put(incoming.packet, "" if incoming.source == source else incoming.source)
                         case CaughtUp() if incoming.source == source:
                             writer.caught_up()
                         case Killed():
-                            writer.finish(ended=True)
-                            return ExitCode.ENDED
+                            until_s = min(until_s, context.clock.monotonic_s() + REST_S)
                         case ParentGone():
-                            writer.finish(ended=False)
+                            writer.finish(ended=until_s < math.inf)
                             return ExitCode.ORPHAN
                 writer.check()
                 if writer.wants_replay():
                     port.close()
                     port = context.open_port()
+            writer.finish(ended=True)
+            return ExitCode.ENDED
         finally:
             port.close()
 

@@ -213,12 +213,16 @@ class Writer:
 
     def _take_missed(self, store: Store, held: Iterable[_Item]) -> None:
         """What was published while nobody listened: written ahead by the scheduler, or kept by it."""
-        found = heapq.merge(self._written_ahead(store.recorded_ns), sorted(held, key=_time), key=_time)
+        found = heapq.merge(self._written_ahead(), sorted(held, key=_time), key=_time)
         for items in _some_at_a_time(found):
             self._take(store, items)
 
-    def _written_ahead(self, since_ns: int) -> Iterator[_Item]:
-        found = (ahead.written_ahead(folder, since_ns) for folder in ahead.folders(self._state)) if self._state else ()
+    def _written_ahead(self) -> Iterator[_Item]:
+        if self._state is None:
+            return iter(())
+        # not what is newer than all that is recorded: lines of a scan wait for the rest of it
+        since_ns = ahead.recorded_until(self._state / ahead.RECORDED_FILE)
+        found = (ahead.written_ahead(folder, since_ns) for folder in ahead.folders(self._state))
         return (_Item(written.packet) for written in chain.from_iterable(found))
 
     def _take(self, store: Store, items: list[_Item]) -> None:

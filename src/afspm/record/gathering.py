@@ -87,10 +87,10 @@ class Gathering:
         return over
 
     def lines(self, packet: Packet, lines: ScanLines) -> list[Taken]:
-        """Lines of a running scan."""
+        """Lines of a running scan. A translator that is started anew publishes them from the first row on again."""
         before = self._open.lines[-1][1] if self._open.lines else None
         over: list[Taken] = []
-        if self._open.channels or (before is not None and before.began_ns != lines.began_ns):
+        if self._open.channels or (before is not None and (before.region, before.shape) != (lines.region, lines.shape)):
             over = self.finish(packet.time_ns or 0)
         self._open.lines.append((packet, lines))
         return over

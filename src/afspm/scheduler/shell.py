@@ -230,7 +230,8 @@ class Shell:
                 case events.Publish():
                     if effect.cached and effect.source_ns is None:
                         self._journal.keep(effect.packet)
-                    self._journal.note(effect.packet, effect.source_ns, cached=effect.cached)
+                    if not self.ended:  # what is said afterwards is of no use to a run that is resumed
+                        self._journal.note(effect.packet, effect.source_ns, cached=effect.cached)
                     sockets.publisher.publish(effect.packet)
                     if effect.cached:
                         self._journal.changed()

@@ -1,0 +1,315 @@
+"""`python -m afspm.testing.power_cut [--cuts N] [--seed S]`: an experiment that is killed as a whole, again and again.
+
+A simulated experiment of scans, spectra and problems is killed (kill -9 of every process, at moments drawn from a
+seed) and resumed. Somebody outside, a plain subscriber of version 1, writes down what was published; in the end
+the record has to have all of it, bit by bit, and each measurement once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import queue
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import afspm
+from afspm.clock import ExperimentClock
+from afspm.model import Packet
+from afspm.runtime.connect import connect
+from afspm.wire import KILL, decode_packet
+
+CLOCK = ExperimentClock.real()
+DEADLINE_S = 60.0
+LONGEST_LIFE_S = 3.0
+"""From the first line of a run to the cut; in most of this time it measures."""
+COMMAND = (sys.executable, "-m", "afspm", "run")
+
+EXPERIMENT = """
+[clock]
+speed = 240.0
+
+[microscope]
+component = true
+class = "Simulator"
+seed = {seed}
+initial = {{ scan-speed = "4 um/s" }}
+live_lines_s = "5 s"
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[tireless]
+component = true
+class = "tireless.Tireless"
+
+[metadata]
+component = true
+class = "Metadata"
+
+[control]
+solved_by_hand = ["thermal-drift"]
+grace = "1 s"
+"""
+COMPONENT = '''
+"""Measures for ever, each thing once, and has a problem now and then."""
+
+import itertools
+
+from afspm import Component, Region
+
+
+class Tireless(Component):
+    def run(self):
+        for i in itertools.count(self.memory.get("done", 0)):
+            region = Region((i % 5 * 1e-6, 0), (1e-6, 1e-6))
+            self.scope.scan(region, shape=(24, 24), key=f"scan-{i}")
+            if i % 3 == 1:
+                self.scope.spectrum((i % 5 * 1e-6, 0), key=f"spectrum-{i}")
+            if i % 4 == 2:
+                self.scope.flag("thermal-drift")
+                self.scope.clear("thermal-drift")
+            self.memory["done"] = i + 1
+            self.memory.save()
+'''
+
+
+class Witness:
+    """A plain subscriber, as of version 1, to one scheduler after the other."""
+
+    def __init__(self) -> None:
+        import zmq
+
+        self.seen: dict[tuple[int, str], bytes] = {}
+        self.contradicted: list[tuple[int, str]] = []
+        self._context: Any = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.SUBSCRIBE, b"")
+        self._socket.setsockopt(zmq.RCVHWM, 0)
+        self._socket.setsockopt(zmq.RCVTIMEO, 20)
+        self._address = ""
+        self._killed = False
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def attend(self, address: str) -> None:
+        """Listen to this scheduler from now on."""
+        with self._lock:
+            if self._address:
+                self._socket.disconnect(self._address)
+            self._socket.connect(address)
+            self._address = address
+
+    def close(self) -> None:
+        """Take in what has come, and leave."""
+        self._over.set()
+        self._thread.join()
+        self._context.destroy(linger=0)
+
+    def _listen(self) -> None:
+        import zmq
+
+        while True:
+            with self._lock:
+                try:
+                    frames = self._socket.recv_multipart()
+                except zmq.Again:
+                    if self._over.is_set():
+                        return
+                    continue
+            if frames == [KILL]:
+                self._killed = True
+            elif len(frames) == 3 and not self._killed:  # last words after the end are for nobody any more
+                self._take(frames)
+
+    def _take(self, frames: list[bytes]) -> None:
+        packet = decode_packet(frames)
+        key = (packet.time_ns or 0, packet.envelope)
+        if self.seen.setdefault(key, frames[1]) != frames[1]:
+            self.contradicted.append(key)
+
+
+@dataclass
+class Life:
+    """One life of the run: `afspm run` with everything that it starts."""
+
+    command: tuple[str, ...]
+    folder: Path
+    lines: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._incoming: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self.process = subprocess.Popen(
+            self.command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=self.folder, start_new_session=True
+        )
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as pipe:
+            for line in pipe:
+                self._incoming.put(line.decode(errors="replace").rstrip())
+        self._incoming.put(None)
+
+    def wait_for(self, pattern: str, within_s: float = DEADLINE_S) -> str | None:
+        """The next line with the pattern; None: it has ended, or none came in time."""
+        until_s = CLOCK.monotonic_s() + within_s
+        with contextlib.suppress(queue.Empty):
+            while (line := self._incoming.get(timeout=max(0.0, until_s - CLOCK.monotonic_s()))) is not None:
+                self.lines.append(line)
+                if re.search(pattern, line):
+                    return line
+        return None
+
+    def cut(self) -> None:
+        """Kill everything, at one moment."""
+        tree = [self.process.pid, *_below(self.process.pid)]
+        for sent in (signal.SIGSTOP, signal.SIGKILL):  # nobody sees another die
+            for pid in tree:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, sent)
+        self.process.wait()
+
+
+def _below(pid: int) -> Iterator[int]:
+    """All processes that this one has started, and those have."""
+    with contextlib.suppress(OSError):
+        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split():
+            yield int(child)
+            yield from _below(int(child))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came of it: `wrong` says what should not be so; `seen` is how many packets the one outside saw."""
+
+    folder: Path
+    cuts: int
+    seen: int
+    scans: int
+    spectra: int
+    wrong: list[str]
+
+
+def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None) -> Verdict:
+    """Begin an experiment in a folder, cut it so often, resume it, and end it.
+
+    Raises:
+        AssertionError: a life of it did not begin, or the last did not end.
+    """
+    chance = random.Random(seed)
+    (folder / "experiment.toml").write_text(EXPERIMENT.format(seed=seed), encoding="utf-8")
+    (folder / "tireless.py").write_text(COMPONENT, encoding="utf-8")
+    witness = Witness()
+    command: tuple[str, ...] = (*COMMAND, "experiment.toml")
+    try:
+        for number in range(cuts + 1):
+            life = Life(command, folder)
+            begun = life.wait_for("processes, into")
+            assert begun is not None, "\n".join(life.lines)
+            run = Path(begun.rpartition(", into ")[2])
+            facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
+            witness.attend(facts["processes"]["scheduler"]["publish"])
+            command = (*COMMAND, "--resume", str(run))
+            if number < cuts:
+                life.wait_for("never said", chance.uniform(0.0, LONGEST_LIFE_S))
+                life.cut()
+                tell(f"cut {number + 1} of {cuts}")
+            else:
+                _end(life, run)
+    finally:
+        if life.process.poll() is None:
+            life.cut()
+        witness.close()
+    return _verdict(run, cuts, witness)
+
+
+def _end(life: Life, run: Path) -> None:
+    with connect(run, "outside") as scope:
+        for _ in scope.events("Scan2d", timeout_s=DEADLINE_S):
+            break
+        scope.end_experiment()
+    life.wait_for("never said")
+    assert life.process.wait(DEADLINE_S) == 0, "\n".join(life.lines)
+
+
+def _verdict(run: Path, cuts: int, witness: Witness) -> Verdict:
+    with afspm.open_run(run) as record:
+        wrong = list(_wrong(record, witness))
+        return Verdict(run, cuts, len(witness.seen), len(record.scans), len(record.spectra), wrong)
+
+
+def _wrong(record: Any, witness: Witness) -> Iterator[str]:
+    if witness.contradicted:
+        yield f"published twice at the same time, and not the same: {witness.contradicted[:3]}"
+    recorded = {(packet.time_ns, packet.envelope): packet for packet in record.packets()}
+    missing = [key for key in witness.seen if key not in recorded]
+    if missing:
+        yield f"{len(missing)} packets were published and are not recorded: {sorted(missing)[:3]}"
+    other = [key for key, payload in witness.seen.items() if key in recorded and not _same(recorded[key], payload)]
+    if other:
+        yield f"{len(other)} packets are recorded otherwise than they were published: {sorted(other)[:3]}"
+    whole = [row for row in record.scans if not row.interrupted]
+    saved = Counter(file.name for file in (record.folder / "scans").glob("scan-*.nc"))
+    if (found := Counter(Path(row.filename).name for row in whole)) != saved:
+        yield f"scans recorded otherwise than measured: {found - saved} too often, {saved - found} missing"
+    if len({row.channels for row in whole}) != 1:
+        yield f"not every scan has all of its channels: {Counter(row.channels for row in whole)}"
+    for row in (*record.scans, *record.spectra):
+        if row.file and not (record.folder / row.file).is_file():
+            yield f"{row.file} is missing"
+    files = {file.name for file in record.folder.glob("s*/*.h5*")}
+    if stray := files - {Path(row.file).name for row in (*record.scans, *record.spectra)}:
+        yield f"files that nobody knows of: {sorted(stray)[:3]}"
+    curves = Counter(Path(row.filename).name for row in record.spectra)
+    if curves != Counter(file.name for file in (record.folder / "scans").glob("spectrum-*.nc")):
+        yield "spectra recorded otherwise than measured"
+
+
+def _same(packet: Packet, payload: bytes) -> bool:
+    return bytes(packet.payload) == payload
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    """Returns the exit code: 1 if something was lost, or is there twice."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--cuts", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=random.randrange(10**6))
+    options = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="power-cut-"))
+    verdict = power_cuts(folder, options.cuts, options.seed, _say)
+    told = "; ".join(verdict.wrong) or "nothing is lost, nothing is there twice"
+    _say(
+        f"seed {options.seed}: {verdict.cuts} cuts, {verdict.seen} packets seen, {verdict.scans} scans and "
+        f"{verdict.spectra} spectra: {told}"
+    )
+    if verdict.wrong:
+        _say(f"it is kept in {folder}")
+        return 1
+    shutil.rmtree(folder)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
