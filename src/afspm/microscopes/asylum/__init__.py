@@ -10,11 +10,12 @@ from typing import Any, ClassVar, Final
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.asylum.activity import FORCE, Activity
 from afspm.microscopes.asylum.frame import GLOBALS, NAMES, asylums, from_image, generic, on_image
-from afspm.microscopes.asylum.harvest import SCAN, Harvest
+from afspm.microscopes.asylum.harvest import Harvest
 from afspm.microscopes.asylum.link import Link
 from afspm.microscopes.asylum.session import Session
 from afspm.microscopes.asylum.xop import XopError
 from afspm.microscopes.in_force import FRAME, POSITION, frame
+from afspm.microscopes.measurements import SCAN
 from afspm.microscopes.microscope import ControllerLost, Microscope, action
 from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names

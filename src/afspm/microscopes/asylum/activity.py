@@ -11,8 +11,9 @@ from typing import Any, Final
 from afspm.clock import Clock
 from afspm.errors import Refused
 from afspm.microscopes.asylum.folders import local
-from afspm.microscopes.asylum.harvest import SCAN, Harvest, Target
+from afspm.microscopes.asylum.harvest import Harvest, Target
 from afspm.microscopes.asylum.session import Session
+from afspm.microscopes.measurements import SCAN, as_list, as_region
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 
 FORCE: Final = "force"
@@ -78,10 +79,7 @@ class Activity:
     def image(self) -> Region:
         """The frame of the last image, which Asylum counts spots on; that in force if nothing was scanned yet."""
         kept = self._kept.get("image")
-        if kept is None:
-            return self._frame_in_force()
-        x, y, width, height, angle = kept
-        return Region((x, y), (width, height), angle)
+        return self._frame_in_force() if kept is None else as_region(kept)
 
     def begin(self, what: str, position_m: tuple[float, float] | None = None) -> None:
         """A measurement begins, with what is in force now.
@@ -92,7 +90,7 @@ class Activity:
         taken: dict[str, Any] = {"position": position_m and list(position_m)}
         if what == SCAN:
             region = self._frame_in_force()
-            taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad]}
+            taken = {"frame": as_list(region)}
             self._kept["image"] = taken["frame"]
         self._harvest.begin(what, self._target(what), taken)
 

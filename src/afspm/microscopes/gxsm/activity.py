@@ -11,8 +11,9 @@ from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
 from afspm.microscopes.gxsm.frame import Frame
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
-from afspm.microscopes.gxsm.harvest import SCAN, Harvest, endings
+from afspm.microscopes.gxsm.harvest import Harvest, endings
 from afspm.microscopes.gxsm.link import Asking
+from afspm.microscopes.measurements import SCAN, as_list
 from afspm.model import Region, ScopeState, ScopeStatus
 
 SHOWS_S: Final = 1.0
@@ -162,7 +163,7 @@ class Activity:
     def _begin_scan(self, begun_ns: int) -> None:
         self._stopping, self._endings = False, []
         region, shape = self._set_frame()
-        taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad], "shape": list(shape)}
+        taken = {"frame": as_list(region), "shape": list(shape)}
         self._harvest.begin(SCAN, self._folder(), begun_ns, taken)
 
     def _begin_curve(self, kind: str, position_m: tuple[float, float]) -> None:

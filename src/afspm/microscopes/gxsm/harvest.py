@@ -1,43 +1,35 @@
-"""What comes of a measurement: GXSM's files, which come late, one for each channel, one after the other.
-
-Everything that must outlive the process is in `kept`: which measurement is running, which has ended and whose files
-are awaited, and which results there are.
-"""
+"""What comes of a measurement: GXSM's files, which come late, one for each channel, one after the other."""
 
 from __future__ import annotations
 
 import logging
-import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from afspm.clock import NS_PER_S
-from afspm.errors import AfspmError, FileError
+from afspm.errors import AfspmError
 from afspm.files import read
 from afspm.files.content import FileContent
+from afspm.microscopes.measurements import SCAN, Measurements, as_set, lines_missing, region_of
 from afspm.model import Region, Scan, Spectrum
 
-SCAN: Final = "scan"
-_LISTED: Final = 16
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
 _STORED: Final = 1e-5
 """Relative: what is lost of a length in a file."""
+_TURNED_RAD: Final = 1e-6
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Files tell the second in which a scan began."""
 SOON_S: Final = 1.0
 """After so long a channel that did not come before will not come; 0.3 s were measured."""
 
 
-class Harvest:
+class Harvest(Measurements):
     """The measurement that is running or has just ended, and the results.
 
     Args:
-        kept: JSON-able, and lasts.
         patience_s: how long all files may take, in experiment time.
         soon_s: how long those of channels may that did not come before.
         rewritten: files may be there before the scan is over, and be written again.
@@ -46,31 +38,22 @@ class Harvest:
     def __init__(
         self, kept: dict[str, Any], patience_s: float, soon_s: float, log: logging.Logger, *, rewritten: bool
     ) -> None:
-        self._kept = kept
+        super().__init__(kept, log)
         self._patience_s = patience_s
         self._soon_s = soon_s
         self._rewritten = rewritten
-        self._log = log
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._whole: dict[Path, FileContent] = {}
-        self._broken_off = False
-        for key, empty in (("running", None), ("ended", None), ("results", []), ("absent", []), ("channels", {})):
-            kept.setdefault(key, empty)
-
-    @property
-    def what(self) -> str:
-        """Which measurement is running: `SCAN`, the kind of a spectrum, or nothing."""
-        running = self._kept["running"]
-        return running["what"] if running else ""
+        kept.setdefault("absent", [])
+        kept.setdefault("channels", {})
 
     @property
     def scanning(self) -> tuple[Region, tuple[int, int]] | None:
         """The frame of the running scan, and (rows, columns)."""
         if self.what != SCAN:
             return None
-        x, y, width, height, angle = self._kept["running"]["frame"]
         rows, columns = self._kept["running"]["shape"]
-        return Region((x, y), (width, height), angle), (rows, columns)
+        return region_of(self._kept["running"]), (rows, columns)
 
     @property
     def channels(self) -> dict[str, list[str]]:
@@ -78,32 +61,17 @@ class Harvest:
         found: dict[str, list[str]] = self._kept["channels"]
         return found
 
-    @property
-    def broken_off(self) -> bool:
-        """Whether nothing came of what has ended; until `results` is called."""
-        return self._broken_off
-
     def begin(self, what: str, folder: Path | None, begun_ns: int, taken: Mapping[str, Any]) -> None:
         """A measurement begins.
 
         Args:
             folder: where its files will be; None: GXSM does not say yet.
             begun_ns: not before this; 0: it was found running.
-            taken: "frame" (x, y, width, height, angle) and "shape" of a scan, "position" of a spectrum.
+            taken: "frame" and "shape" of a scan, "position" of a spectrum.
         """
         newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
-        self._kept["running"] = {
-            "what": what,
-            "folder": None if folder is None else str(folder),
-            "newest_ns": newest,
-            "begun_ns": begun_ns,
-            **taken,
-        }
-        self._kept["ended"] = None
-
-    def forget(self) -> None:
-        """What is running or has ended was broken off: nothing comes of it."""
-        self._kept["running"] = self._kept["ended"] = None
+        place = None if folder is None else str(folder)
+        self._begins(what, {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, **taken})
 
     def end(self, now_ns: int, channels: Iterable[str]) -> None:
         """It has ended.
@@ -112,16 +80,12 @@ class Harvest:
             channels: where GXSM says that it saves each channel of a scan.
         """
         paths = [Path(path) for path in channels]
-        ended = {
-            **self._kept["running"],
-            "end_ns": now_ns,
-            "until_s": now_ns / NS_PER_S + self._patience_s,
-            "channels": sorted(endings(paths)),
-        }
+        until_s = now_ns / NS_PER_S + self._patience_s
+        self._ends({"end_ns": now_ns, "until_s": until_s, "channels": sorted(endings(paths))})
+        ended = self._kept["ended"]
         if ended["folder"] is None and paths:  # a scan's: old ones in there are told by when they began
             ended["folder"] = str(paths[0].parent)
             ended["begun_ns"] = ended["begun_ns"] or now_ns
-        self._kept["running"], self._kept["ended"] = None, ended
         self._sizes, self._whole = {}, {}
 
     def next_s(self) -> float | None:
@@ -131,7 +95,7 @@ class Harvest:
 
     def results(self, now_s: float) -> list[str]:
         """The last results, oldest first: each by one of its files and when it ended."""
-        self._broken_off = False
+        self.broken_off = False
         ended = self._kept["ended"]
         if ended is not None:
             files = self._new(ended)
@@ -145,7 +109,7 @@ class Harvest:
                 self._add(ended, files)
             elif over:
                 self._give_up(self._missing(ended))
-        return [_name(entry) for entry in self._kept["results"]]
+        return self._listed()
 
     def load(self, result: str) -> list[Scan | Spectrum]:
         """Read one of the results, with the parameters that it was taken with.
@@ -153,9 +117,7 @@ class Harvest:
         Raises:
             FileError: it is no result any more, or a file has gone.
         """
-        entry = next((entry for entry in self._kept["results"] if _name(entry) == result), None)
-        if entry is None:
-            raise FileError("is not among the last results", where=result)
+        entry = self._found(result)
         contents = [self._whole.get(Path(file)) or read(file) for file in entry["files"]]
         return [_as_taken(one, entry) for content in contents for one in content]
 
@@ -201,7 +163,7 @@ class Harvest:
     def _give_up(self, why: str) -> None:
         self._log.error("nothing comes of the %s: %s", self._kept["ended"]["what"], why)
         self._kept["ended"] = None
-        self._broken_off = True
+        self.broken_off = True
 
     def _add(self, ended: Mapping[str, Any], files: Mapping[Path, FileContent]) -> None:
         if ended["what"] == SCAN:
@@ -212,17 +174,10 @@ class Harvest:
             for ending, file in endings(files).items():
                 scan = files[file].scans[0]
                 self._kept["channels"][ending] = [scan.channel, scan.unit]
-        entry = {
-            "files": [str(file) for file in files],
-            **{key: ended[key] for key in ("what", "frame", "position", "end_ns") if key in ended},
-        }
-        self._kept["results"] = [*self._kept["results"], entry][-_LISTED:]
+        names = [str(file) for file in files]
+        # numbered by its end: files of spectra may be overwritten
+        self._comes(f"{names[0]} ({ended['end_ns']})", ended, {"files": names})
         self._kept["ended"] = None
-
-
-def _name(entry: Mapping[str, Any]) -> str:
-    """Of a result: files of spectra may be overwritten."""
-    return f"{entry['files'][0]} ({entry['end_ns']})"
 
 
 def endings(files: Iterable[Path]) -> dict[str, Path]:
@@ -248,20 +203,12 @@ def _older(content: FileContent, begun_ns: int) -> bool:
 
 def _gaps(content: FileContent) -> bool:
     """Whether lines were not scanned."""
-    return any(np.isnan(scan.values).all(axis=1).any() for scan in content.scans)
+    return any(map(lines_missing, content.scans))
 
 
 def _as_taken(one: Scan | Spectrum, entry: Mapping[str, Any]) -> Scan | Spectrum:
     """With the frame that was set, where the file has the same, or the position that the tip was sent to; our time."""
     if isinstance(one, Scan):
-        x, y, width, height, angle = entry["frame"]
-        region = Region((x, y), (width, height), angle)
-        return replace(one, region=region if _same(region, one.region) else one.region, time_ns=entry["end_ns"])
+        return as_set(one, entry, part=_STORED, angle_rad=_TURNED_RAD)
     x, y = entry["position"]
     return replace(one, kind=entry["what"], position_m=(x, y), time_ns=entry["end_ns"])
-
-
-def _same(a: Region, b: Region) -> bool:
-    scale = _STORED * max(*map(abs, a.center_m), *a.size_m)
-    close = np.allclose([*a.center_m, *a.size_m], [*b.center_m, *b.size_m], rtol=0.0, atol=scale)
-    return bool(close and abs(math.remainder(a.angle_rad - b.angle_rad, math.tau)) <= 1e-6)

@@ -10,14 +10,15 @@ from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, FileError, Refused
 from afspm.microscopes.in_force import FRAME, frame
+from afspm.microscopes.measurements import SCAN, region_of
 from afspm.microscopes.microscope import ControllerLost, Microscope, action
 from afspm.microscopes.nanonis import fetched, groups, protocol
 from afspm.microscopes.nanonis.activity import Activity
 from afspm.microscopes.nanonis.float32 import same_float32
-from afspm.microscopes.nanonis.harvest import SCAN, Harvest
+from afspm.microscopes.nanonis.harvest import Harvest
 from afspm.microscopes.nanonis.session import MODULES, Session
 from afspm.microscopes.parameters import Value
-from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
 
 _AT_FIRST: Final[dict[str, Value]] = {
@@ -184,8 +185,7 @@ class Nanonis(Microscope):
 
     def _fetch(self, ended: Mapping[str, Any]) -> Sequence[Scan | Spectrum]:
         if ended["what"] == SCAN:
-            x, y, width, height, angle = ended["frame"]
-            region = Region((x, y), (width, height), angle)
+            region = region_of(ended)
             found = fetched.images(self._ask, self._grabbing)
             return [Scan(region, image.name, image.unit, image.values) for image in found]
         curve, self._activity.curve = self._activity.curve, None

@@ -8,9 +8,10 @@ from typing import Any, Final
 from afspm.clock import Clock
 from afspm.errors import Refused
 from afspm.microscopes.in_force import frame
+from afspm.microscopes.measurements import SCAN, as_list
 from afspm.microscopes.microscope import ControllerLost
 from afspm.microscopes.nanonis.groups import Probe, ScanFrame
-from afspm.microscopes.nanonis.harvest import SCAN, Harvest
+from afspm.microscopes.nanonis.harvest import Harvest
 from afspm.microscopes.nanonis.listener import CurveEnded, Failed, Heard, ScanEnded
 from afspm.microscopes.nanonis.session import APPROACH, MODULES, Session
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
@@ -52,7 +53,7 @@ class Activity:
         """A scan of a frame begins, or was found running."""
         self.stopping = False
         self._listener.scan()
-        taken = {"frame": [*region.center_m, *region.size_m, region.angle_rad]}
+        taken = {"frame": as_list(region)}
         self._harvest.begin(SCAN, self._session_folder(), taken)
 
     def begin_curve(self, kind: str) -> None:

@@ -1,8 +1,4 @@
-"""What comes of a measurement: Nanonis' file of it, or, where there is none, what it has in memory.
-
-Everything that must outlive the process is in `kept`: which measurement is running, which has ended and whose file is
-awaited, and which results there are.
-"""
+"""What comes of a measurement: Nanonis' file of it, or, where there is none, what it has in memory."""
 
 from __future__ import annotations
 
@@ -13,28 +9,26 @@ from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import Any, Final
 
-import numpy as np
-
 from afspm.errors import AfspmError, FileError
 from afspm.files import read
+from afspm.microscopes.measurements import SCAN, Content, Measurements, as_set, lines_missing
 from afspm.microscopes.microscope import LOST
 from afspm.microscopes.nanonis import fetched
-from afspm.model import Region, Scan, Spectrum
+from afspm.model import Scan, Spectrum
 
-SCAN: Final = "scan"
-_LISTED: Final = 16
 _PRINTED: Final = 2e-6
 """Relative: what a file has of a position, of which it prints seven digits."""
 
-Content = list[Scan | Spectrum]
+_TURNED_RAD: Final = 1e-3
+"""The same of the angle, in degrees with three digits."""
+
 Fetch = Callable[[Mapping[str, Any]], Sequence[Scan | Spectrum]]
 
 
-class Harvest:
+class Harvest(Measurements):
     """The measurement that is running or has just ended, and the results.
 
     Args:
-        kept: JSON-able, and lasts.
         session_dir: where the session folder of Nanonis' computer is seen from here; None: it is this computer.
         own_folder: for what is fetched.
         patience_s: how long a file may take before the data is fetched instead.
@@ -48,37 +42,23 @@ class Harvest:
         patience_s: float,
         log: logging.Logger,
     ) -> None:
-        self._kept = kept
+        super().__init__(kept, log)
         self._session_dir = session_dir
         self._own_folder = own_folder
         self._patience_s = patience_s
-        self._log = log
         self._read: dict[str, Content] = {}
-        self._broken_off = False
-        for key, empty in (("running", None), ("ended", None), ("results", []), ("fetched", 0)):
-            kept.setdefault(key, empty)
-
-    @property
-    def what(self) -> str:
-        """Which measurement is running: `SCAN`, the kind of a spectrum, or nothing."""
-        running = self._kept["running"]
-        return running["what"] if running else ""
+        kept.setdefault("fetched", 0)
 
     def begin(self, what: str, session: str, taken: Mapping[str, Any]) -> None:
         """A measurement begins.
 
         Args:
             session: Nanonis' session folder.
-            taken: "frame" (x, y, width, height, angle) of a scan, "position" of a spectrum.
+            taken: "frame" of a scan, "position" of a spectrum.
         """
         folder = self._session_dir or Path(session)
         newest = max((file.stat().st_mtime_ns for file in self._files(folder, what)), default=0)
-        self._kept["running"] = {"what": what, "folder": str(folder), "newest_ns": newest, **taken}
-        self._kept["ended"] = None
-
-    def forget(self) -> None:
-        """What is running or has ended was broken off: nothing comes of it."""
-        self._kept["running"] = self._kept["ended"] = None
+        self._begins(what, {"folder": str(folder), "newest_ns": newest, **taken})
 
     def end(self, now_ns: int, now_s: float, told: str | None = None) -> None:
         """It has ended, or more is known of its end.
@@ -86,21 +66,16 @@ class Harvest:
         Args:
             told: where Nanonis says that it saved it; empty: it did not; None: it has not said.
         """
-        running, ended = self._kept["running"], self._kept["ended"]
+        running = self._kept["running"]
         if running is not None:
             seen = Path(running["folder"]).is_dir()
             fetch_at_s = now_s + (self._patience_s if seen else 0.0)
-            ended = {**running, "told": told, "end_ns": now_ns, "fetch_at_s": fetch_at_s}
-            self._kept["running"], self._kept["ended"] = None, ended
+            self._ends({"told": told, "end_ns": now_ns, "fetch_at_s": fetch_at_s})
+        ended = self._kept["ended"]
         if ended is not None and told is not None:
             ended["told"] = told
             if not told:
                 ended["fetch_at_s"] = now_s
-
-    @property
-    def broken_off(self) -> bool:
-        """Whether it turned out that what has ended was broken off at the controller; until `results` is called."""
-        return self._broken_off
 
     def next_s(self) -> float | None:
         """When to look again at the latest."""
@@ -113,7 +88,7 @@ class Harvest:
         Args:
             fetch: gets from Nanonis what is in no file.
         """
-        self._broken_off = False
+        self.broken_off = False
         ended = self._kept["ended"]
         if ended is not None:
             file = self._file(ended)
@@ -122,7 +97,7 @@ class Harvest:
             elif now_s >= ended["fetch_at_s"]:
                 self._kept["ended"] = None
                 self._fetch(fetch, ended, file)
-        return [entry["file"] for entry in self._kept["results"]]
+        return self._listed()
 
     def load(self, result: str) -> Content:
         """Read one of the results, with the parameters that it was taken with.
@@ -130,9 +105,7 @@ class Harvest:
         Raises:
             FileError: it is no result any more, or its file has gone.
         """
-        entry = next((entry for entry in self._kept["results"] if entry["file"] == result), None)
-        if entry is None:
-            raise FileError("is not among the last results", where=result)
+        entry = self._found(result)
         if result not in self._read:
             self._read = {result: _content(Path(result), entry)}
         return self._read[result]
@@ -147,7 +120,7 @@ class Harvest:
             raise
         except AfspmError as error:
             self._log.error("no file of the %s (%s), and it can't be fetched: %s", ended["what"], missed, error)
-            self._broken_off = True
+            self.broken_off = True
             return
         if ended["told"] != "":
             self._log.warning("no whole file of the %s (%s): it was fetched from Nanonis", ended["what"], missed)
@@ -158,8 +131,7 @@ class Harvest:
 
     def _add(self, file: Path, ended: Mapping[str, Any], content: Content) -> None:
         name = str(file)
-        entry = {"file": name, **{key: ended[key] for key in ("what", "frame", "position", "end_ns") if key in ended}}
-        self._kept["results"] = [*self._kept["results"], entry][-_LISTED:]
+        self._comes(name, ended, {})
         self._kept["ended"] = None
         self._read = {name: content}
 
@@ -196,24 +168,15 @@ def _content(path: Path, entry: Mapping[str, Any]) -> Content:
 def _as_taken(one: Scan | Spectrum, entry: Mapping[str, Any]) -> Scan | Spectrum:
     """With the frame or position that was set, of which the file has as many digits as it prints, and our time."""
     if isinstance(one, Scan):
-        x, y, width, height, angle = entry["frame"]
-        region = Region((x, y), (width, height), angle)
-        return replace(one, region=region if _same(region, one.region) else one.region, time_ns=entry["end_ns"])
+        return as_set(one, entry, part=_PRINTED, angle_rad=_TURNED_RAD)
     x, y = entry["position"]
     there = one.position_m is None or math.dist(one.position_m, (x, y)) <= 10 * _PRINTED * max(abs(x), abs(y)) + 1e-12
     position = (x, y) if there else one.position_m
     return replace(one, kind=entry["what"], position_m=position, time_ns=entry["end_ns"])
 
 
-def _same(a: Region, b: Region) -> bool:
-    scale = _PRINTED * max(*map(abs, a.center_m), *a.size_m)
-    close = np.allclose([*a.center_m, *a.size_m], [*b.center_m, *b.size_m], rtol=0.0, atol=scale)
-    return bool(close and abs(math.remainder(a.angle_rad - b.angle_rad, math.tau)) <= 1e-3)
-
-
 def _refuse_gaps(content: Sequence[Scan | Spectrum]) -> None:
     """Raises FileError: lines that were never scanned, of a scan that was broken off."""
     for one in content:
-        missing = int(np.isnan(one.values).all(axis=1).sum()) if isinstance(one, Scan) else 0
-        if missing:
+        if missing := lines_missing(one):
             raise FileError(f"{missing} of its {one.values.shape[0]} lines were not scanned")
