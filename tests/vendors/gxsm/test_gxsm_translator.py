@@ -144,7 +144,7 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
 @pytest.mark.parametrize("version", [3, 4])
 def test_lines_come_while_it_scans(bench: Make, version: int) -> None:
     """Of the second scan on: only files tell what channels are called."""
-    made = bench(speed=20.0, version=version)
+    made = bench(speed=5.0, version=version)
     peer = made.start(live_lines_s=1.0)
     ready(peer, shape=(40, 32))
     assert peer.act(names.START_SCAN).ok

@@ -96,7 +96,7 @@ def test_one_scan_after_the_other_each_its_own(bench: Make) -> None:
 
 
 def test_lines_come_while_it_scans(bench: Make) -> None:
-    made = bench(speed=20.0)
+    made = bench(speed=5.0)
     peer = made.start(live_lines_s=1.0)
     ready(peer, shape=(40, 32))
     assert peer.set(names.SCAN_DIRECTION, "down").ok
