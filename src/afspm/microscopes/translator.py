@@ -390,8 +390,10 @@ def run_translator(microscope: Microscope, context: Context, make: Callable[...,
     from afspm.transport.launching import open_server_port
 
     launch = context.launch
-    # saved several times with each request: it is for a kill, and after a power cut no request is waiting any more
+    # saved several times with each request: all of it is for a kill, after a power cut no request is waiting any more
     memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None, synced=False)
+    if memory.damage:
+        context.log.error("what it knew is damaged, the generation before is taken up: %s", memory.damage)
     port = open_server_port(launch, context.clock)
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     run_dir = Path(launch.run_dir or ".")

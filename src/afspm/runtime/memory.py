@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Any
 
-from afspm.errors import FileError, InvalidValue
+from afspm.errors import InvalidValue
+from afspm.record.whole import Generations, load, write_whole
 
 
 class Memory(MutableMapping[str, Any]):
@@ -17,8 +16,11 @@ class Memory(MutableMapping[str, Any]):
 
     Args:
         path: the file; None keeps nothing over a restart.
-        synced: whether saving waits for the disk, which takes ten milliseconds and more, so that it outlives a power
-            cut. A kill, of any process, it outlives in any case.
+        synced: whether saving waits for the disk, which takes ten milliseconds and more, so that all of it outlives a
+            power cut. If not, what was saved a second before that does. A kill, of any process, it outlives anyway.
+
+    Attributes:
+        damage: what was wrong with the file, where the generation before was taken up in its place; "" else.
 
     Raises:
         FileError: the file can't be read, or holds something else.
@@ -26,8 +28,12 @@ class Memory(MutableMapping[str, Any]):
 
     def __init__(self, path: Path | None, *, synced: bool = True) -> None:
         self._path = path
-        self._synced = synced
-        self._values = _load(path) if path else {}
+        self._generations = Generations(path) if path and not synced else None
+        self.damage = ""
+        self._values: dict[str, Any] = {}
+        if path is not None:
+            values, self.damage = load(path, _read)
+            self._values = values or {}
 
     def save(self) -> None:
         """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
@@ -42,8 +48,10 @@ class Memory(MutableMapping[str, Any]):
             raise InvalidValue(
                 f"a value can't be kept: {error}", where="memory", hint="keep numbers, texts, lists and dicts"
             ) from error
-        if self._path is not None:
-            write_whole(self._path, [text.encode()], synced=self._synced)
+        if self._generations is not None:
+            self._generations.save(text.encode())
+        elif self._path is not None:
+            write_whole(self._path, [text.encode()])
 
     def __getitem__(self, key: str) -> Any:
         return self._values[key]
@@ -66,37 +74,8 @@ class Memory(MutableMapping[str, Any]):
         return f"<Memory {self._values!r}>"
 
 
-def write_whole(path: Path, parts: list[bytes], *, synced: bool = True) -> None:
-    """Write a file so that it is there completely or as it was before, whenever the process is killed.
-
-    Args:
-        synced: the same of a power cut; that waits for the disk.
-
-    Raises:
-        FileError: it can't be written.
-    """
-    new = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with new.open("wb") as file:
-            file.writelines(parts)
-            if synced:
-                file.flush()
-                os.fsync(file.fileno())
-        new.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            new.unlink()
-        raise FileError(f"can't be written: {error}", where=str(path)) from error
-
-
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        values = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to start anew") from error
+def _read(content: bytes) -> dict[str, Any]:
+    values = json.loads(content)
     if not isinstance(values, dict):
-        raise FileError("is not what a component remembers", where=str(path), hint="remove it to start anew")
+        raise ValueError("it is not what a component remembers")
     return values

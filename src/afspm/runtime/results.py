@@ -12,7 +12,8 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
-from afspm.runtime.memory import Memory, write_whole
+from afspm.record.whole import write_whole
+from afspm.runtime.memory import Memory
 
 _MAGIC = b"afspm-result-1\n"
 _LENGTH = struct.Struct("<Q")

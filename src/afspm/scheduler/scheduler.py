@@ -114,6 +114,7 @@ class Scheduler:
         finally:
             sockets.close()
             shell.close()
+            state.close()
         return _ENDED if shell.ended else _ORPHAN
 
     def _settings(self, context: SchedulerContext) -> SchedulerSettings:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import FileError
+from afspm.record.whole import Generations, load
 
 
 class StateFile:
@@ -19,26 +20,29 @@ class StateFile:
 
     def __init__(self, path: Path | None, log: logging.Logger) -> None:
         self.path = path
+        self._generations = None if path is None else Generations(path)
         self._log = log
 
     def load(self) -> dict[str, Any]:
         """What was saved last; empty if nothing was.
 
+        If that is damaged, as a power cut may leave it, the generation before is taken up: the mode, and the problems
+        that stand, but nobody in control. Who was then may not be now, and asks again.
+
         Raises:
-            FileError: there is a file that can't be read. To begin without it could give control to two.
+            FileError: neither can be read. To begin without a problem that is flagged could cost a tip.
         """
-        if self.path is None or not self.path.exists():
+        if self.path is None:
             return {}
-        try:
-            state = json.loads(self.path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise FileError(
-                f"what was in force before the restart can't be read: {error}",
-                where=str(self.path),
-                hint="delete the file to begin with nobody in control",
-            ) from error
-        if not isinstance(state, dict):
-            raise FileError("this is not the state of a scheduler", where=str(self.path), hint="delete the file")
+        state, damage = load(self.path, _read)
+        if state is None:
+            return {}
+        if damage:
+            self._log.critical(
+                "what was in force is damaged, the generation before is taken up, with nobody in control: %s", damage
+            )
+            control = {**state["control"], "holder": None, "solving": 0}
+            state = {**state, "control": control, "granted_to": None}
         return state
 
     def save(self, state: dict[str, Any]) -> None:
@@ -46,12 +50,21 @@ class StateFile:
 
         A disk that is full must not end the experiment: it is said, and the experiment goes on.
         """
-        if self.path is None:
+        if self._generations is None:
             return
-        aside = self.path.with_suffix(".new")
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            aside.write_text(json.dumps(state, ensure_ascii=False), encoding="utf-8")
-            aside.replace(self.path)
-        except OSError as error:
-            self._log.critical("a restart would not know what is in force now: %s: %s", self.path, error)
+            self._generations.save(json.dumps(state, ensure_ascii=False).encode())
+        except FileError as error:
+            self._log.critical("a restart would not know what is in force now: %s", error)
+
+    def close(self) -> None:
+        """Make sure that what was saved last is on the disk."""
+        if self._generations is not None:
+            self._generations.close()
+
+
+def _read(content: bytes) -> dict[str, Any]:
+    state = json.loads(content)
+    if not isinstance(state, dict) or not isinstance(state.get("control"), dict):
+        raise ValueError("it is not the state of a scheduler")
+    return state

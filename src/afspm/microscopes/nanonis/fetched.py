@@ -16,7 +16,7 @@ from afspm.errors import ConfigError, FileError
 from afspm.microscopes.nanonis.groups import Ask
 from afspm.microscopes.nanonis.listener import CurveEnded
 from afspm.model import Region, Scan, ScanLines, Spectrum
-from afspm.runtime.memory import write_whole
+from afspm.record.whole import write_whole
 
 SUFFIX: Final = ".npz"
 ROWS: Final = ("top-first", "recorded")

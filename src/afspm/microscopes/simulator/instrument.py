@@ -25,7 +25,7 @@ from afspm.microscopes.simulator.faults import Faults
 from afspm.microscopes.simulator.files import Measured, encode_scan, encode_spectrum
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
-from afspm.runtime.memory import write_whole
+from afspm.record.whole import write_whole
 from afspm.simulation import SimulatedScan, World
 
 LISTED_RESULTS = 16

@@ -1,0 +1,119 @@
+"""Files that are replaced as a whole: whoever reads finds what was there before or what is there now."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TypeVar
+
+from afspm.errors import FileError
+
+T = TypeVar("T")
+
+PERIOD_S = 1.0
+"""Real time between two generations that are made sure to be on the disk."""
+
+
+def write_whole(path: Path, parts: Iterable[bytes], *, synced: bool = True) -> None:
+    """Write a file so that it is there completely or as it was before, whenever the process is killed.
+
+    Args:
+        synced: the same of a power cut; that waits for the disk.
+
+    Raises:
+        FileError: it can't be written.
+    """
+    new = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with new.open("wb") as file:
+            file.writelines(parts)
+            if synced:
+                file.flush()
+                os.fsync(file.fileno())
+        new.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            new.unlink()
+        raise FileError(f"can't be written: {error}", where=str(path)) from error
+
+
+def former(path: Path) -> Path:
+    """The generation before, of a file that `Generations` keeps."""
+    return path.with_name(f"{path.name}.old")
+
+
+class Generations:
+    """A small file that is saved too often to wait for the disk each time, and is to outlive a power cut all the same.
+
+    What was saved last outlives a kill of any process. A power cut may leave it damaged, or empty; then there is the
+    generation before, some `period_s` older, which a thread has made sure of.
+    """
+
+    def __init__(self, path: Path, period_s: float = PERIOD_S) -> None:
+        self.path = path
+        self._period_s = period_s
+        self._newest: bytes | None = None
+        self._changed = threading.Condition()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def save(self, content: bytes) -> None:
+        """Replace the file. Raises FileError."""
+        write_whole(self.path, [content], synced=False)
+        with self._changed:
+            self._newest = content
+            self._changed.notify()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="generations", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Make sure of what was saved last. Safe to repeat."""
+        self._closing.set()
+        with self._changed:
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._newest is not None or self._closing.is_set())
+                newest, self._newest = self._newest, None
+            if newest is None:
+                return
+            with contextlib.suppress(FileError):  # a full disk is told of by who saves
+                write_whole(former(self.path), [newest])
+            self._closing.wait(self._period_s)
+
+
+def load(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
+    """What `Generations` saved; None if there is no such file.
+
+    Args:
+        read: makes something of the file; raises ValueError, KeyError or TypeError if it is damaged.
+
+    Returns:
+        What was read, and what was wrong with the file itself, if it is the generation before: "" else.
+
+    Raises:
+        FileError: the file can't be read, and there is no generation before that can.
+    """
+    try:
+        return read(path.read_bytes()), ""
+    except FileNotFoundError:
+        return None, ""
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        damage = f"{error!r}"
+    try:
+        return read(former(path).read_bytes()), damage
+    except (OSError, ValueError, KeyError, TypeError):
+        raise FileError(
+            f"can't be read, and there is no generation before it: {damage}",
+            where=str(path),
+            hint="remove it to start anew",
+        ) from None

@@ -1,0 +1,119 @@
+"""A file that is saved often outlives a kill as it is, and a power cut as it was a moment before."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+
+from afspm.errors import FileError
+from afspm.record.whole import Generations, former, load
+from afspm.runtime.memory import Memory
+from afspm.scheduler.state_file import StateFile
+
+CUT = [b"", b"\0" * 40, b'{"control": {"mo']
+"""What a power cut may leave of a file that was not synced."""
+
+
+def saved(path: Path, *contents: bytes) -> None:
+    """Saved one after the other, each made sure of."""
+    for content in contents:
+        kept = Generations(path)
+        kept.save(content)
+        kept.close()
+
+
+def number(content: bytes) -> int:
+    return int(content)
+
+
+def test_what_was_saved_last_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "x"
+    saved(path, b"1", b"2")
+    assert load(path, number) == (2, "")
+
+
+def test_what_was_closed_is_there_twice(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = Generations(path)
+    for n in range(50):
+        kept.save(b"%d" % n)
+    kept.close()
+    kept.close()
+    assert (path.read_bytes(), former(path).read_bytes()) == (b"49", b"49")
+
+
+def test_while_it_is_saved_the_generation_before_is_made_sure_of_by_itself(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = Generations(path, period_s=0.001)
+    n = 0
+    while not former(path).exists() or int(former(path).read_bytes()) < 5:
+        n += 1
+        kept.save(b"%d" % n)
+    kept.close()
+
+
+@pytest.mark.parametrize("left", CUT)
+def test_after_a_power_cut_the_generation_before_is_read_and_that_is_told(tmp_path: Path, left: bytes) -> None:
+    path = tmp_path / "x"
+    saved(path, b"1")
+    path.write_bytes(left)
+    value, damage = load(path, number)
+    assert value == 1
+    assert damage
+
+
+def test_where_neither_can_be_read_nothing_is_guessed(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    saved(path, b"1")
+    path.write_bytes(b"")
+    former(path).write_bytes(b"")
+    with pytest.raises(FileError, match="remove it"):
+        load(path, number)
+
+
+def test_a_file_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    saved(path, b"1")
+    path.unlink()
+    assert load(path, number) == (None, "")
+
+
+@pytest.mark.parametrize("left", CUT)
+def test_a_scheduler_after_a_power_cut_knows_the_problems_and_gives_control_to_nobody(
+    tmp_path: Path, left: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = logging.getLogger("scheduler")
+    path = tmp_path / "scheduler.json"
+    state = {"control": {"mode": 1, "holder": "series", "solving": 3, "problems": {"3": "a"}, "ended": False}}
+    file = StateFile(path, log)
+    file.save({**state, "granted_to": "token", "last_ns": 7})
+    file.close()
+    assert StateFile(path, log).load()["control"]["holder"] == "series"
+    assert not caplog.records
+    path.write_bytes(left)
+    again = StateFile(path, log).load()
+    assert again["control"] == {**state["control"], "holder": None, "solving": 0}
+    assert (again["granted_to"], again["last_ns"]) == (None, 7)
+    assert "nobody in control" in caplog.text
+
+
+def test_what_is_saved_without_waiting_for_the_disk_has_a_generation_before(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "microscope.json", synced=False)
+    memory["tip"] = "blunt"
+    memory.save()
+    assert memory._generations is not None
+    memory._generations.close()
+    assert (
+        Memory(tmp_path / "microscope.json").damage,
+        json.loads(former(tmp_path / "microscope.json").read_bytes()),
+    ) == (
+        "",
+        {"tip": "blunt"},
+    )
+    (tmp_path / "microscope.json").write_bytes(b"")
+    again = Memory(tmp_path / "microscope.json", synced=False)
+    assert again["tip"] == "blunt"
+    assert again.damage
