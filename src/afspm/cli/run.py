@@ -45,6 +45,9 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check, say what would be started, and start nothing.")
     ] = False,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Write report.html when it has ended.", show_default=False)
+    ] = True,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details too.")] = False,
 ) -> None:
     """Run an experiment.
@@ -65,6 +68,7 @@ def run(
         only=names_in(only),
         without=names_in(without),
         speed=speed,
+        report=report,
         log_level=logging.DEBUG if verbose else logging.INFO,
     )
     if resume is not None:

@@ -16,7 +16,8 @@ from afspm.experiment.wiring import connectable
 from afspm.record import ahead
 from afspm.runtime.connect import ENDED, GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
-from afspm.supervisor import common_clock, reporting, run_folder, summary
+from afspm.supervisor import aftermath, common_clock, reporting, run_folder, summary
+from afspm.supervisor.aftermath import Ended
 from afspm.supervisor.log import SUPERVISOR, RunLog
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.supervisor import Outcome, Supervisor
@@ -33,6 +34,7 @@ class Options:
         runs: the folder of run folders.
         only, without: names of processes to start, or not to start, on this computer.
         speed: experiment seconds in a real second, instead of the file's; for simulated microscopes only.
+        report: whether the report is written when it has ended.
         log_level: of `logging`; what is shown in the terminal, and what the processes write at all.
     """
 
@@ -40,6 +42,7 @@ class Options:
     only: Collection[str] = ()
     without: Collection[str] = ()
     speed: float | None = None
+    report: bool = True
     log_level: int = logging.INFO
 
 
@@ -98,6 +101,14 @@ def go(
         run_folder.write_run(folder, {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()})
         for line in summary.lines(outcome, folder):
             log.write(SUPERVISOR, logging.INFO, line)
+        aftermath.follow(
+            experiment,
+            Ended(name, folder, outcome, experiment.resolved.simulated),
+            starts,
+            clock,
+            log,
+            with_report=options.report,
+        )
     finally:
         log.close()
     return Run(folder, outcome)

@@ -19,7 +19,8 @@ def run(tmp_path: Path) -> Iterator[Run]:
         file.write_text(EXPERIMENT.format(scans=scans, speed=speed) + more, encoding="utf-8")
         overlay = tmp_path / "overlay.toml"
         overlay.write_text(over, encoding="utf-8")
-        command = (*AFSPM, "run", str(file), str(overlay), "--runs", str(tmp_path / "runs"), "--verbose", *options)
+        files, folder = (str(file), str(overlay)), str(tmp_path / "runs")
+        command = (*AFSPM, "run", *files, "--runs", folder, "--verbose", "--no-report", *options)
         # in a group of its own, so that a Ctrl-C for it is not one for the tests
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=tmp_path

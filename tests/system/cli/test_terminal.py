@@ -1,0 +1,179 @@
+"""The commands of the terminal on a running experiment."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.cli.joining import NOT_RUNNING, person
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+AFSPM = (sys.executable, "-m", "afspm")
+DEADLINE_S = 30.0
+EXPERIMENT = """
+name = "night"
+
+[clock]
+speed = 60.0
+
+[microscope]
+component = true
+class = "Simulator"
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[series]
+component = true
+class = "ScanSeries"
+size = ["1 um", "1 um"]
+pixels = [16, 16]
+every = "10 min"
+scans = 1000
+"""
+
+
+def afspm(*arguments: object, answer: str = "") -> subprocess.CompletedProcess[str]:
+    command = [*AFSPM, *map(str, arguments)]
+    environment = {**os.environ, "COLUMNS": "200", "PYTHONIOENCODING": "utf-8"}
+    return subprocess.run(
+        command, capture_output=True, text=True, encoding="utf-8", input=answer, timeout=DEADLINE_S, env=environment
+    )
+
+
+class Running:
+    """An experiment under way, and its output so far."""
+
+    def __init__(self, folder: Path) -> None:
+        file = folder / "experiment.toml"
+        file.write_text(EXPERIMENT, encoding="utf-8")
+        self.runs = folder / "runs"
+        self.output: list[str] = []
+        self.process = subprocess.Popen(
+            [*AFSPM, "run", str(file), "--runs", str(self.runs), "--verbose"],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", start_new_session=True,
+        )  # fmt: skip
+
+    def wait_for(self, pattern: str) -> None:
+        """Read on until a line matches."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.output.append(line)
+            if re.search(pattern, line):
+                return
+        raise AssertionError(f"{pattern} never came:\n{''.join(self.output)}")
+
+    def status(self) -> dict[str, Any]:
+        told: dict[str, Any] = json.loads(afspm("status", self.runs, "--json").stdout)
+        return told
+
+    def until(self, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The status, once something holds of it; each look waits for the scheduler's answer."""
+        for _ in range(40):
+            if holds(told := self.status()):
+                return told
+        raise AssertionError(f"never so: {told}")
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    running = Running(tmp_path_factory.mktemp("terminal"))
+    try:
+        running.wait_for(r"scan 1 of")
+        yield running
+    finally:
+        running.process.send_signal(signal.SIGINT)
+        running.process.communicate(timeout=DEADLINE_S)
+
+
+def test_status_says_who_is_in_control_and_how_far_it_is(night: Running) -> None:
+    said = afspm("status", night.runs)
+    assert said.returncode == 0, said.stderr
+    for words in ("night", "SIMULATED", "AUTOMATED", "microscope", "series: ", "of 1000"):
+        assert words in said.stdout
+    assert "\x1b" not in said.stdout  # no colours where there is no terminal
+    told = night.status()
+    assert told["mode"] == "AUTOMATED"
+    assert told["progress"]["series"]["of"] == 1000
+    assert told["progress"]["series"]["remaining_s"] > 0
+
+
+def test_status_tells_of_the_processes(night: Running) -> None:
+    told = night.until(lambda told: len(told["processes"]) >= 3)
+    assert {"microscope", "scheduler", "series"} <= {one["name"] for one in told["processes"]}
+
+
+def test_pause_and_resume_are_manual_and_automated(night: Running) -> None:
+    assert "afspm resume" in afspm("pause", night.runs).stdout
+    paused = night.status()
+    assert paused["mode"] == "MANUAL"
+    assert afspm("resume", night.runs).returncode == 0
+    assert night.until(lambda told: told["mode"] == "AUTOMATED")["problems"] == []
+
+
+def test_a_problem_is_flagged_and_cleared_by_the_person(night: Running) -> None:
+    assert afspm("problems", night.runs, "--flag", "thermal-drift").returncode == 0
+    listed = afspm("problems", night.runs).stdout
+    assert "thermal-drift, for" in listed
+    assert f"flagged by {person()}" in listed
+    assert afspm("problems", night.runs, "--clear", "thermal-drift").returncode == 0
+    assert "no problem is flagged" in afspm("problems", night.runs).stdout
+
+
+def test_a_misspelt_problem_is_an_error_with_the_nearest(night: Running) -> None:
+    said = afspm("problems", night.runs, "--flag", "thermal-drit")
+    assert said.returncode == 1
+    assert "did you mean 'thermal-drift'?" in said.stderr
+
+
+def test_watch_without_a_terminal_writes_a_line_whenever_something_changes(night: Running) -> None:
+    watching = subprocess.Popen([*AFSPM, "watch", str(night.runs)], stdout=subprocess.PIPE, text=True, encoding="utf-8")
+    try:
+        assert watching.stdout is not None
+        assert "AUTOMATED" in watching.stdout.readline()
+        assert afspm("pause", night.runs).returncode == 0
+        assert any("MANUAL" in line for line in watching.stdout)
+        assert afspm("resume", night.runs).returncode == 0
+        assert any("AUTOMATED" in line for line in watching.stdout)
+    finally:
+        watching.kill()
+        watching.communicate(timeout=DEADLINE_S)
+
+
+def test_end_asks_first(night: Running) -> None:
+    said = afspm("end", night.runs, answer="n\n")
+    assert said.returncode == 1
+    assert night.status()["mode"] == "AUTOMATED"
+
+
+def test_status_survives_the_restart_of_the_scheduler(night: Running) -> None:
+    pid = next(one["pid"] for one in night.until(lambda t: t["processes"])["processes"] if one["name"] == "scheduler")
+    os.kill(pid, signal.SIGKILL)
+    told = night.until(lambda t: any(one["name"] == "scheduler" and one["starts"] == 2 for one in t["processes"]))
+    assert told["mode"] == "AUTOMATED"
+
+
+def test_where_nothing_runs_that_is_said(tmp_path: Path) -> None:
+    said = afspm("status", tmp_path)
+    assert said.returncode == NOT_RUNNING
+    assert "nothing runs here" in said.stderr
+
+
+def test_end_ends_it_and_then_nothing_runs(night: Running) -> None:
+    assert afspm("end", "--yes", night.runs).returncode == 0
+    night.wait_for(r"everything is in")
+    assert night.process.wait(DEADLINE_S) == 0
+    for command in ("status", "watch", "pause", "resume", "problems"):
+        said = afspm(command, night.runs)
+        assert said.returncode == NOT_RUNNING, said.stderr
+        assert "has ended (" in said.stderr
