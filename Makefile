@@ -20,9 +20,10 @@ demo: $(SETUP)
 demo-drift: $(SETUP)
 	@$(BIN)/afspm run experiments/drift_night/experiment.toml
 
-## all tests
+## all tests: more at a time than there are cores, since many of them wait. Tests and modules stay compiled
+TESTS_AT_A_TIME ?= 4
 test: $(SETUP)
-	@$(BIN)/pytest -n 2 --dist loadgroup
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME)
 
 ## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
 TRANSLATORS ?= simulator image nanonis asylum gxsm

@@ -24,7 +24,7 @@ duration = "90 min"
 SCANS = 10
 
 pytest.importorskip("matplotlib")
-pytestmark = [pytest.mark.timeout(180), pytest.mark.xdist_group("tip repair")]  # one night for all
+pytestmark = pytest.mark.timeout(180)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from drift_rig import Rig, Surveyed, surveyed, table, worker_of
 
-pytestmark = [pytest.mark.timeout(180), pytest.mark.xdist_group("drift")]
+pytestmark = pytest.mark.timeout(180)
 KNOWN_M = 2e-9
 """How well a scan is known to lie; a pixel is 16 nm."""
 PLACED_M = 20e-9

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from runtime_lab import Lab, run
 from tip_scans_lab import channels
 
@@ -15,8 +14,6 @@ from afspm.model import ControlRequest, Problem, Scan
 from afspm.runtime.exit_codes import ExitCode
 
 TIP = Problem.TIP_SHAPE_CHANGED
-
-pytestmark = pytest.mark.xdist_group("tips")
 
 
 def publish_at(lab: Lab, at_s: float, pair: tuple[Scan, Scan]) -> None:

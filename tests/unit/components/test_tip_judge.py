@@ -16,8 +16,6 @@ from afspm.model import Scan
 LEARN = 3
 FLAWS = ("double", "blunt", "contaminated")
 
-pytestmark = pytest.mark.xdist_group("tips")  # the scans are simulated once a process
-
 
 def judged(judge: TipJudge, pair: tuple[Scan, Scan]) -> Verdict:
     return judge.judge(pair[0].values, pair[1].values, pair[0].region)
