@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,10 @@ AS_MODEL = {
     "ScopeStateMsg",
     "ControlState",
     "ScanLines",
+    "JournalEntries",
+    "ProcessStates",
+    "LogLines",
+    "Progress",
 }
 
 
@@ -71,8 +76,8 @@ def _presence(message: Any) -> Any:
 
 def _same(a: Any, b: Any) -> None:
     assert type(a) is type(b)
-    for name, value in vars(a).items():
-        other = getattr(b, name)
+    for name in (field.name for field in fields(a)):
+        value, other = getattr(a, name), getattr(b, name)
         if isinstance(value, np.ndarray):
             np.testing.assert_array_equal(value, other)
         elif isinstance(value, model.Region):
