@@ -78,6 +78,9 @@ class TipCorrector(Component):
         self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
+        pulses = (names.PULSE,) if pulse_voltages else ()
+        crashes = (names.CRASH,) if crash_depths else ()
+        self.needs_actions = (names.START_SCAN, *pulses, *crashes)
         self.place_spacing, self.keep_away = place_spacing, keep_away
         self.problem = problem
         if place_spacing <= 0.0 or keep_away < 0.0:

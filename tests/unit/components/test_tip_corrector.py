@@ -104,6 +104,12 @@ def test_what_is_done_is_done_away_from_the_scans_at_a_fresh_place_and_told() ->
     assert told == ["x-pulse", "x-pulse", "x-crash"]
 
 
+def test_what_it_may_do_to_a_tip_the_microscope_has_to_be_able_to() -> None:
+    assert corrector().needs_actions == ("start-scan", "x-pulse", "x-crash")
+    assert corrector(crash_depths=()).needs_actions == ("start-scan", "x-pulse")
+    assert corrector(pulse_voltages=()).needs_actions == ("start-scan", "x-crash")
+
+
 def test_an_unclear_verdict_is_looked_at_again_without_another_treatment() -> None:
     lab = repaired([UNCLEAR, GOOD])
     assert len(lab.actions) == 1
