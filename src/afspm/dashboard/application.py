@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,7 +38,6 @@ def application(
     encrypted: bool,
 ) -> tuple[App, Callable[[float], bool]]:
     """The application, once a process; and what waits until all pages have been told of the end, so many seconds."""
-    os.environ.setdefault("NICEGUI_STORAGE_PATH", str(Path(os.devnull).parent / "afspm-keeps-nothing"))
     from fastapi import FastAPI
     from fastapi.staticfiles import StaticFiles
     from nicegui import ui

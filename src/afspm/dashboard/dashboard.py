@@ -66,7 +66,7 @@ class Dashboard(Component):
         state_dir = Path(launch.state_dir) if launch.state_dir else None
         secret = secret_in(state_dir / f"{self.name}.secret" if state_dir else None)
         access = Access(self._host, self._password_hash, ExperimentClock.real().now_s, secret)
-        bound = listening(self._host, self._port, self._usual_ports())
+        bound = listening(self._host, self._port or None, self._usual_ports())
         self._watch = Watch(self.clock, self._context.problems)
         self._steering = Steering(launch, self.clock, self._watch)
         folder = self.run_dir if launch.run_dir else None
@@ -98,8 +98,10 @@ class Dashboard(Component):
         self._server.stop()
 
     def _usual_ports(self) -> tuple[int, ...]:
+        """The one of our earlier life, where the page in a browser looks for us."""
         before = self.memory.get("port")
-        return (before, USUAL_PORT) if isinstance(before, int) else (USUAL_PORT,)
+        earlier = (before,) if isinstance(before, int) else ()
+        return earlier if self._port == 0 else (*earlier, USUAL_PORT)
 
     def _say_where(self, port: int) -> None:
         scheme = "http" if self._certificate is None else "https"

@@ -59,6 +59,7 @@ class Page:
         self._spectra_shown: tuple[object, ...] = ()
         ui.page_title(services.title)
         ui.add_head_html(_HEAD)
+        ui.colors(primary="#0b6e72", negative="#b3261e", positive="#2f7d46")
         self._dark = ui.dark_mode(None)
         self._theme = ""
         self._header()

@@ -23,7 +23,7 @@ def listening(host: str, port: int | None, wanted: Iterable[int] = (USUAL_PORT,)
     """A socket that listens at `host`.
 
     Args:
-        port: 0 for any that is free; None: the first of `wanted` that is free, or any.
+        port: None: the first of `wanted` that is free, or any.
 
     Raises:
         ConfigError: no such address, or the port is taken.

@@ -115,4 +115,5 @@ SHORT_NAME_PACKAGES: Final[tuple[str, ...]] = (
     "afspm.emulators.nanonis",
     "afspm.emulators.asylum",
     "afspm.emulators.gxsm",
+    "afspm.dashboard",
 )

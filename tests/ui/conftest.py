@@ -1,0 +1,98 @@
+"""A real browser: Debian's chromium, driven by Playwright. Where there is none these tests are skipped."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ui_lab import SCREENSHOTS, Night
+
+NO_BROWSER = (
+    "no chromium is found: `apt install chromium` (or another way to have it; AFSPM_CHROMIUM=/path says where), "
+    "and the package playwright"
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.is_relative_to(here):  # one browser, one experiment: one after the other
+            item.add_marker(pytest.mark.xdist_group("ui"))
+            item.add_marker(pytest.mark.timeout(180))
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A browser without a window."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason=NO_BROWSER)
+    named = os.environ.get("AFSPM_CHROMIUM")
+    program = named or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip(NO_BROWSER)
+    with sync_api.sync_playwright() as playwright:
+        # in a container it has no sandbox of its own
+        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def night(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
+    """An experiment that runs: one for all tests of a module. (After the browser: without one nothing is started.)"""
+    one = Night(tmp_path_factory.mktemp("night"))
+    yield one
+    one.close()
+
+
+Opened = Callable[..., Any]
+
+
+@pytest.fixture
+def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[Opened]:
+    """`opened(night.url, person="Ada")`: the page in a window of its own; what went wrong in it fails the test."""
+    contexts = []
+    wrong: list[str] = []
+
+    def open_(url: str, person: str = "", width: int = 1500, height: int = 1000, theme: str = "light") -> Any:
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, color_scheme=theme, has_touch=width < 500
+        )
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(15_000)
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("request", lambda asked: _only_ours(asked.url, url, wrong))
+        if person:
+            page.goto(f"{url}/login")
+            page.fill("#person", person)
+            page.click("button")
+        else:
+            page.goto(url)
+        page.wait_for_selector("text=is in control")
+        return page
+
+    yield open_
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    for context in contexts:
+        context.close()
+    assert not wrong
+
+
+def _only_ours(asked: str, url: str, wrong: list[str]) -> None:
+    if not asked.startswith((url, url.replace("http", "ws", 1), "data:", "blob:")):
+        wrong.append(f"asked for {asked}")
+
+
+@pytest.fixture
+def keep() -> Callable[[Any, str], None]:
+    """Keep a screenshot in build/screenshots."""
+
+    def screenshot(page: Any, name: str) -> None:
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=SCREENSHOTS / f"{name}.png", full_page=True)
+
+    return screenshot

@@ -1,0 +1,64 @@
+"""The dashboard may be killed, the scheduler too, and the experiment ends: the page says so each time."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+from ui_lab import Night
+
+from afspm.model import ProcessCondition
+from conftest import Opened
+
+
+def pid_of(night: Night, name: str) -> int:
+    state = night.until(lambda: (s := night.follower.overview.processes.get(name)) and s.pid and s)
+    return int(state.pid)
+
+
+def test_a_killed_dashboard_is_back_at_the_same_address_and_so_is_the_page(
+    night: Night, opened: Opened, keep: object
+) -> None:
+    page = opened(night.url, person="Ada")
+    page.wait_for_selector("[role=rowheader]")
+    before = pid_of(night, "dashboard")
+    os.kill(before, signal.SIGKILL)
+    page.wait_for_selector("#trouble:has-text('connection to the dashboard is lost')")
+    night.until(lambda: night.follower.overview.processes["dashboard"].pid not in (0, before))
+    page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
+    page.wait_for_selector("nav.who:has-text('Ada')")  # who has signed in stays so
+    page.wait_for_selector("text=is in control")
+
+
+def test_data_that_are_old_are_said_to_be(night: Night, opened: Opened) -> None:
+    page = opened(night.url)
+    page.wait_for_selector("#trouble", state="hidden")
+    # the one who would start it anew, too: together they are a computer that stands still
+    frozen = (night.process.pid, pid_of(night, "scheduler"))
+    for pid in frozen:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        page.wait_for_selector("#trouble:has-text('No word from the experiment for')", timeout=40_000)
+    finally:
+        for pid in reversed(frozen):
+            os.kill(pid, signal.SIGCONT)
+    page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
+
+
+def test_the_end_is_asked_for_twice_and_then_told(night: Night, opened: Opened, keep: object) -> None:
+    page = opened(night.url, person="Ada")
+    page.click("button:has-text('End the experiment')")
+    page.click(".question button:has-text('End it')")
+    page.wait_for_selector(".question:has-text('Really?')")
+    page.click(".question:has-text('Really?') button:has-text('Cancel')")
+    page.locator(".question:has-text('Really?')").wait_for(state="detached")
+    condition = night.follower.overview.processes["series"].condition
+    assert condition is not ProcessCondition.ENDED
+    assert night.process.poll() is None
+    page.click("button:has-text('End the experiment')")
+    page.click(".question button:has-text('End it')")
+    page.click("button:has-text('Yes, end the experiment')")
+    assert night.process.wait(40.0) == 0
+    page.wait_for_selector("#trouble:has-text('The experiment has ended')")
+    assert callable(keep)
+    keep(page, "ended")

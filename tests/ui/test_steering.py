@@ -1,0 +1,218 @@
+"""Each button does what it says, in the name of the person, as the scheduler's own messages tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from ui_lab import Night
+
+from afspm.model import ControlMode, ControlResponse, ProcessCondition, ScopeState
+from conftest import Opened
+
+ADA = "dashboard:Ada"
+
+
+@pytest.fixture
+def page(night: Night, opened: Opened) -> Iterator[Any]:
+    """The page of somebody who has signed in, in AUTOMATED mode."""
+    page = opened(night.url, person="Ada")
+    page.wait_for_selector("button:has-text('Take over')")
+    yield page
+    if page.locator("button:has-text('Hand back')").is_visible():
+        page.click("button:has-text('Hand back')")
+    night.until(lambda: night.control().mode is ControlMode.AUTOMATED)
+
+
+def press(page: Any, text: str) -> None:
+    page.get_by_role("button", name=text, exact=True).click()
+
+
+def take_over(page: Any, night: Night) -> None:
+    press(page, "Take over: MANUAL")
+    night.until(lambda: night.control().mode is ControlMode.MANUAL)
+    page.wait_for_selector("button:visible:has-text('Scan as set')")
+
+
+def seen(night: Night) -> int:
+    """How many journal entries there are, to look only for those after."""
+    night.follower.pump(0.0)
+    return len(night.follower.overview.entries)
+
+
+def said(page: Any, text: str) -> None:
+    """Wait until the page says so."""
+    page.wait_for_selector(f".outcomes >> text={text}")
+
+
+def choose(page: Any, label: str, option: str) -> None:
+    page.click(f".q-field:visible:has(input[aria-label='{label}'])")
+    page.click(f".q-menu .q-item:text-is('{option}'), .q-menu .q-item:has(:text-is('{option}'))")
+
+
+def test_a_person_takes_over_and_hands_back(night: Night, page: Any, keep: Any) -> None:
+    after = seen(night)
+    take_over(page, night)
+    assert night.control().holder is None
+    assert night.entry(ADA, "MANUAL", after=after).response == 0
+    page.wait_for_selector("[data-part=mode]:text-is('MANUAL')")
+    keep(page, "manual")
+    press(page, "Hand back: AUTOMATED")
+    night.until(lambda: night.control().mode is ControlMode.AUTOMATED)
+    page.wait_for_selector("[data-part=mode]:text-is('AUTOMATED')")
+
+
+def test_a_problem_is_raised_and_cleared(night: Night, page: Any) -> None:
+    choose(page, "problem", "drop-on-the-table")
+    press(page, "Raise")
+    night.until(lambda: 9 in night.control().problems)
+    page.wait_for_selector("[data-part=problem]:has-text('drop-on-the-table (flagged by dashboard:Ada)')")
+    page.wait_for_selector(".lane > b:text-is('drop-on-the-table')")
+    press(page, "Clear drop-on-the-table")
+    night.until(lambda: 9 not in night.control().problems)
+    page.locator("[data-part=problem]").wait_for(state="detached")
+
+
+def test_parameters_are_read_and_set_and_refusals_give_their_reason(night: Night, page: Any, keep: Any) -> None:
+    take_over(page, night)
+    choose(page, "parameter", "tip-bias-voltage")
+    page.wait_for_selector("text=/tip-bias-voltage is .*V/")
+    page.fill("input[aria-label='value with unit']", "1250 mV")
+    page.press("input[aria-label='value with unit']", "Enter")
+    said(page, "tip-bias-voltage is now 1.25 V")
+    after = seen(night)
+    page.fill("input[aria-label='value with unit']", "7 V")
+    press(page, "Set")
+    page.wait_for_selector(".outcomes .refused")
+    refusal = night.entry(ADA, "tip-bias-voltage", after=after)
+    assert refusal.refused
+    assert refusal.reason in page.inner_text(".outcomes")
+    assert "above the highest allowed, 3 V" in refusal.reason
+    page.wait_for_selector(".refusals >> text=tip-bias-voltage = 7.0 V")
+    keep(page, "refused")
+
+
+def test_the_microscope_refuses_what_it_has_not(night: Night, page: Any) -> None:
+    take_over(page, night)
+    choose(page, "parameter", "sample-slope-x")
+    page.fill("input[aria-label='value with unit']", "not a number")
+    press(page, "Set")
+    page.wait_for_selector(".outcomes .refused")
+    assert "Refused" in page.inner_text(".outcomes")
+
+
+def test_a_scan_is_taken_where_a_rectangle_is_drawn(night: Night, page: Any, keep: Any) -> None:
+    take_over(page, night)
+    page.wait_for_function("document.querySelector('.picture').dataset.number > 0")
+    page.click("[data-tool=scan]")
+    box = page.locator(".picture").bounding_box()
+    corners = page.evaluate(
+        """(() => {
+          const g = afspm.image.geometry;
+          return [[-0.3e-6, 0.1e-6], [0.1e-6, -0.2e-6]].map((place) => g.toScreen(place));
+        })()"""
+    )
+    centre = page.evaluate("afspm.image.geometry.place([-0.1e-6, -0.05e-6])")
+    page.mouse.move(box["x"] + corners[0][0], box["y"] + corners[0][1])
+    page.mouse.down()
+    page.mouse.move(box["x"] + corners[1][0], box["y"] + corners[1][1], steps=3)
+    page.mouse.up()
+    page.wait_for_selector(".question")
+    keep(page, "scan-here")
+    before = len(night.follower.overview.scans)
+    page.click(".question button:has-text('Scan')")
+    said(page, "begins")
+    night.until(lambda: len(night.follower.overview.scans) > before)
+    region = night.follower.overview.scans[-1].region
+    assert region.size_m == pytest.approx((0.4e-6, 0.3e-6), rel=0.05)
+    assert region.center_m == pytest.approx(centre, abs=1e-8)
+    assert night.follower.overview.scans[-1].holder is None
+
+
+def test_a_spectrum_is_taken_by_a_click_and_shown(night: Night, page: Any, keep: Any) -> None:
+    take_over(page, night)
+    page.wait_for_function("document.querySelector('.picture').dataset.number > 0")
+    page.click("[data-tool=spectrum]")
+    at = page.evaluate("afspm.image.geometry.toScreen([0, 0])")
+    centre = page.evaluate("afspm.image.geometry.place([0, 0])")
+    before = len(night.follower.overview.spectra)
+    page.click(".picture", position={"x": at[0], "y": at[1]})
+    page.click(".question button:has-text('Take it')")
+    said(page, "begins")
+    night.until(lambda: len(night.follower.overview.spectra) > before)
+    taken = night.follower.overview.spectra[-1]
+    assert taken.position_m == pytest.approx(centre, abs=2e-9)
+    page.wait_for_selector(".spectra .plot path")
+    page.wait_for_selector(".map path.spectrum", state="attached")
+    keep(page, "spectrum")
+
+
+def test_a_scan_is_stopped_after_taking_over(night: Night, page: Any) -> None:
+    take_over(page, night)
+    choose(page, "parameter", "scan-speed")
+    page.fill("input[aria-label='value with unit']", "50 nm/s")
+    press(page, "Set")
+    said(page, "scan-speed is now 50 nm/s")
+    press(page, "Scan as set")
+    night.until(lambda: night.follower.overview.status.state is ScopeState.SCANNING)
+    press(page, "Stop the scan")
+    said(page, "The scan is stopped")
+    night.until(lambda: night.follower.overview.status.state is ScopeState.FREE)
+    assert any(span.label == "interrupted" for span in night.follower.overview.states.spans)
+    page.fill("input[aria-label='value with unit']", "4 um/s")
+    press(page, "Set")
+    said(page, "scan-speed is now 4 µm/s")
+
+
+def test_stopping_in_automated_says_that_it_takes_over(night: Night, page: Any) -> None:
+    press(page, "Stop the scan")
+    page.wait_for_selector(".question:has-text('MANUAL first')")
+    page.keyboard.press("Escape")
+    page.locator(".question").wait_for(state="detached")
+    assert night.control().mode is ControlMode.AUTOMATED
+
+
+def test_a_component_is_started_anew(night: Night, page: Any) -> None:
+    before = night.until(lambda: night.follower.overview.processes.get("series")).starts
+    page.click("button[aria-label='Restart series']")
+    page.click(".question button:has-text('Restart')")
+    said(page, "series will be started anew")
+    state = night.until(
+        lambda: (
+            (s := night.follower.overview.processes["series"]).starts > before
+            and s.condition in (ProcessCondition.ALIVE, ProcessCondition.BUSY)
+            and s
+        )
+    )
+    assert state.starts == before + 1
+    page.wait_for_selector(".process:has-text('series'):has-text('restarted')")
+    assert night.entry(ADA, "series").response == ControlResponse.SUCCESS
+
+
+def test_all_of_it_can_be_done_by_keyboard(night: Night, page: Any) -> None:
+    page.locator("button:has-text('Take over')").focus()
+    page.keyboard.press("Enter")
+    night.until(lambda: night.control().mode is ControlMode.MANUAL)
+    page.wait_for_selector("[data-tool=scan]:visible")
+    page.locator("[data-tool=scan]").focus()
+    page.keyboard.press("Space")
+    page.locator(".picture").focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Enter")
+    page.wait_for_selector(".question")
+    page.keyboard.press("Escape")
+    page.locator(".question").wait_for(state="detached")
+    assert night.control().mode is ControlMode.MANUAL
+
+
+def test_two_persons_are_told_apart(night: Night, page: Any, opened: Opened) -> None:
+    after = seen(night)
+    other = opened(night.url, person="Žofie Ö")
+    choose(other, "problem", "drop-on-the-table")
+    press(other, "Raise")
+    night.until(lambda: 9 in night.control().problems)
+    assert night.entry("dashboard:Žofie Ö", "drop-on-the-table", after=after).response == 0
+    press(page, "Clear drop-on-the-table")
+    night.until(lambda: 9 not in night.control().problems)
+    assert night.entry(ADA, "drop-on-the-table", after=after).response == 0

@@ -1,0 +1,221 @@
+"""What is shown is what was published."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from ui_lab import Night
+
+import afspm
+from afspm.dashboard.levelling import Levelling, levelled
+from afspm.dashboard.palettes import colours
+from afspm.dashboard.pictures import Contrast, indices, span_of
+from afspm.model import Region, Scan
+from conftest import Opened
+
+TURNED = Region((0.4e-6, -0.3e-6), (0.8e-6, 0.5e-6), 0.4)
+
+
+@pytest.fixture(scope="module")
+def scan(night: Night) -> Iterator[Scan]:
+    """A scan of many pixels, turned, longer than wide: nothing in it is the same when mirrored."""
+    with afspm.connect(night.folder, "tester") as scope:
+        yield scope.scan(TURNED, shape=(48, 72), timeout_s=60.0).first
+
+
+def shown(page: Any, scan: Scan) -> Any:
+    """The canvas, once it shows the scan."""
+    page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{scan.time_ns}'")
+    return page.locator(".picture")
+
+
+def read_value(page: Any, column: int, row: int) -> float:
+    """Point at a pixel, and read its value."""
+    x, y = page.evaluate(
+        f"(() => {{ const g = afspm.image.geometry; return g.toScreen(g.fromPixel([{column}, {row}])) }})()"
+    )
+    page.locator(".picture").hover(position={"x": x, "y": y})
+    page.wait_for_selector(f".readout[data-column='{column}'][data-row='{row}']")
+    return float(page.get_attribute(".readout", "data-value"))
+
+
+@pytest.mark.parametrize(("column", "row"), [(0, 0), (71, 0), (0, 47), (20, 31), (55, 7)])
+def test_the_value_under_the_pointer_is_the_one_published(
+    night: Night, opened: Opened, scan: Scan, column: int, row: int
+) -> None:
+    page = opened(night.url)
+    shown(page, scan)
+    assert read_value(page, column, row) == scan.values[row, column]
+
+
+def test_the_position_under_the_pointer_is_that_of_the_pixel(night: Night, opened: Opened, scan: Scan) -> None:
+    page = opened(night.url)
+    shown(page, scan)
+    read_value(page, 70, 3)
+    x, y = (float(axis[3, 70]) * 1e9 for axis in TURNED.pixels_m(scan.shape))
+    text = page.inner_text(".readout").replace("−", "-")
+    assert f"at ({x:.5g}, {y:.5g}) nm" in text
+
+
+@pytest.mark.parametrize("levelling", list(Levelling))
+def test_each_pixel_has_the_colour_of_its_value(night: Night, opened: Opened, scan: Scan, levelling: Levelling) -> None:
+    page = opened(night.url)
+    shown(page, scan)
+    number = page.get_attribute(".picture", "data-number")
+    page.select_option("[data-part=levelling]", levelling.value)
+    page.wait_for_function("n => afspm.image.head.levelling === n", arg=levelling.value)
+    assert page.get_attribute(".picture", "data-number") == number
+    values = levelled(scan.values, levelling)
+    wanted = colours("gold")[indices(values, span_of(values, Contrast.ROBUST))]
+    for column, row in ((3, 20), (68, 4), (5, 44), (40, 20), (66, 42)):  # none under the scale bar
+        found = page.evaluate(
+            """([column, row]) => {
+              const { canvas, geometry } = afspm.image;
+              const [x, y] = geometry.toScreen(geometry.fromPixel([column, row])), ratio = window.devicePixelRatio;
+              return [...canvas.getContext("2d").getImageData(x * ratio, y * ratio, 1, 1).data].slice(0, 3);
+            }""",
+            [column, row],
+        )
+        assert np.abs(np.array(found) - wanted[row, column]).max() <= 1, (column, row)
+
+
+def test_it_is_said_to_be_simulated_and_what_is_scanned(night: Night, opened: Opened, scan: Scan, keep: Any) -> None:
+    page = opened(night.url)
+    shown(page, scan)
+    assert page.locator(".simulated").inner_text() == "SIMULATED: this is no real microscope"
+    assert "turned by 22.92°" in page.inner_text(".caption")
+    assert "72 × 48 px" in page.inner_text(".caption")
+    keep(page, "watching")
+
+
+def test_the_pointer_may_be_the_keyboard(night: Night, opened: Opened, scan: Scan) -> None:
+    page = opened(night.url)
+    shown(page, scan).focus()
+    page.keyboard.press("ArrowRight")
+    page.wait_for_selector(".readout[data-column='37'][data-row='24']")
+    page.keyboard.press("Shift+ArrowUp")
+    page.wait_for_selector(".readout[data-column='37'][data-row='34']")
+    assert float(page.get_attribute(".readout", "data-value")) == scan.values[34, 37]
+    page.keyboard.press("+")
+    assert page.evaluate("afspm.image.view.zoom") == 1.5
+    page.keyboard.press("0")
+    assert page.evaluate("afspm.image.view.zoom") == 1
+
+
+def test_zoom_keeps_what_is_under_the_pointer(night: Night, opened: Opened, scan: Scan) -> None:
+    page = opened(night.url)
+    shown(page, scan)
+    before = read_value(page, 60, 40)
+    page.mouse.wheel(0, -600)
+    page.wait_for_function("afspm.image.view.zoom > 2")
+    assert read_value(page, 60, 40) == before
+    page.click("[data-zoom='0']")
+    page.wait_for_function("afspm.image.view.zoom === 1")
+
+
+def test_a_profile_is_drawn_along_a_line(night: Night, opened: Opened, scan: Scan, keep: Any) -> None:
+    page = opened(night.url)
+    shown(page, scan)
+    page.select_option("[data-part=levelling]", "none")
+    page.wait_for_function("afspm.image.head.levelling === 'none'")
+    page.click("[data-tool=profile]")
+    box = page.locator(".picture").bounding_box()
+    ends = page.evaluate(
+        """(() => {
+          const g = afspm.image.geometry;
+          return [[10, 20], [60, 20]].map((pixel) => g.toScreen(g.fromPixel(pixel)));
+        })()"""
+    )
+    page.mouse.move(box["x"] + ends[0][0], box["y"] + ends[0][1])
+    page.mouse.down()
+    page.mouse.move(box["x"] + ends[1][0], box["y"] + ends[1][1], steps=4)
+    page.mouse.up()
+    page.wait_for_function("afspm.image.profile?.distances_m.at(-1) > 0.5e-6")
+    values = page.evaluate("afspm.image.profile.values")
+    assert len(values) == 51
+    assert max(values) <= scan.values[19:22, 10:61].max() + 1e-12
+    assert np.corrcoef(values, scan.values[20, 10:61])[0, 1] > 0.99
+    keep(page, "profile")
+
+
+def test_a_scan_is_seen_again_by_a_click_in_the_map(night: Night, opened: Opened, scan: Scan) -> None:
+    page = opened(night.url)
+    shown(page, scan)
+    first = page.locator(".map polygon.scan:not(.shown)").first
+    first.wait_for()
+    time_ns = first.get_attribute("data-time")
+    assert time_ns != str(scan.time_ns)
+    first.click(force=True, position={"x": 4, "y": 4})
+    page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{time_ns}'")
+    page.click("text=Back to the newest scan")
+    shown(page, scan)
+
+
+def test_a_scan_grows_line_by_line(night: Night, opened: Opened, scan: Scan, keep: Any) -> None:
+    page = opened(night.url)
+    with afspm.connect(night.folder, "grower") as scope, scope.control():
+        scope.set("scan-speed", "0.5 um/s")
+        page.evaluate(
+            """() => {
+              window.seen = [];
+              new MutationObserver(() => window.seen.push(Number(document.querySelector(".picture").dataset.rows)))
+                .observe(document.querySelector(".picture"), { attributeFilter: ["data-number"] });
+            }"""
+        )
+        grown = scope.scan(Region((0, 0), (1e-6, 1e-6)), shape=(32, 32), timeout_s=60.0).first
+        page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{grown.time_ns}'")
+        scope.set("scan-speed", "4 um/s")
+    rows = page.evaluate("window.seen")
+    growing = [count for count in rows if count < 32]
+    assert len(growing) >= 3
+    assert growing == sorted(growing)
+    assert rows[-1] == 32
+
+
+def test_control_processes_log_and_time_line_are_as_published(night: Night, opened: Opened) -> None:
+    page = opened(night.url)
+    night.until(lambda: len(night.follower.overview.processes) >= 4)
+    for name, state in night.follower.overview.processes.items():
+        page.wait_for_selector(f"[role=rowheader]:text-is('{name}')")
+        assert state.starts >= 1
+    page.wait_for_selector("ul.log >> text=the dashboard is at")
+    for lane in ("control", "mode", "microscope", "scheduler"):
+        assert page.locator(f".lane > b:text-is('{lane}')").count() >= 1
+
+
+def test_the_log_is_filtered(night: Night, opened: Opened) -> None:
+    page = opened(night.url)
+    page.wait_for_selector("ul.log >> text=the dashboard is at")
+    page.fill("input[aria-label=contains]", "no line is like this")
+    page.wait_for_selector("text=No such line.")
+    page.fill("input[aria-label=contains]", "DASHBOARD is at")
+    page.wait_for_selector("ul.log >> text=the dashboard is at")
+    assert page.locator("ul.log li").count() == 1
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "theme"), [(390, 844, "light"), (390, 844, "dark"), (1024, 768, "light"), (2000, 1100, "dark")]
+)
+def test_it_fits_any_screen(
+    night: Night, opened: Opened, scan: Scan, keep: Any, width: int, height: int, theme: str
+) -> None:
+    page = opened(night.url, width=width, height=height, theme=theme)
+    page.wait_for_selector(".map svg")
+    page.wait_for_selector("[role=rowheader]")
+    page.wait_for_function("document.querySelector('.picture').dataset.number > 0")
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    light = sum(int(part) for part in ground.removeprefix("rgb(").rstrip(")").split(",")) > 384
+    assert light is (theme == "light")
+    keep(page, f"{theme}-{width}")
+
+
+def test_whoever_has_not_signed_in_can_steer_nothing(night: Night, opened: Opened) -> None:
+    page = opened(night.url)
+    page.wait_for_selector("[role=rowheader]")
+    assert page.locator(".steer button").count() == 0
+    assert page.locator(".process button:visible").count() == 0
+    assert page.locator("[data-tool=scan]:visible").count() == 0
