@@ -24,6 +24,8 @@ PERIOD_S = 0.1
 """Real time between two publications, at least."""
 MOST = 1000
 """Requests written down within that time; of more it is only said how many there were."""
+LONGEST = 1000
+"""Characters of what was asked, and of the reason."""
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
 SCHEDULER = "scheduler"
@@ -70,7 +72,8 @@ class Chronicle:
 
     def unreadable(self, who: str, response: Response) -> None:
         """Somebody asked for what could not be read."""
-        entry = JournalEntry(self._now_ns, REQUEST, who, "what can't be read", response.code, response.reason, 0.0)
+        reason = response.reason[:LONGEST]
+        entry = JournalEntry(self._now_ns, REQUEST, who, "what can't be read", response.code, reason, 0.0)
         if len(self._gathered) >= self._most:
             self._left_out += 1
         else:
@@ -119,5 +122,6 @@ class Chronicle:
     def _worded(self, answered: _Answered) -> JournalEntry:
         time_ns, who, request, response, took_s, note = answered
         kind = ORDER if request.kind == RESTART_REQUEST else REQUEST
-        reason = "; ".join(filter(None, (note, response.reason)))
-        return JournalEntry(time_ns, kind, who, asked(request, self._problems), response.code, reason, took_s)
+        what = asked(request, self._problems)[:LONGEST]
+        reason = "; ".join(filter(None, (note, response.reason[:LONGEST])))
+        return JournalEntry(time_ns, kind, who, what, response.code, reason, took_s)

@@ -133,6 +133,14 @@ def test_what_could_not_be_read_is_written_down(lab: Lab) -> None:
     assert (entry.who, entry.response, entry.reason) == ("stranger", C.CMD_NOT_SUPPORTED, "there is no request 77")
 
 
+def test_however_long_what_is_asked_is_what_is_written_down_is_not(lab: Lab) -> None:
+    lab.ask("stranger", R.PARAM, Parameter("scan-speed", "9" * 10**6))
+    lab.step(Unreadable("stranger", Response(int(C.FAILURE), b"", "x" * 10**6)))
+    asked_, unreadable = lab.entries()
+    assert asked_.what.startswith("scan-speed = 999")
+    assert len(asked_.what) == len(unreadable.reason) == chronicle.LONGEST
+
+
 def test_the_time_is_asked_for_too_often_to_be_written_down(lab: Lab) -> None:
     lab.ask("series", CLOCK_REQUEST)
     assert lab.entries() == []
