@@ -208,9 +208,15 @@ def _well(state: ProcessState) -> str:
 
 
 def _refusals(seen: Overview, most: int = 3) -> Iterator[Text]:
-    for entry in list(seen.refusals)[-most:]:
-        line = _label("refused").append(f"{_clock(entry.time_ns)} {entry.who}: {entry.what}")
-        yield line.append(f": {entry.reason}" if entry.reason else "", "yellow")
+    """The last; what was refused again and again in the same way, once."""
+    last: dict[tuple[str, str, str], tuple[int, int]] = {}
+    for entry in seen.refusals:
+        key = (entry.who, entry.what, entry.reason)
+        last[key] = (last.pop(key, (0, 0))[0] + 1, entry.time_ns)
+    for (who, what, reason), (count, time_ns) in list(last.items())[-most:]:
+        again = f" ({count} times)" if count > 1 else ""
+        line = _label("refused").append(f"{_clock(time_ns)} {who}: {what}{again}")
+        yield line.append(f": {reason}" if reason else "", "yellow")
 
 
 def _log(seen: Overview, most: int) -> Iterator[Text]:

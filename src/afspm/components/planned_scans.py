@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from afspm.clock import NS_PER_S
 from afspm.components.plan import XY, Rhythm, ScanPlan, Step, grid_centers, rounds_within, squares
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region, names
@@ -90,8 +89,13 @@ class PlannedScans(Component):
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted and taken again: %s", step.key, interruption)
         if self.plan.total is not None:
-            self.scope.progress(step.index + 1, self.plan.total, began_ns=round(self.memory["start_s"] * NS_PER_S))
+            self.scope.progress(step.index + 1, self.plan.total, left_s=self._left_s(step.index + 1, self.plan.total))
         self.log.info("scan %d%s %s", step.index + 1, self._of_total(), _told(scans.time))
+
+    def _left_s(self, done: int, total: int) -> float:
+        """What the rest takes as fast as so far, but no faster than the beat."""
+        per_scan_s = (self.clock.now_s() - float(self.memory["start_s"])) / done
+        return (total - done) * max(per_scan_s, self.beat_s / len(self.plan.regions))
 
     def _of_total(self) -> str:
         return "" if self.plan.total is None else f" of {self.plan.total}"

@@ -56,13 +56,14 @@ class SpectroscopyGrid(Component):
 
     def run(self) -> None:
         total = len(self.positions) * self.repeats
-        began_ns = int(self.memory.setdefault("began_ns", self.clock.now_ns()))
+        start_s = float(self.memory.setdefault("start_s", self.clock.now_s()))
         for index in range(int(self.memory.get("done", 0)), total):
             place, repeat = divmod(index, self.repeats)
             self.scope.spectrum(self.positions[place], kind=self.kind, key=f"spectrum-{place}-{repeat}")
             self.memory["done"] = index + 1
             self.memory.save()
-            self.scope.progress(index + 1, total, began_ns=began_ns)
+            per_spectrum_s = (self.clock.now_s() - start_s) / (index + 1)
+            self.scope.progress(index + 1, total, left_s=per_spectrum_s * (total - index - 1))
             self.log.info("spectrum %d of %d", index + 1, total)
         if self.end_when_done:
             self.scope.end_experiment()

@@ -119,21 +119,18 @@ class Progress:
 
     Attributes:
         done, of: how many of how many, of whatever it counts.
-        began_ns: when it began with the first; None if it does not say.
+        left_s: experiment time that the rest will take, if it goes on as it does; None if it does not say.
     """
 
     time_ns: int
     name: str
     done: int
     of: int
-    began_ns: int | None = None
+    left_s: float | None = None
 
     def remaining_ns(self, now_ns: int) -> int | None:
-        """How long it will still take if it goes on as fast as so far; None if that can't be told."""
-        if self.began_ns is None or not 0 < self.done <= self.of:
-            return None
-        left_ns = (self.time_ns - self.began_ns) / self.done * (self.of - self.done)
-        return max(0, round(left_ns) - max(0, now_ns - self.time_ns))
+        """How long it will still take, told now; None if it does not say."""
+        return None if self.left_s is None else max(0, round(self.left_s * 1e9) - max(0, now_ns - self.time_ns))
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,6 +72,7 @@ class Scope:
         self._link = link
         self._between = between
         self._depth = 0
+        self._begun: tuple[int, int] | None = None  # what was done when progress was first told, and when
         self.problems = problems or ProblemNames()
         self._holding = Holding(link, self.problems)
         self._asker = Asker(link, self._holding)
@@ -228,14 +229,18 @@ class Scope:
         with suppress(ExperimentEnded):  # it may come before the answer
             self._tell(ControlRequest.END_EXPERIMENT, None)
 
-    def progress(self, done: int, of: int, *, began_ns: int | None = None) -> None:
+    def progress(self, done: int, of: int, *, left_s: float | None = None) -> None:
         """Say how far one is with what one set out to do, for those who look on. Costs nothing, and waits for nobody.
 
         Args:
             done, of: how many of how many, of whatever is counted.
-            began_ns: experiment time of the first, from which it is told how long the rest will take.
+            left_s: experiment time that the rest will take; None: as it went since this was first said.
         """
-        self._link.tell(Progress(self._link.clock.now_ns(), self._link.name, done, of, began_ns))
+        now_ns = self._link.clock.now_ns()
+        begun, begun_ns = self._begun = self._begun or (done, now_ns)
+        if left_s is None and done > begun:
+            left_s = (now_ns - begun_ns) * 1e-9 / (done - begun) * (of - done)
+        self._link.tell(Progress(now_ns, self._link.name, done, of, left_s))
 
     # --- looking ---
 

@@ -104,14 +104,14 @@ def progress_to_wire(progress: model.Progress) -> journal_pb2.Progress:
         name=progress.name,
         done=progress.done,
         of=progress.of,
-        began=None if progress.began_ns is None else timestamp(progress.began_ns),
+        remaining=progress.left_s,
     )
 
 
 def progress_from_wire(payload: Buffer) -> model.Progress:
     message = parse(journal_pb2.Progress, payload)
-    began_ns = time_ns(message.began) if message.HasField("began") else None
-    return model.Progress(time_ns(message.timestamp), message.name, message.done, message.of, began_ns)
+    left_s = message.remaining if message.HasField("remaining") else None
+    return model.Progress(time_ns(message.timestamp), message.name, message.done, message.of, left_s)
 
 
 def told_to_wire(told: model.Told) -> journal_pb2.Told:

@@ -10,7 +10,7 @@ from runtime_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
 from afspm import wire
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
-from afspm.model import TELL_REQUEST, ControlRequest, Problem
+from afspm.model import TELL_REQUEST, ControlRequest, Problem, Progress
 from afspm.runtime.component import Component
 from afspm.runtime.exit_codes import ExitCode
 
@@ -116,16 +116,48 @@ def test_a_spectrum_is_taken_at_each_point_of_a_grid() -> None:
     assert lab.control.ended
 
 
-def told_progress(lab: Lab) -> list[tuple[str, int, int]]:
+def progress_of(lab: Lab) -> list[Progress]:
     told = [request.subject for request in lab.requests if request.kind == TELL_REQUEST]
-    progress = [wire.decode(one.message, one.payload) for one in told]
-    return [(one.name, one.done, one.of) for one in progress]
+    return [wire.decode(one.message, one.payload) for one in told]
+
+
+def told_progress(lab: Lab) -> list[tuple[str, int, int]]:
+    return [(one.name, one.done, one.of) for one in progress_of(lab)]
 
 
 def test_those_who_look_on_are_told_how_far_it_is() -> None:
     lab = Lab("series")
     run(series(), lab)
     assert told_progress(lab) == [("series", 1, 3), ("series", 2, 3), ("series", 3, 3)]
+
+
+def test_what_remains_of_a_series_goes_by_its_beat() -> None:
+    lab = Lab("series")
+    run(series(), lab)
+    assert [one.left_s for one in progress_of(lab)] == pytest.approx([1800.0, 900.0, 0.0])
+
+
+def test_what_remains_of_a_list_goes_by_its_pace() -> None:
+    lab = Lab("list")
+    place = {"center": (0.0, 0.0), "size": (1e-6, 1e-6)}
+    run(ScanList([place, place, place], pixels=(8, 8), end_when_done=True), lab)  # type: ignore[list-item]
+    first, second, last = (one.left_s for one in progress_of(lab))
+    assert first == pytest.approx(2 * SCAN_S, rel=0.1)
+    assert second == pytest.approx(SCAN_S, rel=0.1)
+    assert last == 0.0
+
+
+def test_who_does_not_say_how_long_the_rest_takes_has_it_told_by_the_pace() -> None:
+    class Script(Component):
+        def run(self) -> None:
+            self.scope.set("tip-bias-voltage", 1.0)  # the scheduler is known then
+            for done in range(3):
+                self.scope.progress(done, 4)
+                self.scope.sleep(60.0)
+
+    lab = Lab("script")
+    run(Script(), lab)
+    assert [one.left_s for one in progress_of(lab)] == [None, pytest.approx(180.0), pytest.approx(120.0)]
 
 
 def test_a_series_without_end_tells_no_progress() -> None:

@@ -212,11 +212,10 @@ def test_progress_is_the_newest_of_each_component() -> None:
     assert night.progress == {"series": (4, 9), "grid": (1, 9)}
 
 
-def test_what_remains_is_told_by_the_pace_so_far() -> None:
-    told = model.Progress(20 * S, "series", 2, 10, began_ns=10 * S)
+def test_what_remains_gets_less_while_nothing_new_is_told() -> None:
+    told = model.Progress(20 * S, "series", 2, 10, left_s=40.0)
     assert told.remaining_ns(25 * S) == 35 * S
     assert told.remaining_ns(500 * S) == 0
-    assert model.Progress(20 * S, "series", 0, 10, 10 * S).remaining_ns(20 * S) is None
     assert model.Progress(20 * S, "series", 2, 10).remaining_ns(20 * S) is None
 
 

@@ -34,7 +34,7 @@ def night() -> Overview:
         (3, "ScopeStateMsg", model.ScopeStatus(ScopeState.SCANNING)),
         (103, "ScopeStateMsg", model.ScopeStatus(ScopeState.FREE)),
         (110, "ScopeStateMsg", model.ScopeStatus(ScopeState.SCANNING)),
-        (120, "Progress", model.Progress(START + 120 * S, "series", 1, 5, START)),
+        (120, "Progress", model.Progress(START + 120 * S, "series", 1, 5, 480.0)),
         (121, "ProcessStates", model.ProcessStates(START, "lab", (
             process("series", ProcessCondition.BUSY, step_age_s=12.0),
             process("judge", ProcessCondition.GIVEN_UP, last_exit="exit code 1"),
@@ -89,6 +89,14 @@ def test_without_block_characters_bars_are_plain(night: Overview) -> None:
     about = About("night", "", fancy=False)
     assert shown(night, about).isascii()
     assert telling.bar(0.5, fancy=False, width=4) == "[##..]"
+
+
+def test_what_is_refused_again_and_again_is_said_once(night: Overview) -> None:
+    for k in range(5):
+        entry = model.JournalEntry(START + (130 + k) * S, "request", "series", "asks for control", 6, "flagged: …")
+        night.take("JournalEntries", model.JournalEntries((entry,)), START + (130 + k) * S)
+    assert shown(night).count("asks for control") == 1
+    assert "series: asks for control (5 times): flagged: …" in shown(night)
 
 
 def test_silence_is_said_as_such(night: Overview) -> None:
