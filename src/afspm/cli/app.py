@@ -4,7 +4,21 @@ from __future__ import annotations
 
 import typer
 
-from afspm.cli import check, drift, emulate, graph, keys, new, report, run, status, steer, test_translator
+from afspm.cli import (
+    check,
+    drift,
+    emulate,
+    export,
+    graph,
+    keys,
+    new,
+    replay,
+    report,
+    run,
+    status,
+    steer,
+    test_translator,
+)
 
 app = typer.Typer(
     name="afspm",
@@ -22,6 +36,8 @@ app.command("resume")(steer.resume)
 app.command("end")(steer.end)
 app.command("problems")(steer.problems)
 app.command("report")(report.report)
+app.command("export")(export.export)
+app.command("replay")(replay.replay)
 app.command("check")(check.check)
 app.command("graph")(graph.graph)
 app.command("keys")(keys.keys)

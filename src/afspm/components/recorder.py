@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import tomllib
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from afspm.model import Frame
 from afspm.runtime.component import Component
+from afspm.runtime.connect import RUN_FILE
 from afspm.runtime.exit_codes import ExitCode
 from afspm.transport.port import CaughtUp, Killed, PacketReceived, ParentGone
 
@@ -88,22 +90,29 @@ def _about(context: Context, run_dir: Path, *, scans: bool) -> About:
 
     launch = context.launch
     frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
-    name, seeds = _said(run_dir / EXPERIMENT_FILE)
     facts: dict[str, Any] = {
-        "experiment": name,
+        "experiment": _name(run_dir / RUN_FILE),
         "run": run_dir.resolve().name,
         "simulated": launch.simulated,
-        "seeds": seeds,
+        "seeds": _seeds(run_dir / EXPERIMENT_FILE),
         "frame": frame.value,
     }
     return About(facts, context.problems, frame, measured=scans)
 
 
-def _said(file: Path) -> tuple[str, dict[str, Any]]:
-    """What the experiment file says: its name, and the seed of each component that has one."""
+def _name(file: Path) -> str:
+    """Of the experiment, as the facts of the run have it; empty if it is not known."""
+    try:
+        facts = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ""
+    return str(facts.get("name", "")) if isinstance(facts, dict) else ""
+
+
+def _seeds(file: Path) -> dict[str, Any]:
+    """The seed of each component that has one, as the experiment file says."""
     try:
         said = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return "", {}
-    seeds = {name: table["seed"] for name, table in said.items() if isinstance(table, dict) and "seed" in table}
-    return str(said.get("name", "")), seeds
+        return {}
+    return {name: table["seed"] for name, table in said.items() if isinstance(table, dict) and "seed" in table}

@@ -67,7 +67,7 @@ class MeasuredFiles:
         ).fetchone()
         if known is None:
             scans = [new[channel] for channel in dict.fromkeys(scan.channel for _, scan in taken.channels)]
-            stood = circumstances.stood(self._journal, published_ns, ScopeState.SCANNING)
+            stood = circumstances.stood(self._journal, published_ns, ScopeState.SCANNING, measured_ns)
             number = self._add_scan(scans, measured_ns, stood, published_ns, interrupted=False)
         else:
             number = known[0]
@@ -138,7 +138,7 @@ class MeasuredFiles:
             (time_ns, spectrum.filename, spectrum.kind),
         ).fetchone()
         if known is None:
-            stood = circumstances.stood(self._journal, published_ns, ScopeState.SPEC)
+            stood = circumstances.stood(self._journal, published_ns, ScopeState.SPEC, time_ns)
             number, name = self._next(SPECTRA, time_ns)
             facts = {**self._facts, **stood.facts(self._problems), "number": number}
             at = Circumstances(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))

@@ -53,7 +53,7 @@ class Circumstances:
 
 def encode_scan(scans: Sequence[Scan], circumstances: Circumstances) -> bytes:
     """All channels of one scan, of the same region and shape, as a file. Needs h5py."""
-    first, fields = scans[0], _fields((scan.channel for scan in scans), ("x", "y"))
+    first, fields = scans[0], field_names((scan.channel for scan in scans), ("x", "y"))
     region = first.region
     about = _about("scan", first.filename, circumstances) | {
         "center_m": region.center_m,
@@ -84,7 +84,7 @@ def encode_scan(scans: Sequence[Scan], circumstances: Circumstances) -> bytes:
 
 def encode_spectrum(spectrum: Spectrum, circumstances: Circumstances) -> bytes:
     """One spectrum as a file. Needs h5py."""
-    fields = _fields(spectrum.names)
+    fields = field_names(spectrum.names)
     about = _about("spectrum", spectrum.filename, circumstances) | {
         "position_m": spectrum.position_m,
         "frame": spectrum.frame.value,
@@ -184,7 +184,7 @@ def _values(group: Any, name: str, values: Array | float, unit: str, long_name: 
         dataset.attrs["long_name"] = long_name
 
 
-def _fields(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
+def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
     """Names that NeXus allows, all different; the real ones are in `long_name`."""
     found, used = [], set(taken)
     for name in names:

@@ -68,12 +68,12 @@ class Run:
     @property
     def scans(self) -> Table[ScanRow]:
         """One row for each scan, those that were interrupted too, in the order in which they were recorded."""
-        return Table(_scan_row(row) for row in self._query("SELECT * FROM scans ORDER BY number"))
+        return Table(map(_scan_row, self._query("SELECT * FROM scans ORDER BY number")), ScanRow)
 
     @property
     def spectra(self) -> Table[SpectrumRow]:
         """One row for each spectrum, in the order in which they were recorded."""
-        return Table(_spectrum_row(row) for row in self._query("SELECT * FROM spectra ORDER BY number"))
+        return Table(map(_spectrum_row, self._query("SELECT * FROM spectra ORDER BY number")), SpectrumRow)
 
     def scan(self, index: int | ScanRow) -> ScanSet:
         """All channels of a scan: by its place in `scans` (-1: the last), or by its row.
@@ -101,13 +101,14 @@ class Run:
     @property
     def journal(self) -> Table[JournalEntry]:
         """Requests with their answers, changes of control, orders; oldest first."""
-        return Table(JournalEntry(*row) for row in self._query("SELECT * FROM entries ORDER BY time_ns, rowid"))
+        rows = self._query("SELECT * FROM entries ORDER BY time_ns, rowid")
+        return Table((JournalEntry(*row) for row in rows), JournalEntry)
 
     @property
     def refusals(self) -> Table[JournalEntry]:
         """Requests that were not carried out, with the reasons."""
         rows = self._query("SELECT * FROM entries WHERE response > 0 ORDER BY time_ns, rowid")
-        return Table(JournalEntry(*row) for row in rows)
+        return Table((JournalEntry(*row) for row in rows), JournalEntry)
 
     @property
     def control(self) -> Table[ControlRow]:
@@ -119,7 +120,7 @@ class Run:
             state = self._decoded("ControlState", payload)
             if isinstance(state, ControlState) and (not rows or rows[-1].state != state):
                 rows.append(ControlRow(time_ns, state))
-        return Table(rows)
+        return Table(rows, ControlRow)
 
     @property
     def problems(self) -> Table[ProblemRow]:
@@ -130,15 +131,17 @@ class Run:
             for number, lane in lanes.items()
             for span in lane.spans
         ]
-        return Table(sorted(rows, key=lambda row: row.flagged_ns))
+        return Table(sorted(rows, key=lambda row: row.flagged_ns), ProblemRow)
 
     @property
     def processes(self) -> Table[ProcessRow]:
         """A row for each change of a process."""
-        return Table(
+        rows = self._query("SELECT * FROM processes ORDER BY time_ns, rowid")
+        made = (
             ProcessRow(time_ns, name, role, ProcessCondition(condition), *rest)
-            for time_ns, name, role, condition, *rest in self._query("SELECT * FROM processes ORDER BY time_ns, rowid")
+            for time_ns, name, role, condition, *rest in rows
         )
+        return Table(made, ProcessRow)
 
     @property
     def restarts(self) -> Table[ProcessRow]:
@@ -149,17 +152,20 @@ class Run:
             if row.starts > seen.get(row.name, 1):
                 rows.append(row)
             seen[row.name] = row.starts
-        return Table(rows)
+        return Table(rows, ProcessRow)
 
     @property
     def log(self) -> Table[LogLine]:
         """What all processes said, oldest first."""
-        return Table(LogLine(*row) for row in self._query("SELECT * FROM log ORDER BY time_ns, rowid"))
+        rows = self._query("SELECT * FROM log ORDER BY time_ns, rowid")
+        return Table((LogLine(*row) for row in rows), LogLine)
 
     @property
     def drift(self) -> Table[DriftPoint]:
         """What was known of drift after each scan; empty without a Drift Compensated Scheduler."""
-        return Table(self.overview(messages=("DriftMapping",)).drift)
+        from afspm.record.overview import DriftPoint
+
+        return Table(self.overview(messages=("DriftMapping",)).drift, DriftPoint)
 
     # --- everything ---
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 import numpy as np
@@ -100,17 +101,22 @@ class ProcessRow:
 
 
 class Table(Sequence[T], Generic[T]):
-    """Rows of one kind: a sequence, with `to_numpy` and `to_xarray` for the columns that are numbers and texts."""
+    """Rows of one kind: a sequence, with `to_numpy` and `to_xarray` for the columns that are numbers and texts.
 
-    def __init__(self, rows: Iterable[T]) -> None:
+    Args:
+        kind: of the rows: says which columns there are where there are no rows.
+    """
+
+    def __init__(self, rows: Iterable[T], kind: type[T]) -> None:
         self._rows = tuple(rows)
+        self._kind = kind
 
     @overload
     def __getitem__(self, index: int) -> T: ...
     @overload
     def __getitem__(self, index: slice) -> Table[T]: ...
     def __getitem__(self, index: int | slice) -> T | Table[T]:
-        return Table(self._rows[index]) if isinstance(index, slice) else self._rows[index]
+        return Table(self._rows[index], self._kind) if isinstance(index, slice) else self._rows[index]
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -120,13 +126,12 @@ class Table(Sequence[T], Generic[T]):
 
     def where(self, wanted: Callable[[T], bool]) -> Table[T]:
         """The rows for which it is true."""
-        return Table(row for row in self._rows if wanted(row))
+        return Table((row for row in self._rows if wanted(row)), self._kind)
 
     def columns(self) -> dict[str, list[Any]]:
         """Each column by its name, as numbers and texts; places are taken apart (`center_x_m` …), times are ns."""
         taken_apart = [_apart(row) for row in self._rows]
-        names = dict.fromkeys(name for row in taken_apart for name in row)
-        return {name: [row.get(name) for row in taken_apart] for name in names}
+        return {name: [row[name] for row in taken_apart] for name in _names(self._kind)}
 
     def to_numpy(self) -> NDArray[Any]:
         """A structured array: times as datetime64[ns], numbers that are not known as NaN or -1."""
@@ -143,8 +148,23 @@ class Table(Sequence[T], Generic[T]):
         return xarray.Dataset({name: ("row", _array(name, values)) for name, values in self.columns().items()})
 
     def __repr__(self) -> str:
-        kind = type(self._rows[0]).__name__ if self._rows else "nothing"
-        return f"<Table of {len(self)} {kind}>"
+        return f"<Table of {len(self)} {self._kind.__name__}>"
+
+
+_REGION = ("center_x_m", "center_y_m", "width_m", "height_m", "angle_rad", "frame")
+_COLUMNS = {
+    "region": _REGION,
+    "shape": ("rows", "columns"),
+    "position_m": ("x_m", "y_m"),
+    "state": ("holder", "mode", "problems"),
+    "translation_m": ("x_m", "y_m"),
+    "rate_m_s": ("rate_x_m_s", "rate_y_m_s"),
+}
+"""The columns that some attributes are taken apart into."""
+
+
+def _names(kind: type[Any]) -> list[str]:
+    return [name for field in fields(kind) for name in _COLUMNS.get(field.name, (field.name,))]
 
 
 def _apart(row: Any) -> dict[str, Any]:
@@ -152,35 +172,25 @@ def _apart(row: Any) -> dict[str, Any]:
     made: dict[str, Any] = {}
     for field in fields(row):
         name, value = field.name, getattr(row, field.name)
-        if name == "region":
-            made |= _of_region(value)
-        elif name == "shape":
-            made |= dict(zip(("rows", "columns"), value or (None, None), strict=True))
-        elif name == "position_m":
-            made |= dict(zip(("x_m", "y_m"), value or (None, None), strict=True))
+        if name in _COLUMNS:
+            made |= zip(_COLUMNS[name], _parts(value, len(_COLUMNS[name])), strict=True)
         elif name == "channels":
-            made["channels"] = ";".join(f"{channel} [{unit}]" for channel, unit in value)
-        elif isinstance(value, ControlState):
-            made |= {
-                "holder": value.holder,
-                "mode": value.mode.name.lower(),
-                "problems": " ".join(map(str, value.problems)),
-            }
+            made[name] = ";".join(f"{channel} [{unit}]" for channel, unit in value)
         elif isinstance(value, tuple):
             made[name] = ";".join(map(str, value))
-        elif hasattr(value, "value"):
+        elif isinstance(value, Enum):
             made[name] = value.name.lower()
         else:
             made[name] = value
     return made
 
 
-def _of_region(region: Region | None) -> dict[str, Any]:
-    names = ("center_x_m", "center_y_m", "width_m", "height_m", "angle_rad")
-    if region is None:
-        return {**dict.fromkeys(names), "frame": None}
-    values = (*region.center_m, *region.size_m, region.angle_rad)
-    return {**dict(zip(names, values, strict=True)), "frame": region.frame.value}
+def _parts(value: Any, count: int) -> tuple[Any, ...]:
+    if isinstance(value, Region):
+        return (*value.center_m, *value.size_m, value.angle_rad, value.frame.value)
+    if isinstance(value, ControlState):
+        return value.holder, value.mode.name.lower(), " ".join(map(str, value.problems))
+    return (None,) * count if value is None else tuple(value)
 
 
 def _array(name: str, values: list[Any]) -> NDArray[Any]:

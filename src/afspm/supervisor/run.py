@@ -67,7 +67,7 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     first = _starts(experiment, options, clock, FreePorts())
     names = [start.launch.name for start in first]
     clock = _common_clock(experiment, first, clock, options, terminal)
-    folder = run_folder.create(options.runs, experiment.name, _now())
+    folder = run_folder.create(options.runs, experiment.name, now())
     with run_folder.locked(folder):
         run_folder.write_experiment(folder, experiment.expanded())
         return go(experiment, options, clock, folder, experiment.name, terminal, names)
@@ -202,5 +202,6 @@ def _common_clock(
     return clock
 
 
-def _now() -> datetime:
+def now() -> datetime:
+    """Real time, with the zone of this computer."""
     return datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone()

@@ -1,0 +1,78 @@
+"""Writes scans and spectra of a run, and its tables, in the format that is asked for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+
+from afspm.errors import FileError, InvalidValue
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
+
+FORMATS = {"gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables"}
+"""By suffix, the module of this package; each has `write(run, scans, spectra, folder)`, which yields files."""
+
+Writer = Callable[[Run, list[ScanRow], list[SpectrumRow], Path], Iterator[Path]]
+
+
+def export(
+    run: Run, to: str, folder: Path, scans: str | None = None, tell: Callable[[str], None] | None = None
+) -> Iterator[Path]:
+    """Write a run in another format, and yield each file as it is there.
+
+    Args:
+        to: one of `FORMATS`.
+        folder: made if it is not there.
+        scans: numbers of scans, as for `chosen`; None: all scans and spectra.
+        tell: is told what is left out, and why.
+
+    Raises:
+        InvalidValue: there is no such format, or no such scan.
+        FileError: a file can't be written, or what it needs is not installed.
+    """
+    if to not in FORMATS:
+        raise InvalidValue(f"there is no format {to!r}", hint=f"one of {', '.join(FORMATS)}")
+    wanted = list(run.scans) if scans is None else chosen(list(run.scans), scans)
+    for row in wanted:
+        if not row.file and tell is not None:
+            tell(f"scan {row.number} was interrupted before anything of it was seen")
+    spectra = list(run.spectra) if scans is None else []
+    write: Writer = import_module(f"afspm.record.export.{FORMATS[to]}").write
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield from write(run, [row for row in wanted if row.file], spectra, folder)
+    except OSError as error:
+        raise FileError(f"can't be written: {error}", where=str(folder)) from error
+
+
+def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
+    """The scans that are meant by "3", "1-5,8" or "7-" (from 7 on).
+
+    Raises:
+        InvalidValue: that is no list of numbers, or one of them is none of a scan.
+    """
+    by_number = {row.number: row for row in rows}
+    last = max(by_number, default=0)
+    wanted: list[int] = []
+    for part in numbers.split(","):
+        match = re.fullmatch(r"\s*(\d+)\s*(-\s*(\d*))?\s*", part)
+        if match is None:
+            raise InvalidValue(f"{part!r} is no number of a scan", hint="e.g. 3, 1-5,8 or 7-")
+        first = int(match[1])
+        wanted += range(first, int(match[3] or last) + 1) if match[2] else [first]
+    missing = [number for number in wanted if number not in by_number]
+    if missing or not wanted:
+        raise InvalidValue(f"there is no scan {missing[0] if missing else numbers}", hint=f"there are 1 to {last}")
+    return [by_number[number] for number in dict.fromkeys(wanted)]
+
+
+def stem(file: str) -> str:
+    """How the files of a measurement are called, whatever the format."""
+    return Path(file).stem
+
+
+def plain(name: str) -> str:
+    """A name as part of a file's name."""
+    return re.sub(r"[^\w.-]+", "_", name).strip("_") or "channel"

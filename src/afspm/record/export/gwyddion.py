@@ -1,0 +1,153 @@
+"""Gwyddion's own files (.gwy): all channels of a scan, or the curves of a spectrum, in one.
+
+The format: Gwyddion user guide, "Format of Gwyddion files". A file is "GWYP" and an object; an object is its name, the
+size of its components, and these: name, type, value. Numbers are little-endian, texts end with a zero byte.
+
+Gwyddion's rows go down from the largest y; ours go up. Its offsets are of the corner of smallest x and y.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.model import Scan, Spectrum
+from afspm.record.export.exporting import stem
+from afspm.record.measured import write_synced
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
+
+_MAGIC = b"GWYP"
+Item = tuple[str, str, Any]
+"""The name, the type (Gwyddion's letter) and the value of a component."""
+
+
+def write(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
+    """A file for each scan and each spectrum."""
+    for row in scans:
+        yield _written(folder / f"{stem(row.file)}.gwy", scan_file(list(run.scan(row).values()), _said(run.about(row))))
+    for spectrum in spectra:
+        target = folder / f"{stem(spectrum.file)}.gwy"
+        yield _written(target, spectrum_file(run.spectrum(spectrum), _said(run.about(spectrum))))
+
+
+def _written(path: Path, data: bytes) -> Path:
+    write_synced(path, data)
+    return path
+
+
+def scan_file(scans: Sequence[Scan], meta: Mapping[str, str]) -> bytes:
+    """The channels of one scan."""
+    items: list[Item] = []
+    for number, scan in enumerate(scans):
+        values = scan.values[::-1]
+        unknown = ~np.isfinite(values)
+        items.append((f"/{number}/data", "o", _field(scan, np.where(unknown, _typical(values), values), scan.unit)))
+        items.append((f"/{number}/data/title", "s", scan.channel))
+        items.append((f"/{number}/data/visible", "b", True))
+        if unknown.any():  # Gwyddion knows no NaN: what was not measured is masked
+            items.append((f"/{number}/mask", "o", _field(scan, unknown.astype(np.float64), "")))
+        items.append((f"/{number}/meta", "o", _object("GwyContainer", [(k, "s", v) for k, v in meta.items()])))
+    return _MAGIC + _object("GwyContainer", items)
+
+
+def spectrum_file(spectrum: Spectrum, meta: Mapping[str, str]) -> bytes:
+    """The curves of one spectrum, as a graph for each variable over the first."""
+    items: list[Item] = []
+    swept, units = spectrum.values[:, 0] if spectrum.names else np.empty(0), spectrum.units
+    for number, name in enumerate(spectrum.names[1:], 1):
+        curve = [
+            ("xdata", "D", swept),
+            ("ydata", "D", spectrum.values[:, number]),
+            ("description", "s", name),
+            ("type", "i", 2),
+        ]
+        graph = [
+            ("title", "s", f"{spectrum.kind}: {name}"),
+            ("bottom_label", "s", spectrum.names[0]),
+            ("left_label", "s", name),
+            ("x_unit", "o", _unit(units[0])),
+            ("y_unit", "o", _unit(units[number])),
+            ("curves", "O", [_object("GwyGraphCurveModel", curve)]),
+        ]
+        items.append((f"/0/graph/graph/{number}", "o", _object("GwyGraphModel", graph)))
+        items.append((f"/0/graph/graph/{number}/visible", "b", True))
+    items.append(("/0/meta", "o", _object("GwyContainer", [(k, "s", v) for k, v in meta.items()])))
+    return _MAGIC + _object("GwyContainer", items)
+
+
+def _field(scan: Scan, values: NDArray[np.float64], unit: str) -> bytes:
+    rows, columns = values.shape
+    (width, height), (left, low) = scan.region.size_m, scan.region.top_left_m
+    return _object(
+        "GwyDataField",
+        [
+            ("xres", "i", columns),
+            ("yres", "i", rows),
+            ("xreal", "d", width),
+            ("yreal", "d", height),
+            ("xoff", "d", left),
+            ("yoff", "d", low),
+            ("si_unit_xy", "o", _unit("m")),
+            ("si_unit_z", "o", _unit(unit)),
+            ("data", "D", values.reshape(-1)),
+        ],
+    )
+
+
+def _unit(unit: str) -> bytes:
+    return _object("GwySIUnit", [("unitstr", "s", unit)])
+
+
+def _object(name: str, items: Sequence[Item]) -> bytes:
+    content = b"".join(_text(key) + kind.encode() + _value(kind, value) for key, kind, value in items)
+    return _text(name) + struct.pack("<I", len(content)) + content
+
+
+def _value(kind: str, value: Any) -> bytes:
+    match kind:
+        case "b":
+            return bytes([bool(value)])
+        case "i":
+            return struct.pack("<i", value)
+        case "d":
+            return struct.pack("<d", value)
+        case "s":
+            return _text(value)
+        case "D":
+            data = np.ascontiguousarray(value, "<f8")
+            return struct.pack("<I", data.size) + data.tobytes()
+        case "O":
+            return struct.pack("<I", len(value)) + b"".join(value)
+        case _:
+            return bytes(value)
+
+
+def _text(text: str) -> bytes:
+    return text.replace("\0", " ").encode() + b"\0"
+
+
+def _typical(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else 0.0
+
+
+def _said(about: Mapping[str, Any]) -> dict[str, str]:
+    """What is known of a measurement as Gwyddion shows it: names and texts."""
+    said = {}
+    for name, value in about.items():
+        if name in ("channels", "variables", "content") or value is None:
+            continue
+        if name == "angle_rad":
+            said["angle"] = f"{math.degrees(value):g} deg"
+        elif isinstance(value, Mapping):
+            said |= {f"{name} {inner}": str(one) for inner, one in value.items()}
+        else:
+            said[str(name)] = str(value)
+    return said

@@ -1,0 +1,68 @@
+"""NetCDF (.nc, classic format): xarray, MATLAB, ncdump … read it. A file for each scan and each spectrum."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from afspm.files.netcdf import Attributes, Variable, encoded
+from afspm.model import ScanSet, Spectrum
+from afspm.record.export.exporting import stem
+from afspm.record.measured import write_synced
+from afspm.record.nexus import field_names
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
+
+_RENAMED = {"mode": "control_mode", "filename": "controller_file"}
+"""scipy's reader, which xarray uses, has attributes of its own by these names."""
+
+
+def write(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
+    """A file for each scan and each spectrum."""
+    for row in scans:
+        yield _written(folder / f"{stem(row.file)}.nc", scan_file(run.scan(row), run.about(row)))
+    for one in spectra:
+        yield _written(folder / f"{stem(one.file)}.nc", spectrum_file(run.spectrum(one), run.about(one)))
+
+
+def _written(path: Path, data: bytes) -> Path:
+    write_synced(path, data)
+    return path
+
+
+def scan_file(scans: ScanSet, about: Mapping[str, Any]) -> bytes:
+    """All channels over (y, x), which are those of the frame before it was turned."""
+    (left, low), (width, height), (rows, columns) = scans.region.top_left_m, scans.region.size_m, scans.first.shape
+    variables = {
+        "y": Variable(("y",), np.linspace(low, low + height, rows), {"units": "m"}),
+        "x": Variable(("x",), np.linspace(left, left + width, columns), {"units": "m"}),
+    }
+    for name, scan in zip(field_names(scans, ("x", "y")), scans.values(), strict=True):
+        attributes: Attributes = {"long_name": scan.channel, "units": scan.unit}
+        variables[name] = Variable(("y", "x"), scan.values, attributes)
+    return encoded(variables, _attributes(about))
+
+
+def spectrum_file(spectrum: Spectrum, about: Mapping[str, Any]) -> bytes:
+    """Every variable over (point)."""
+    variables = {
+        name: Variable(("point",), spectrum.values[:, number], {"long_name": long_name, "units": unit})
+        for number, (name, long_name, unit) in enumerate(
+            zip(field_names(spectrum.names), spectrum.names, spectrum.units, strict=True)
+        )
+    }
+    return encoded(variables, _attributes(about))
+
+
+def _attributes(about: Mapping[str, Any]) -> Attributes:
+    """Texts and numbers as they are; whole numbers as texts, since a float64 has no room for all of them."""
+    made: dict[str, str | float] = {}
+    for name, value in about.items():
+        if value is not None and name not in ("channels", "variables"):
+            plain = value if isinstance(value, str | float) else json.dumps(value, default=str)
+            made[_RENAMED.get(name, str(name).replace("/", "_"))] = plain
+    return made

@@ -1,0 +1,103 @@
+"""Pictures (.png): one for each channel of a scan, with scale bar and colour bar, and one for each spectrum."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from afspm.errors import FileError
+from afspm.model import Scan, Spectrum
+from afspm.record.export.exporting import plain, stem
+from afspm.record.nexus import iso
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k"}
+_DPI = 150
+
+
+def write(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
+    """A picture for each channel and each spectrum. Raises FileError: matplotlib is not installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise FileError("pictures need matplotlib", hint='pip install "afspm[plot]"')
+    for row in scans:
+        for channel, scan in run.scan(row).items():
+            title = _title(run, f"{channel}, {iso(row.time_ns)[:19].replace('T', ' ')} UTC", row.interrupted)
+            yield _saved(scan_figure(scan, title), folder / f"{stem(row.file)}_{plain(channel)}.png")
+    for one in spectra:
+        spectrum = run.spectrum(one)
+        title = _title(run, f"{one.kind}, {iso(one.time_ns)[:19].replace('T', ' ')} UTC", interrupted=False)
+        yield _saved(spectrum_figure(spectrum, title), folder / f"{stem(one.file)}.png")
+
+
+def scan_figure(scan: Scan, title: str) -> Figure:
+    """The values as they are, not levelled, with a colour bar and a scale bar."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    factor, unit = _in(scan.unit, float(np.nanmax(np.abs(scan.values), initial=0.0)))
+    known = scan.values[np.isfinite(scan.values)]
+    low, high = np.percentile(known, (0.5, 99.5)) * factor if known.size else (0.0, 1.0)
+    width, height = scan.region.size_m
+    image = axes.imshow(
+        scan.values * factor, origin="lower", extent=(0.0, width, 0.0, height), cmap="viridis", vmin=low, vmax=high
+    )
+    axes.set_title(title, fontsize=9)
+    axes.set_axis_off()
+    figure.colorbar(image, ax=axes, label=unit or scan.channel)
+    bar_m = _round_length(width / 4)
+    text_factor, text_unit = _in("m", bar_m)
+    left, low_edge = 0.05 * width, 0.05 * height
+    for color, line in (("black", 6.0), ("white", 3.0)):
+        axes.plot([left, left + bar_m], [low_edge, low_edge], color=color, linewidth=line, solid_capstyle="butt")
+    axes.text(left, low_edge + 0.02 * height, f"{bar_m * text_factor:g} {text_unit}", color="white", va="bottom",
+              bbox={"facecolor": "black", "alpha": 0.5, "pad": 1.5, "edgecolor": "none"})  # fmt: skip
+    return figure
+
+
+def spectrum_figure(spectrum: Spectrum, title: str) -> Figure:
+    """Every variable over the first, one above the other."""
+    from matplotlib.figure import Figure
+
+    others = list(zip(spectrum.names, spectrum.units, spectrum.values.T, strict=True))[1:]
+    figure = Figure(figsize=(5.2, 1.2 + 2.0 * max(1, len(others))), layout="constrained")
+    panels: Any = figure.subplots(max(1, len(others)), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, unit, values) in zip(panels, others, strict=False):
+        axes.plot(spectrum.values[:, 0], values, linewidth=1.0)
+        axes.set_ylabel(f"{name} / {unit}" if unit else name)
+    panels[-1].set_xlabel(f"{spectrum.names[0]} / {spectrum.units[0]}" if spectrum.names else "")
+    panels[0].set_title(title, fontsize=9)
+    return figure
+
+
+def _saved(figure: Figure, path: Path) -> Path:
+    figure.savefig(path, dpi=_DPI)
+    return path
+
+
+def _title(run: Run, text: str, interrupted: bool) -> str:
+    marks = [mark for mark, is_so in (("SIMULATED", run.simulated), ("interrupted", interrupted)) if is_so]
+    return ", ".join([*marks, text])
+
+
+def _in(unit: str, largest: float) -> tuple[float, str]:
+    """The factor and the unit by which values up to `largest` are easily read."""
+    if not unit or unit in ("deg", "°", "%") or not largest or not math.isfinite(largest):
+        return 1.0, unit
+    exponent = min(max(3 * math.floor(math.log10(largest) / 3), -15), 3)
+    return 10.0**-exponent, f"{_PREFIXES[exponent]}{unit}"
+
+
+def _round_length(length_m: float) -> float:
+    """1, 2 or 5 times a power of ten, at most `length_m`."""
+    power = 10.0 ** math.floor(math.log10(length_m))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length_m * (1 + 1e-9))

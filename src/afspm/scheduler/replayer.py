@@ -1,0 +1,122 @@
+"""Stands where a scheduler did, and publishes what that had published; it decides nothing, and nobody measures."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from afspm import wire
+from afspm.clock import NS_PER_S, ExperimentClock
+from afspm.errors import WireError
+from afspm.model import CLOCK_REQUEST, TELL_REQUEST, ControlResponse, Packet, Response
+from afspm.transport.complaints import Complaints
+from afspm.transport.history import Published
+from afspm.transport.network import Network
+from afspm.transport.polling import milliseconds, poller
+from afspm.transport.publisher import Publisher
+from afspm.transport.router import PeerAsked, Router
+from afspm.transport.wakeup import WakeUp
+
+REASON = "this is a replay of a recorded run: nothing can be asked of it"
+FAREWELL_S = 0.5  # real: for those who are told that it is over
+MOST_AT_ONCE = 200
+
+
+class Replayer:
+    """Publishes packets at the times at which they were published.
+
+    Args:
+        packets: oldest first.
+        clock: shows the time of the recorded run.
+    """
+
+    def __init__(
+        self,
+        packets: Iterator[Packet],
+        clock: ExperimentClock,
+        complaints: Complaints,
+        *,
+        publish: str,
+        serve: str,
+    ) -> None:
+        self._packets = packets
+        self._clock = clock
+        self._network = Network.from_launch("replay", None)
+        self._published = Published(clock)
+        self._wake_up: WakeUp[None] = WakeUp()
+        self._publisher = Publisher(self._network, publish, self._published)
+        self._router = Router(self._network, serve, complaints)
+        self._poller = poller(self._wake_up)
+        self._poller.register(self._publisher.socket, self._publisher.serve, self._publisher)
+        self._poller.register(self._router.socket, self._answer, self._router)
+        self._poller.register(self._router.monitor.socket, self._router.follow, None)
+        self._next = next(self._packets, None)
+        self._ended = False
+        self.count = 0
+        """How many packets have been published."""
+
+    def run(self, *, stay: bool = False) -> None:
+        """Until all is published; then everybody is told that the experiment has ended, unless we stay."""
+        while self._next is not None or stay:
+            self._serve(self._due_in_s())
+            self._publish_due()
+        self.end()
+
+    def end(self) -> None:
+        """Tell everybody that it is over, also those who come in this moment."""
+        self._ended = True
+        self._publisher.serve()
+        self._publisher.kill()
+        until_s = self._clock.monotonic_s() + FAREWELL_S
+        while (left_s := until_s - self._clock.monotonic_s()) > 0.0:
+            self._serve(left_s)
+
+    def close(self) -> None:
+        """Close all once what was sent has gone out. Safe to repeat."""
+        self._network.close()
+        self._wake_up.close()
+
+    def _due_in_s(self) -> float:
+        """Real seconds until the next packet."""
+        if self._next is None:
+            return math.inf
+        left_ns = (self._next.time_ns or 0) - self._clock.now_ns()
+        return max(0.0, self._clock.real_s(left_ns / NS_PER_S))
+
+    def _publish_due(self) -> None:
+        for _ in range(MOST_AT_ONCE):
+            if self._next is None or (self._next.time_ns or 0) > self._clock.now_ns():
+                return
+            packet = self._next
+            keep = not packet.envelope.startswith("ScanLines")  # as a scheduler does
+            stamped = self._published.stamp(packet.envelope, bytes(packet.payload), packet.time_ns, keep=keep)
+            self._publisher.publish(stamped)
+            self.count += 1
+            self._next = next(self._packets, None)
+
+    def _serve(self, within_s: float) -> None:
+        timeout = None if within_s == math.inf else milliseconds(within_s)
+        for drain in self._poller.wait(timeout)[0]:
+            drain()
+        if self._ended and self._publisher.serve():
+            self._publisher.kill()
+
+    def _answer(self) -> list[Any]:
+        for event in self._router.receive():
+            if isinstance(event, PeerAsked) and event.frames:
+                self._router.reply(event.connection, wire.encode_response(self._response(event)))
+        return []
+
+    def _response(self, asked: PeerAsked) -> Response:
+        try:
+            request = wire.decode_request(asked.frames)
+        except WireError as error:
+            return Response(error.response, reason=str(error))
+        if request.kind == CLOCK_REQUEST:
+            told = {**self._clock.as_dict(), "now_ns": self._clock.now_ns()}
+            return Response(int(ControlResponse.SUCCESS), json.dumps(told).encode(), "", request.id)
+        if request.kind == TELL_REQUEST:  # a supervisor of those who listen: it has nobody to tell
+            return Response(int(ControlResponse.SUCCESS), wire.encode_orders(()), "", request.id)
+        return Response(int(ControlResponse.FAILURE), reason=REASON, id=request.id)
