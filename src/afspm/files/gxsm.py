@@ -38,12 +38,14 @@ class _Raw:
         values: FloatField, (time, value, y, x).
         attributes: of FloatField.
         numbers, texts: of the other variables.
+        about: attributes of the whole, such as the program's version.
     """
 
     values: NDArray[np.float64]
     attributes: dict[str, str]
     numbers: dict[str, float]
     texts: dict[str, str]
+    about: dict[str, str]
 
 
 def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
@@ -62,7 +64,11 @@ def _netcdf3(file: netcdf.File) -> _Raw:
         raise FileError("a NetCDF file that is neither of GXSM nor of the simulated microscope")
     field = file.variables[name]
     numbers = {key: float(v.values.flat[0]) for key, v in file.variables.items() if v.values.size == 1}
-    return _Raw(field.values, {k: str(v) for k, v in field.attributes.items()}, numbers, dict(file.texts))
+    return _Raw(field.values, _as_texts(field.attributes), numbers, dict(file.texts), _as_texts(file.attributes))
+
+
+def _as_texts(attributes: netcdf.Attributes) -> dict[str, str]:
+    return {key: str(value) for key, value in attributes.items()}
 
 
 def _netcdf4(path: Path) -> _Raw:
@@ -77,8 +83,7 @@ def _netcdf4(path: Path) -> _Raw:
                 texts[key] = hdf5.text(node[()])
             elif node.dtype.kind in "iuf" and node.size == 1:
                 numbers[key] = float(np.ravel(node[()])[0])
-        attributes = {key: hdf5.text(v) for key, v in field.attrs.items() if isinstance(v, bytes | str)}
-        return _Raw(hdf5.array(field), attributes, numbers, texts)
+        return _Raw(hdf5.array(field), hdf5.texts(field.attrs), numbers, texts, hdf5.texts(file.attrs))
 
 
 def _content(raw: _Raw, path: Path) -> FileContent:
@@ -101,7 +106,7 @@ def _content(raw: _Raw, path: Path) -> FileContent:
         )
         for k, layer in enumerate(layers)
     )
-    header: dict[str, Any] = {**raw.numbers, **raw.texts}
+    header: dict[str, Any] = {**raw.about, **raw.numbers, **raw.texts}
     return FileContent(CONTROLLER, scans, header=header, start_ns=start, end_ns=end, upwards=upwards)
 
 

@@ -65,6 +65,11 @@ def array(dataset: Any) -> NDArray[np.float64]:
     return np.asarray(dataset[()], dtype=np.float64)
 
 
+def texts(attributes: Any) -> dict[str, str]:
+    """The attributes that are texts."""
+    return {key: text(value) for key, value in attributes.items() if isinstance(value, bytes | str)}
+
+
 def text(value: Any) -> str:
     """An attribute, or a dataset of characters, as text."""
     if isinstance(value, np.ndarray):

@@ -132,6 +132,7 @@ def gxsm3(path: Path, stopped: int = 0) -> None:
     from scipy.io import netcdf_file
 
     with netcdf_file(path, "w", version=1) as file:
+        file.Creator, file.Version = b"gxsm3", b"1.2.3"
         for name, size in (("time", 1), ("value", 1), ("dimy", NY), ("dimx", NX), ("text", 8), ("name", 24)):
             file.createDimension(name, size)
         field = file.createVariable("FloatField", "f4", ("time", "value", "dimy", "dimx"))
@@ -149,6 +150,7 @@ def gxsm4(path: Path, stopped: int = 0) -> None:
     import h5py
 
     with h5py.File(path, "w") as file:
+        file.attrs["Creator"], file.attrs["Version"] = np.bytes_(b"gxsm4"), np.bytes_(b"1.2.3")
         field = file.create_dataset("FloatField", data=gxsm_field(stopped))
         field.attrs["ZSrcUnit"], field.attrs["ZLabel"] = np.bytes_(b"AA"), np.bytes_(b"ZS-Topo")
         for name, value in gxsm_numbers().items():

@@ -92,6 +92,14 @@ def test_of_a_gwyddion_field_top_is_up_and_its_sides_are_of_whole_pixels(tmp_pat
     assert (content.scans[0].channel, content.scans[0].unit) == ("Height", "m")
 
 
+@pytest.mark.parametrize("name", ["gxsm3.nc", "gxsm4.nc"])
+def test_what_a_file_of_gxsm_says_of_itself_is_in_the_header(name: str, tmp_path: Path) -> None:
+    header = read(name, tmp_path).header
+    assert (header["Creator"], header["Version"]) == (name.removesuffix(".nc"), "1.2.3")
+    assert header["rangex"] == 500.0
+    assert header["spm_scancontrol"].strip() == "TopDown"
+
+
 def test_a_bias_spectrum_of_nanonis(tmp_path: Path) -> None:
     (curve,) = read("spectrum.dat", tmp_path).spectra
     assert curve.names == ("Bias calc", "Current", "Current [filt]")
