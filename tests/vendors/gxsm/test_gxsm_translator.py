@@ -437,3 +437,14 @@ def test_a_scan_that_ends_while_the_translator_is_down_is_published_by_the_next(
     heard = peer.until(FREE)
     assert {scan.region for scan in scans(heard)} == {TURNED}
     assert len(list(made.data.glob("*.nc"))) == 4
+
+
+@pytest.mark.parametrize(("version", "told"), [(3, "gxsm3 3.54.0"), (4, "gxsm4 4.4.1")])
+def test_its_version_is_told_once_there_is_a_file_of_it(bench: Make, version: int, told: str) -> None:
+    made = bench(version=version)
+    peer = made.start()
+    ready(peer)
+    hardware = peer.get(names.CONTROLLER).removeprefix("GXSM ")
+    assert hardware.startswith("(")
+    scanned(peer)
+    assert peer.get(names.CONTROLLER) == f"{told} {hardware}"

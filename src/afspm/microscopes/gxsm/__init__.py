@@ -168,7 +168,7 @@ class Gxsm(Microscope):
         if FEEDBACK_ON in wanted:
             found[FEEDBACK_ON] = self._activity.doing().feedback_on
         found[names.SPEC_KIND] = str(self._kept[names.SPEC_KIND])
-        found[names.CONTROLLER] = f"GXSM ({self._hardware.value})"
+        found[names.CONTROLLER] = f"{self._harvest.program or 'GXSM'} ({self._hardware.value})"
         return found | super().read([name for name in wanted if name not in found])
 
     def write(self, values: Mapping[str, Value]) -> None:

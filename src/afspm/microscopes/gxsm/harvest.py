@@ -46,6 +46,7 @@ class Harvest(Measurements):
         self._whole: dict[Path, FileContent] = {}
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
+        kept.setdefault("program", "")
 
     @property
     def scanning(self) -> tuple[Region, tuple[int, int]] | None:
@@ -59,6 +60,12 @@ class Harvest(Measurements):
     def channels(self) -> dict[str, list[str]]:
         """Name and unit of each channel of the last scans, by the ending of its files."""
         found: dict[str, list[str]] = self._kept["channels"]
+        return found
+
+    @property
+    def program(self) -> str:
+        """Its name and version, which only its files tell; empty before the first of them."""
+        found: str = self._kept["program"]
         return found
 
     def begin(self, what: str, folder: Path | None, begun_ns: int, taken: Mapping[str, Any]) -> None:
@@ -172,7 +179,8 @@ class Harvest(Measurements):
                 self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
             self._kept["absent"] = absent
             for ending, file in endings(files).items():
-                scan = files[file].scans[0]
+                scan, header = files[file].scans[0], files[file].header
+                self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()
                 self._kept["channels"][ending] = [scan.channel, scan.unit]
         names = [str(file) for file in files]
         # numbered by its end: files of spectra may be overwritten

@@ -106,6 +106,7 @@ def run(
                         result = do(check, kit)
                         report.results.append(result)
                         done(result)
+                    session.support.ask_again(session.bench)
             except KeyboardInterrupt:
                 report.lost = "interrupted"
                 raise

@@ -29,6 +29,11 @@ class Support:
     errors: list[str] = field(default_factory=list)
     settable: dict[str, bool | None] = field(default_factory=dict)
 
+    def ask_again(self, bench: Bench) -> None:
+        """For the controller's version: some tell it by their files alone."""
+        if self.parameters.get(names.CONTROLLER) is not None:
+            self.parameters[names.CONTROLLER] = _value(bench, names.CONTROLLER, self.errors)
+
     def missing(self, needs: Iterable[str]) -> list[str]:
         """Those of `needs` that the microscope does not have."""
         known = {**self.parameters, **{name: has or has is None for name, has in self.actions.items()}}
