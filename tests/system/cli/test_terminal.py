@@ -150,6 +150,12 @@ def test_watch_without_a_terminal_writes_a_line_whenever_something_changes(night
         watching.communicate(timeout=DEADLINE_S)
 
 
+def test_a_report_may_be_had_while_it_goes_on(night: Running) -> None:
+    said = afspm("report", night.runs)
+    assert said.returncode == 0, said.stderr
+    assert "goes on" in Path(said.stdout.strip()).read_text(encoding="utf-8")
+
+
 def test_end_asks_first(night: Running) -> None:
     said = afspm("end", night.runs, answer="n\n")
     assert said.returncode == 1

@@ -66,6 +66,10 @@ def night() -> list[tuple[float, object]]:
         (1600, ControlState(ControlMode.AUTOMATED, "series <b>")),
         processes(1700, process("judge", ProcessCondition.RESTARTING, 1700, 1, "signal 9")),  # type: ignore[arg-type]
         processes(1702, process("judge", ProcessCondition.ALIVE, 1702, 2, "signal 9")),  # type: ignore[arg-type]
+        (2000, model.ScopeStatus(ScopeState.SCANNING)),
+        (2010, model.ScanLines(REGION, (8, 8), "Height Retrace", "m", 0, np.ones((3, 8)), START + 2000 * S)),
+        (2020, model.ScopeStatus(ScopeState.INTERRUPTED)),
+        (2021, model.ScopeStatus(ScopeState.FREE)),
         (3601, model.ScopeStatus(ScopeState.MOVING)),
     ]
 
@@ -131,7 +135,7 @@ def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
     text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
-    assert page.pictures == 3  # the scans
+    assert page.pictures == 4  # the scans, the interrupted one too
     assert [load for load in page.loads if not load.startswith("data:image/png;base64,")] == []
     assert "<script" not in text
     assert re.findall(r"url\(|@import", text) == []
@@ -141,9 +145,10 @@ def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
     "said",
     [
         "SIMULATED",
-        "3 scans, tip-shape-changed flagged once, 1 restart",
+        "3 scans, 1 interrupted, tip-shape-changed flagged once, 1 restart",
         "60 min (60 s real); all is done",
         "2 × pulse",
+        "<b>interrupted</b>",
         "prefers-color-scheme:dark",
         "@media print",
         "signal 9",

@@ -65,11 +65,11 @@ def _when(story: Story) -> str:
 
 
 def _cards(story: Story) -> str:
-    interrupted = f"{story.interrupted} interrupted" if story.interrupted else ""
+    interrupted = f"and {story.interrupted} interrupted" if story.interrupted else ""
     flags = len(story.problems)
     unsolved = sum(span.end_ns is None for span in story.problems)
     cards = [
-        ("scans", len(story.scans), interrupted),
+        ("scans", len(story.scans) - story.interrupted, interrupted),
         ("spectra", story.spectra, ""),
         ("problems flagged", flags, f"{unsolved} still flagged at the end" if unsolved else ""),
         ("refusals", sum(one.count for one in story.refusals), ""),

@@ -127,7 +127,9 @@ def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
 
 def sentence(story: Story) -> str:
     """The run in one sentence."""
-    parts = [_counted(len(story.scans), "scan", "scans")]
+    parts = [_counted(len(story.scans) - story.interrupted, "scan", "scans")]
+    if story.interrupted:
+        parts.append(f"{story.interrupted} interrupted")
     if story.spectra:
         parts.append(_counted(story.spectra, "spectrum", "spectra"))
     flagged = Counter(span.label for span in story.problems)
