@@ -63,7 +63,7 @@ def test_keys_makes_a_pair_for_each_process_and_person_and_leaves_old_ones(
     write(CORRECTOR)
     assert runner.invoke(app, ["keys", "night.toml", "--also", "ana"]).exit_code == 0
     public = {file.stem for file in (tmp_path / "keys" / "public").iterdir()}
-    assert public == {"repair", "scheduler", "microscope", "recorder", "ana"}
+    assert public == {"repair", "scheduler", "microscope", "recorder", "supervisor", "ana"}
     before = (tmp_path / "keys" / "public" / "ana.key").read_text()
     result = runner.invoke(app, ["keys", "night.toml", "--also", "ana"])
     assert "there already" in result.output
