@@ -40,6 +40,7 @@ class BenchMicroscope(Microscope):
 
     def __init__(self, scan_s: float, finished: dict[int, tuple[float, float]]) -> None:
         super().__init__(poll_period_s=1e6)
+        self.table = self.table.without([name for name in self.table if name not in _AT_FIRST])
         self._scan_s = scan_s
         self._finished = finished
 
