@@ -71,17 +71,16 @@ class Ahead:
         Raises:
             OSError: the disk is full …
         """
-        if self._size >= SEGMENT_BYTES:
-            self._begin_another()
-        if self._size + sum(size for _, size, _ in self._full) + len(packet.payload) > self._most_bytes:
-            self._begin_another()
-            if sum(size for _, size, _ in self._full) + len(packet.payload) > self._most_bytes:
-                return False
-        if self._file is None:
-            self._file = self._opened()
         envelope, time_ns = packet.envelope.encode(), packet.time_ns or 0
         source = -1 if source_ns is None else source_ns
         head = _HEAD.pack(_MAGIC, len(envelope), len(packet.payload), time_ns, source, cached) + envelope
+        size = len(head) + len(packet.payload) + len(_END)
+        if self._size >= SEGMENT_BYTES or self._waiting + size > self._most_bytes:
+            self._begin_another()
+        if self._waiting + size > self._most_bytes:
+            return False
+        if self._file is None:
+            self._file = self._opened()
         if len(packet.payload) <= _SMALL:
             self._write(b"".join((head, packet.payload, _END)))
         else:
@@ -90,6 +89,11 @@ class Ahead:
             self._write(_END)
         self._newest_ns = max(self._newest_ns, time_ns)
         return True
+
+    @property
+    def _waiting(self) -> int:
+        """Bytes that are not deleted."""
+        return self._size + sum(size for _, size, _ in self._full)
 
     def close(self, *, ended: bool) -> None:
         """Nothing more comes; if the experiment has ended and all is recorded, nothing is left."""

@@ -59,8 +59,8 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
     try:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
-        connection.executescript(_TABLES)
-        connection.execute("INSERT OR IGNORE INTO about VALUES ('format', ?)", (FORMAT,))
+        format_row = f"INSERT OR IGNORE INTO about VALUES ('format', '{FORMAT}');"
+        connection.executescript(f"BEGIN IMMEDIATE; {_TABLES} {format_row} COMMIT;")  # whoever reads finds all or none
         check_format(connection, path)
     except sqlite3.OperationalError:
         connection.close()
@@ -108,7 +108,10 @@ def _checked(uri: str, path: Path) -> sqlite3.Connection:
     connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=30.0)
     try:
         connection.execute("PRAGMA query_only = 1")
-        if connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'about'").fetchone() is None:
+        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
+        if not tables:
+            raise FileError("this record has not begun yet", where=str(path))
+        if "about" not in tables:
             raise FileError("is no journal of an experiment", where=str(path))
         check_format(connection, path)
     except BaseException:

@@ -3,7 +3,8 @@
 The format: Gwyddion user guide, "Format of Gwyddion files". A file is "GWYP" and an object; an object is its name, the
 size of its components, and these: name, type, value. Numbers are little-endian, texts end with a zero byte.
 
-Gwyddion's rows go down from the largest y; ours go up. Its offsets are of the corner of smallest x and y.
+Gwyddion's y points down, and so do its rows: a field lies at the mirrored y. Its sides are those of whole pixels, ours
+end at the middles of the outermost.
 """
 
 from __future__ import annotations
@@ -85,15 +86,16 @@ def spectrum_file(spectrum: Spectrum, meta: Mapping[str, str]) -> bytes:
 def _field(scan: Scan, values: NDArray[np.float64], unit: str) -> bytes:
     rows, columns = values.shape
     (width, height), (left, low) = scan.region.size_m, scan.region.top_left_m
+    pixel_x, pixel_y = width / max(columns - 1, 1), height / max(rows - 1, 1)
     return _object(
         "GwyDataField",
         [
             ("xres", "i", columns),
             ("yres", "i", rows),
-            ("xreal", "d", width),
-            ("yreal", "d", height),
-            ("xoff", "d", left),
-            ("yoff", "d", low),
+            ("xreal", "d", columns * pixel_x),
+            ("yreal", "d", rows * pixel_y),
+            ("xoff", "d", left - pixel_x / 2),
+            ("yoff", "d", -(low + height + pixel_y / 2)),
             ("si_unit_xy", "o", _unit("m")),
             ("si_unit_z", "o", _unit(unit)),
             ("data", "D", values.reshape(-1)),

@@ -1,0 +1,198 @@
+"""The thread that records: it writes what comes, waits for room on a disk, and asks for what was missed."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import afspm
+from afspm import wire
+from afspm.clock import ExperimentClock
+from afspm.components import recording
+from afspm.components.recording import Writer
+from afspm.errors import FileError
+from afspm.model import ControlMode, ControlState, Packet
+from afspm.record import ahead
+from afspm.record.ahead import Ahead, expect_record, recorded_until
+from afspm.record.journal import JOURNAL_FILE
+from afspm.record.store import About, Store
+
+DEADLINE_S = 20.0
+
+
+def control(time_ns: int, holder: str = "series") -> Packet:
+    return Packet("ControlState", wire.encode(ControlState(ControlMode.AUTOMATED, f"{holder}{time_ns}"))[1], time_ns)
+
+
+class Bench:
+    """A run folder with a writer."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.state = folder / "state"
+        self.state.mkdir()
+        expect_record(self.state)
+        self.woken = threading.Event()
+        self.writers: list[Writer] = []
+
+    def writer(self) -> Writer:
+        writer = Writer(
+            self.folder,
+            self.state,
+            About(),
+            ExperimentClock.real(),
+            logging.getLogger("recorder"),
+            step=contextlib.nullcontext,
+            wake=self.woken.set,
+        )
+        self.writers.append(writer)
+        writer.start()
+        return writer
+
+    def times(self) -> list[int | None]:
+        """Of what is recorded; none before the record has begun."""
+        with contextlib.suppress(FileError), afspm.open_run(self.folder) as run:
+            return [packet.time_ns for packet in run.packets()]
+        return []
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    monkeypatch.setattr(recording, "AGAIN_S", 0.02)
+    monkeypatch.setattr(recording, "QUIET_S", 0.02)
+    return Bench(tmp_path)
+
+
+def test_what_was_written_ahead_and_what_is_sent_again_is_recorded_once_in_order(bench: Bench) -> None:
+    noted = Ahead(bench.state / f"scheduler{ahead.FOLDER_SUFFIX}", bench.state / ahead.RECORDED_FILE)
+    for time_ns in (1, 2, 3, 4):
+        noted.note(control(time_ns), None, cached=True)
+    noted.close(ended=False)
+    writer = bench.writer()
+    for time_ns in (2, 4, 5):
+        writer.put(control(time_ns), "")
+    writer.caught_up()
+    writer.put(control(6), "")
+    writer.finish(ended=True)
+    assert bench.times() == [1, 2, 3, 4, 5, 6]
+    assert recorded_until(bench.state / ahead.RECORDED_FILE) == 6
+
+
+def test_a_scheduler_that_does_not_say_when_all_has_come_is_not_waited_for(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "CAUGHT_UP_WITHIN_S", 0.05)
+    writer = bench.writer()
+    writer.put(control(1), "")
+    _until(lambda: bench.times() == [1])
+    writer.finish(ended=False)
+
+
+def test_a_full_disk_is_told_once_and_all_is_recorded_when_there_is_room(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    disk = _Disk(monkeypatch)
+    writer = bench.writer()
+    writer.caught_up()
+    _until(lambda: (bench.folder / JOURNAL_FILE).exists())
+    disk.is_full = True
+    for time_ns in (1, 2):
+        writer.put(control(time_ns), "")
+    _until(lambda: disk.refused > 3)
+    disk.is_full = False
+    writer.put(control(3), "")
+    writer.finish(ended=True)
+    assert bench.times() == [1, 2, 3]
+    assert [r.levelname for r in caplog.records if "can be recorded" in r.message] == ["CRITICAL"]
+    assert not writer.wants_replay()
+
+
+def test_what_did_not_fit_while_the_disk_was_full_is_asked_for_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "MOST_BYTES", 200)
+    disk = _Disk(monkeypatch)
+    disk.is_full = True
+    writer = bench.writer()
+    writer.caught_up()
+    writer.put(control(1), "")
+    _until(lambda: disk.refused > 0)
+    packets = [control(time_ns) for time_ns in range(1, 30)]
+    for packet in packets:
+        writer.put(packet, "")
+    disk.is_full = False
+    assert bench.woken.wait(DEADLINE_S)
+    assert writer.wants_replay()
+    assert not writer.wants_replay(), "once"
+    for packet in packets:  # the scheduler sends again what it has kept
+        writer.put(packet, "")
+    writer.caught_up()
+    writer.finish(ended=True)
+    assert bench.times() == [packet.time_ns for packet in packets]
+
+
+def test_a_damaged_journal_is_put_aside_and_told(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    (bench.folder / JOURNAL_FILE).write_bytes(b"SQLite format 3\0" + b"nonsense" * 1000)
+    writer = bench.writer()
+    writer.caught_up()
+    writer.put(control(1), "")
+    writer.finish(ended=True)
+    assert bench.times() == [1]
+    assert (bench.folder / f"{JOURNAL_FILE}.damaged-1").exists()
+    assert any(record.levelname == "CRITICAL" and "put aside" in record.message for record in caplog.records)
+
+
+def test_what_ends_the_writing_is_raised_where_it_is_noticed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> None:
+        raise RuntimeError("a mistake of ours")
+
+    monkeypatch.setattr(Store, "take", broken)
+    writer = bench.writer()
+    writer.caught_up()
+    writer.put(control(1), "")
+    assert bench.woken.wait(DEADLINE_S)
+    with pytest.raises(RuntimeError, match="mistake of ours"):
+        writer.check()
+
+
+def test_a_packet_without_a_time_gets_that_of_now(bench: Bench) -> None:
+    writer = bench.writer()
+    writer.caught_up()
+    writer.put(Packet("ControlState", control(1).payload), "tcp://another")
+    writer.finish(ended=True)
+    row = afspm.open_run(bench.folder)._query("SELECT source, time_ns > 0 FROM packets")
+    assert row == [("tcp://another", 1)]
+
+
+class _Disk:
+    """A disk that may be full."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.is_full = False
+        self.refused = 0
+        take = Store.take
+
+        def taken(store: Store, packets: Any) -> None:
+            if self.is_full:
+                self.refused += 1
+                raise OSError(errno.ENOSPC, "No space left on device")
+            take(store, packets)
+
+        monkeypatch.setattr(Store, "take", taken)
+
+
+def _until(condition: Callable[[], bool]) -> None:
+    """Wait for what another thread does."""
+    changed = threading.Event()
+    clock = ExperimentClock.real()
+    until_s = clock.monotonic_s() + DEADLINE_S
+    while not condition():
+        assert clock.monotonic_s() < until_s, "it did not happen in time"
+        changed.wait(0.005)

@@ -1,0 +1,132 @@
+"""What is written down ahead of its publication, until it is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from afspm.model import Packet
+from afspm.record import ahead
+from afspm.record.ahead import Ahead, Written, expect_record, recorded_until, say_recorded, written_ahead
+
+Noting = Callable[..., Ahead]
+
+
+def packet(time_ns: int, size: int = 10, envelope: str = "Scan2d_1.0_Height") -> Packet:
+    return Packet(envelope, bytes([time_ns % 251]) * size, time_ns)
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    expect_record(tmp_path)
+    return tmp_path / ahead.RECORDED_FILE
+
+
+@pytest.fixture
+def noting(folder: Path, recorded: Path) -> Iterator[Callable[..., Ahead]]:
+    """Makes what notes packets in the folder, another life each time."""
+    made: list[Ahead] = []
+
+    def make(**settings: int) -> Ahead:
+        made.append(Ahead(folder, recorded, **settings))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close(ended=False)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / f"scheduler{ahead.FOLDER_SUFFIX}"
+
+
+def test_what_was_noted_is_found_in_order(noting: Noting, folder: Path, recorded: Path) -> None:
+    noted = noting()
+    wanted = []
+    for time_ns, source_ns, cached, size in ((1, 1, True, 0), (2, None, True, 10), (5, 4, False, 200_000)):
+        assert noted.note(packet(time_ns, size), source_ns, cached=cached)
+        wanted.append(Written(packet(time_ns, size), source_ns, cached))
+    assert list(written_ahead(folder)) == wanted, "before it is closed: a kill closes nothing"
+    assert list(written_ahead(folder, 2)) == wanted[2:]
+    assert ahead.folders(folder.parent) == [folder]
+
+
+def test_what_a_kill_cut_off_was_not_published(noting: Noting, folder: Path, recorded: Path) -> None:
+    noted = noting()
+    for time_ns in (1, 2):
+        noted.note(packet(time_ns), None, cached=True)
+    (segment,) = folder.iterdir()
+    whole = segment.read_bytes()
+    for length in range(len(whole)):
+        segment.write_bytes(whole[:length])
+        assert [written.packet.time_ns for written in written_ahead(folder)] == (
+            [1] if length >= len(whole) // 2 else []
+        )
+
+
+def test_another_life_goes_on_in_another_file(noting: Noting, folder: Path, recorded: Path) -> None:
+    noting().note(packet(1), None, cached=True)
+    with (folder / "00000001.packets").open("ab") as file:
+        file.write(b"AFp1 half")
+    noting().note(packet(2), None, cached=True)
+    assert [written.packet.time_ns for written in written_ahead(folder)] == [1, 2]
+
+
+def test_what_is_recorded_is_deleted_a_file_at_a_time(
+    noting: Noting, folder: Path, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ahead, "SEGMENT_BYTES", 100)
+    noted = noting()
+    for time_ns in range(1, 10):
+        noted.note(packet(time_ns, 40), None, cached=True)
+    assert len(list(written_ahead(folder))) == 9
+    say_recorded(recorded, 5)
+    for time_ns in range(10, 13):
+        noted.note(packet(time_ns, 40), None, cached=True)
+    times = [written.packet.time_ns for written in written_ahead(folder)]
+    assert times[-7:] == [6, 7, 8, 9, 10, 11, 12]
+    assert times[0] is not None
+    assert times[0] > 2, times
+
+
+def test_no_more_than_a_bound_waits_and_it_is_said(
+    noting: Noting, folder: Path, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ahead, "SEGMENT_BYTES", 100)
+    noted = noting(most_bytes=500)
+    kept = [noted.note(packet(time_ns, 40), None, cached=True) for time_ns in range(1, 20)]
+    assert kept[0]
+    assert not kept[-1]
+    assert sum(file.stat().st_size for file in folder.iterdir()) <= 500
+    say_recorded(recorded, 19)
+    assert noted.note(packet(20), None, cached=True), "there is room again"
+
+
+def test_at_the_end_nothing_is_left_if_all_is_recorded(noting: Noting, folder: Path, recorded: Path) -> None:
+    noted = noting()
+    noted.note(packet(1), None, cached=True)
+    say_recorded(recorded, 1)
+    noted.close(ended=True)
+    assert not folder.exists()
+
+
+def test_at_the_end_what_is_not_recorded_stays(noting: Noting, folder: Path, recorded: Path) -> None:
+    noted = noting()
+    noted.note(packet(7), None, cached=True)
+    noted.close(ended=True)
+    assert [written.packet.time_ns for written in written_ahead(folder)] == [7]
+
+
+def test_until_when_it_is_recorded_is_known_from_the_beginning(tmp_path: Path) -> None:
+    file = tmp_path / ahead.RECORDED_FILE
+    assert (file.exists(), recorded_until(file)) == (False, -1)
+    expect_record(tmp_path)
+    assert (file.exists(), recorded_until(file)) == (True, -1)
+    say_recorded(file, 17)
+    expect_record(tmp_path)
+    assert recorded_until(file) == 17
+    file.write_text("half a num")
+    assert recorded_until(file) == -1

@@ -1,0 +1,176 @@
+"""Exports hold what was measured, as readers of others see it."""
+
+from __future__ import annotations
+
+import csv
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from record_lab import REGION, Night
+
+import afspm
+from afspm.errors import FileError, InvalidValue
+from afspm.model import ScopeState
+from afspm.record.export import chosen, export
+from afspm.record.run import Run
+from afspm.record.store import Store
+
+
+@pytest.fixture
+def run(night: Night, store: Store, tmp_path: Path) -> Run:
+    store.take([night.control(), *night.whole_scan(1), *night.whole_scan(2)])
+    store.take([night.state(ScopeState.SCANNING), night.lines(2), night.state(ScopeState.INTERRUPTED)])
+    store.take([night.state(ScopeState.SPEC), night.spectrum(), night.state(ScopeState.FREE)])
+    return afspm.open_run(tmp_path)
+
+
+def parsed(data: bytes) -> dict[str, Any]:
+    """A .gwy file as nested dicts, by the description of the format alone."""
+    assert data[:4] == b"GWYP"
+    (name, content), end = _object(data, 4)
+    assert (name, end) == ("GwyContainer", len(data))
+    return content
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    end = data.index(b"\0", at)
+    return data[at:end].decode(), end + 1
+
+
+def _object(data: bytes, at: int) -> tuple[tuple[str, dict[str, Any]], int]:
+    name, at = _text(data, at)
+    (size,) = struct.unpack_from("<I", data, at)
+    at, end, items = at + 4, at + 4 + size, {}
+    while at < end:
+        key, at = _text(data, at)
+        kind, at = chr(data[at]), at + 1
+        items[key], at = _value(kind, data, at)
+    assert at == end
+    return (name, items), end
+
+
+def _value(kind: str, data: bytes, at: int) -> tuple[Any, int]:
+    if kind == "b":
+        return bool(data[at]), at + 1
+    if kind in "id":
+        form, size = {"i": ("<i", 4), "d": ("<d", 8)}[kind]
+        return struct.unpack_from(form, data, at)[0], at + size
+    if kind == "s":
+        return _text(data, at)
+    if kind == "o":
+        return _object(data, at)
+    (count,) = struct.unpack_from("<I", data, at)
+    at += 4
+    if kind == "D":
+        return np.frombuffer(data, "<f8", count, at), at + 8 * count
+    assert kind == "O", kind
+    found = []
+    for _ in range(count):
+        one, at = _object(data, at)
+        found.append(one)
+    return found, at
+
+
+def test_gwyddion_gets_every_channel_with_place_and_units(run: Run, tmp_path: Path) -> None:
+    files = list(export(run, "gwy", tmp_path / "out", "1"))
+    assert [file.name for file in files] == [Path(run.scans[0].file).stem + ".gwy"]
+    content = parsed(files[0].read_bytes())
+    for number, (channel, scan) in enumerate(run.scan(0).items()):
+        kind, field = content[f"/{number}/data"]
+        assert (kind, content[f"/{number}/data/title"]) == ("GwyDataField", channel)
+        assert (field["xres"], field["yres"]) == (8, 6)
+        assert np.array_equal(field["data"].reshape(6, 8)[::-1], scan.values)
+        # the sides of Gwyddion are those of whole pixels
+        assert field["xreal"] == pytest.approx(REGION.size_m[0] * 8 / 7)
+        assert field["xoff"] + field["xreal"] / 2 == pytest.approx(REGION.center_m[0])
+        assert field["yoff"] + field["yreal"] / 2 == pytest.approx(-REGION.center_m[1])
+        assert field["si_unit_xy"] == field["si_unit_z"] == ("GwySIUnit", {"unitstr": "m"})
+        assert content[f"/{number}/meta"][1]["in_control"] == "series"
+
+
+def test_an_independent_reader_of_gwyddion_files_reads_them(run: Run, tmp_path: Path) -> None:
+    gwyfile = pytest.importorskip("gwyfile", reason="a reader of others, if it is installed")
+    (file,) = export(run, "gwy", tmp_path / "out", "2")
+    channels = gwyfile.util.get_datafields(gwyfile.load(str(file)))
+    assert {name: field.data.shape for name, field in channels.items()} == {"Height": (6, 8), "Height Retrace": (6, 8)}
+    assert np.array_equal(channels["Height"].data[::-1], run.scan(1)["Height"].values)
+
+
+def test_what_was_not_measured_is_masked_for_gwyddion(run: Run, tmp_path: Path) -> None:
+    (file,) = export(run, "gwy", tmp_path / "out", "3")
+    content = parsed(file.read_bytes())
+    mask = content["/0/mask"][1]["data"].reshape(6, 8)[::-1]
+    assert np.array_equal(mask.astype(bool), np.isnan(run.scan(2)["Height"].values))
+    assert np.isfinite(content["/0/data"][1]["data"]).all()
+
+
+def test_gwyddion_gets_the_curves_of_a_spectrum(run: Run, tmp_path: Path) -> None:
+    file = next(file for file in export(run, "gwy", tmp_path / "out") if Path(run.spectra[0].file).stem in file.name)
+    model = parsed(file.read_bytes())["/0/graph/graph/1"][1]
+    ((kind, curve),) = model["curves"]
+    assert (kind, model["y_unit"][1]["unitstr"], curve["description"]) == ("GwyGraphCurveModel", "A", "Current")
+    assert np.array_equal(curve["ydata"], run.spectrum(0)["Current"])
+
+
+def test_netcdf_is_read_by_xarray(run: Run, tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("scipy")
+    files = list(export(run, "nc", tmp_path / "out"))
+    assert len(files) == 4
+    with xarray.open_dataset(files[0], engine="scipy") as found:
+        assert np.array_equal(found["height"].values, run.scan(0)["Height"].values)
+        assert (found["height"].units, found["x"].units, found.in_control) == ("m", "m", "series")
+        assert float(found["y"][-1]) == pytest.approx(-1.75e-6)
+    with xarray.open_dataset(files[-1], engine="scipy") as found:
+        assert np.array_equal(found["current"].values, run.spectrum(0)["Current"])
+
+
+def test_pictures_are_there_for_every_channel(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    names = [file.name for file in export(run, "png", tmp_path / "out")]
+    stems = [Path(row.file).stem for row in run.scans]
+    assert names[:2] == [f"{stems[0]}_Height.png", f"{stems[0]}_Height_Retrace.png"]
+    assert len(names) == 2 + 2 + 1 + 1
+    assert all((tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG") for name in names)
+
+
+def test_tables_have_their_columns_even_if_they_are_empty(run: Run, tmp_path: Path) -> None:
+    files = {file.name: file for file in export(run, "csv", tmp_path / "out")}
+    with files["scans.csv"].open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["number"] for row in rows] == ["1", "2", "3"]
+    assert rows[0]["time"].startswith("2026-03-14T20:00:00.")
+    assert [row["interrupted"] for row in rows] == ["False", "False", "True"]
+    assert files["drift.csv"].read_text(encoding="utf-8").startswith("time,x_m,y_m,rate_x_m_s")
+    curve = files[Path(run.spectra[0].file).stem + ".csv"].read_text(encoding="utf-8").splitlines()
+    assert curve[0] == "Bias [V],Current [A],dI/dV [S]"
+    assert float(curve[1].split(",")[1]) == run.spectrum(0)["Current"][0]
+
+
+@pytest.mark.parametrize(("numbers", "meant"), [("2", [2]), ("1-2", [1, 2]), ("3, 1", [3, 1]), ("2-", [2, 3])])
+def test_scans_are_chosen_by_their_numbers(run: Run, numbers: str, meant: list[int]) -> None:
+    assert [row.number for row in chosen(list(run.scans), numbers)] == meant
+
+
+@pytest.mark.parametrize("numbers", ["", "x", "0", "4", "1-9", "2-1", "1;2"])
+def test_what_is_no_scan_is_refused(run: Run, numbers: str) -> None:
+    with pytest.raises(InvalidValue):
+        chosen(list(run.scans), numbers)
+
+
+def test_an_unknown_format_and_an_impossible_folder_are_refused(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(InvalidValue, match="no format 'doc'"):
+        list(export(run, "doc", tmp_path))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileError, match="can't be written"):
+        list(export(run, "gwy", tmp_path / "file"))
+
+
+def test_what_was_not_seen_is_told_and_left_out(night: Night, store: Store, tmp_path: Path) -> None:
+    store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])
+    told: list[str] = []
+    assert list(export(afspm.open_run(tmp_path), "gwy", tmp_path / "out", tell=told.append)) == []
+    assert told == ["scan 1 was interrupted before anything of it was seen"]

@@ -1,0 +1,172 @@
+"""Runs that go on, that were killed, that are damaged or are none, as open_run sees them."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from record_lab import ABOUT, Night
+
+import afspm
+from afspm.errors import FileError
+from afspm.model import ScopeState
+from afspm.record.journal import JOURNAL_FILE
+from afspm.record.store import Store
+
+
+def test_a_run_that_goes_on_is_read_as_far_as_it_is(night: Night, store: Store, tmp_path: Path) -> None:
+    run = afspm.open_run(tmp_path)
+    assert len(run.scans) == 0
+    store.take(night.whole_scan(1))
+    assert len(run.scans) == 1
+    assert run.scan(-1).first.filename == "scan-0001.nc"
+
+
+def test_a_killed_run_is_read_from_what_it_left(night: Night, store: Store, tmp_path: Path) -> None:
+    store.take(night.whole_scan(1))
+    left = tmp_path / "left"
+    left.mkdir()
+    for file in tmp_path.glob(f"{JOURNAL_FILE}*"):  # with all that was not yet put into the main file
+        (left / file.name).write_bytes(file.read_bytes())
+    assert len(afspm.open_run(left).scans) == 1
+
+
+def test_reading_changes_nothing(night: Night, tmp_path: Path) -> None:
+    store = Store(tmp_path, ABOUT)
+    store.take(night.whole_scan(1))
+    store.close()
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    with afspm.open_run(tmp_path) as run:
+        run.scan(0)
+        run.overview()
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.suffix in (".sqlite", ".h5")} == before
+
+
+def test_the_newest_of_a_folder_of_runs_is_meant(night: Night, tmp_path: Path) -> None:
+    (tmp_path / "night-2").mkdir()
+    Store(tmp_path / "night-2", ABOUT).close()
+    (tmp_path / "latest").write_text("night-2\n")
+    assert afspm.open_run(tmp_path).folder == tmp_path / "night-2"
+
+
+def test_a_folder_without_a_record_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no record") as caught:
+        afspm.open_run(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a database at all" * 100, b"SQLite format 3\0" + bytes(500)])
+def test_a_damaged_journal_is_named(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / JOURNAL_FILE).write_bytes(content)
+    with pytest.raises(FileError) as caught:
+        afspm.open_run(tmp_path)
+    assert JOURNAL_FILE in str(caught.value)
+    with pytest.raises((FileError, sqlite3.OperationalError)) if content else _nothing():
+        Store(tmp_path, ABOUT).close()
+
+
+class _nothing:  # noqa: N801 - an empty file is a new journal to whoever writes
+    def __enter__(self) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
+
+
+def test_a_journal_that_is_damaged_inside_is_named_when_that_is_read(night: Night, tmp_path: Path) -> None:
+    store = Store(tmp_path, ABOUT)
+    for number in range(1, 40):
+        store.take(night.whole_scan(number))
+    store.close()
+    data = bytearray((tmp_path / JOURNAL_FILE).read_bytes())
+    data[8192:] = np.random.default_rng(1).bytes(len(data) - 8192)
+    (tmp_path / JOURNAL_FILE).write_bytes(data)
+    with pytest.raises(FileError, match=r"journal\.sqlite"):
+        _read_all(tmp_path)
+
+
+def _read_all(folder: Path) -> None:
+    with afspm.open_run(folder) as run:
+        list(run.scans)
+        list(run.packets())
+
+
+def test_the_journal_of_a_version_to_come_is_refused(tmp_path: Path) -> None:
+    Store(tmp_path, ABOUT).close()
+    with sqlite3.connect(tmp_path / JOURNAL_FILE) as connection:
+        connection.execute("UPDATE about SET value = 'afspm record 2' WHERE name = 'format'")
+    connection.close()
+    with pytest.raises(FileError, match="afspm record 2"):
+        afspm.open_run(tmp_path)
+
+
+def test_a_database_of_others_is_refused(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / JOURNAL_FILE) as connection:
+        connection.execute("CREATE TABLE cats (name TEXT)")
+    connection.close()
+    with pytest.raises(FileError, match="no journal"):
+        afspm.open_run(tmp_path)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\x89HDF\r\n\x1a\n" + bytes(100)])
+def test_a_damaged_or_missing_file_of_a_scan_is_named(
+    night: Night, store: Store, tmp_path: Path, content: bytes | None
+) -> None:
+    store.take([*night.whole_scan(1), *night.whole_scan(2)])
+    run = afspm.open_run(tmp_path)
+    file = tmp_path / run.scans[0].file
+    if content is None:
+        file.unlink()
+    else:
+        file.write_bytes(content)
+    with pytest.raises(FileError) as caught:
+        run.scan(0)
+    assert file.name in str(caught.value)
+    assert len(run.scan(1)) == 2  # the others are there
+    with pytest.raises(FileError):
+        list(run.packets())
+
+
+def test_half_a_file_is_named(night: Night, store: Store, tmp_path: Path) -> None:
+    store.take(night.whole_scan(1))
+    run = afspm.open_run(tmp_path)
+    file = tmp_path / run.scans[0].file
+    for part in (0.3, 0.6, 0.9):
+        whole = file.read_bytes()
+        file.write_bytes(whole[: int(len(whole) * part)])
+        with pytest.raises(FileError, match=file.name):
+            run.scan(0)
+        file.write_bytes(whole)
+    assert len(run.scan(0)) == 2
+
+
+def test_there_is_no_scan_beyond_the_last(night: Night, store: Store, tmp_path: Path) -> None:
+    store.take(night.whole_scan(1))
+    run = afspm.open_run(tmp_path)
+    for index in (1, -2):
+        with pytest.raises(IndexError):
+            run.scan(index)
+
+
+def test_tables_become_arrays_and_datasets(night: Night, store: Store, tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    store.take([night.control(), *night.whole_scan(1)])
+    store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])
+    run = afspm.open_run(tmp_path)
+    found = run.scans.to_numpy()
+    assert found["time_ns"].dtype == np.dtype("datetime64[ns]")
+    assert found["center_x_m"][0] == 1e-6
+    assert np.isnan(found["center_x_m"][1])
+    assert list(found["rows"]) == [6, -1]
+    assert list(found["interrupted"]) == [False, True]
+    assert isinstance(run.control.to_xarray(), xarray.Dataset)
+    assert run.scans[:1].to_xarray().sizes["row"] == 1
+    assert [row.number for row in run.scans.where(lambda row: row.interrupted)] == [2]
+
+
+def test_the_overview_comes_without_reading_files(night: Night, store: Store, tmp_path: Path) -> None:
+    store.take([night.control("series", (4,)), *night.whole_scan(1)])
+    run = afspm.open_run(tmp_path)
+    (tmp_path / run.scans[0].file).unlink()
+    overview = run.overview()
+    assert [(scan.channel, scan.shape) for scan in overview.scans] == [("Height", (6, 8)), ("Height Retrace", (6, 8))]
+    assert [row.name for row in run.problems] == ["thermal-drift"]

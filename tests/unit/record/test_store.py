@@ -1,0 +1,272 @@
+"""What is given to the store is in the record: once, whole, with the circumstances."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from record_lab import ABOUT, REGION, START_NS, Night, same
+
+import afspm
+from afspm import wire
+from afspm.errors import FileError
+from afspm.files import read
+from afspm.model import (
+    Frame,
+    JournalEntries,
+    JournalEntry,
+    LogLine,
+    LogLines,
+    Packet,
+    ProblemNames,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    ScopeState,
+)
+from afspm.record.store import About, Store
+
+
+def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(night: Night, store: Store, tmp_path: Path) -> None:
+    given = [night.control("series", (1,)), night.feedback(), *night.whole_scan(1)]
+    store.take(given)
+    run = afspm.open_run(tmp_path)
+    (row,) = run.scans
+    assert (row.holder, row.mode, row.problems) == ("series", "automated", ("tip-shape-changed",))
+    assert (row.channels, row.shape) == ((("Height", "m"), ("Height Retrace", "m")), (6, 8))
+    assert row.began_ns == given[2][0].time_ns
+    assert row.file == "scans/20260314T200000.003000Z-00001.h5"
+    for packet, _ in given[3:5]:
+        scan = wire.decode("Scan2d", packet.payload)
+        assert np.array_equal(run.scan(0)[scan.channel].values, scan.values)
+        assert run.scan(0)[scan.channel].region == scan.region
+    about = run.about(row)
+    assert about["feedback"] == {"on": True, "proportional_gain": 0.125, "integral_gain": 1500.0, "setpoint": 0.75}
+    assert (about["experiment"], about["seeds"], about["simulated"]) == ("night", {"microscope": 7}, True)
+
+
+def test_the_file_follows_nexus(night: Night, store: Store, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    store.take(night.whole_scan(1))
+    with h5py.File(tmp_path / afspm.open_run(tmp_path).scans[0].file) as file:
+        assert file.attrs["NX_class"] == "NXroot"
+        entry = file[file.attrs["default"]]
+        assert (entry.attrs["NX_class"], entry["definition"].asstr()[()]) == ("NXentry", "NXspm")
+        data = entry[entry.attrs["default"]]
+        assert data.attrs["NX_class"] == "NXdata"
+        signals = [data.attrs["signal"], *data.attrs["auxiliary_signals"]]
+        assert [data[name].attrs["long_name"] for name in signals] == ["Height", "Height Retrace"]
+        rows, columns = (data[axis] for axis in data.attrs["axes"])
+        assert data[signals[0]].shape == (len(rows), len(columns))
+        assert {data[name].attrs["units"] for name in (*signals, *data.attrs["axes"])} == {"m"}
+        assert [rows[0], rows[-1]] == pytest.approx([-2.25e-6, -1.75e-6])
+        region = entry["experiment_instrument/scan_environment/scan_control/scan_region"]
+        assert region["scan_offset_value_x"][()] == pytest.approx(REGION.center_m[0])
+        assert region["scan_angle_x"][()] == pytest.approx(np.degrees(0.25))
+        assert entry["experiment_description"].asstr()[()] == "SIMULATED"
+
+
+def test_what_is_given_again_changes_nothing(night: Night, store: Store, tmp_path: Path) -> None:
+    given = [night.control(), *night.whole_scan(1), night.state(ScopeState.SPEC), night.spectrum()]
+    for _ in range(3):
+        store.take(given)
+    again = Store(tmp_path, ABOUT)  # in another life
+    again.take(given)
+    again.close()
+    run = afspm.open_run(tmp_path)
+    assert (len(run.scans), len(run.spectra)) == (1, 1)
+    assert len(list((tmp_path / "scans").iterdir())) == 1
+    assert same(list(run.packets()), given)
+
+
+def test_everything_comes_out_as_it_was_published(night: Night, store: Store, tmp_path: Path) -> None:
+    given = [night.control(), night.feedback(), night.state(ScopeState.SCANNING), night.lines(2), night.lines(4, 2)]
+    given += [*night.scans(1), night.state(ScopeState.FREE), night.state(ScopeState.SPEC), night.spectrum()]
+    # what lines show is part of the scan that comes
+    height = wire.decode("Scan2d", given[5][0].payload).values
+    for at, rows in ((3, slice(0, 2)), (4, slice(2, 6))):
+        lines = wire.decode("ScanLines", given[at][0].payload)
+        payload = wire.encode(type(lines)(**{**_fields(lines), "values": height[rows]}))[1]
+        given[at] = (Packet("ScanLines", payload, given[at][0].time_ns), given[at][1])
+    store.take(given)
+    run = afspm.open_run(tmp_path)
+    assert same(list(run.packets()), given)
+    assert same(list(run.packets(messages=["ControlState"])), given[:1])
+    assert same(list(run.packets(since_ns=given[6][0].time_ns or 0)), given[7:])
+
+
+def _fields(lines: Any) -> dict[str, Any]:
+    return {name: getattr(lines, name) for name in ("region", "shape", "channel", "unit", "first_row", "began_ns")}
+
+
+def test_packets_of_unknown_messages_are_kept_as_they_are(store: Store, tmp_path: Path) -> None:
+    strange = (Packet("Peaks_of_mine", b"\x01\x02", START_NS), "")
+    store.take([strange])
+    assert same(list(afspm.open_run(tmp_path).packets()), [strange])
+
+
+def test_a_channel_that_comes_after_a_kill_joins_the_others(night: Night, tmp_path: Path) -> None:
+    scanning, first, second, free = night.whole_scan(1)
+    store = Store(tmp_path, ABOUT)
+    store.take([scanning, first])
+    store.flush()
+    store.close()
+    again = Store(tmp_path, ABOUT)
+    again.take([scanning, first, second, free])
+    again.close()
+    run = afspm.open_run(tmp_path)
+    assert list(run.scan(0)) == ["Height", "Height Retrace"]
+    assert [name for name, _ in run.scans[0].channels] == ["Height", "Height Retrace"]
+    assert len(list((tmp_path / "scans").iterdir())) == 1
+    assert same(list(run.packets()), [scanning, first, second, free])
+
+
+def test_an_interrupted_scan_is_kept_as_far_as_it_was_seen(night: Night, store: Store, tmp_path: Path) -> None:
+    given = [night.control(), night.state(ScopeState.SCANNING), night.lines(2, 0), night.lines(1, 2)]
+    given += [night.state(ScopeState.INTERRUPTED), night.state(ScopeState.FREE)]
+    store.take(given)
+    run = afspm.open_run(tmp_path)
+    (row,) = run.scans
+    assert (row.interrupted, row.holder, row.began_ns) == (True, "series", given[1][0].time_ns)
+    values = run.scan(row)["Height"].values
+    assert np.isfinite(values[:3]).all()
+    assert np.isnan(values[3:]).all()
+    assert same(list(run.packets()), given)
+
+
+def test_an_interrupted_scan_of_which_nothing_was_seen_has_a_row(night: Night, store: Store, tmp_path: Path) -> None:
+    store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED), night.state(ScopeState.FREE)])
+    run = afspm.open_run(tmp_path)
+    (row,) = run.scans
+    assert (row.interrupted, row.file, row.region, row.channels) == (True, "", None, ())
+    with pytest.raises(FileError, match="interrupted before anything"):
+        run.scan(0)
+
+
+def test_a_scan_that_vanished_is_kept_when_the_next_begins(night: Night, store: Store, tmp_path: Path) -> None:
+    store.take([night.state(ScopeState.SCANNING), night.lines(), night.state(ScopeState.UNDEFINED)])
+    store.take(night.whole_scan(2))
+    assert [row.interrupted for row in afspm.open_run(tmp_path).scans] == [True, False]
+
+
+def test_what_waits_for_the_rest_of_its_scan_is_not_recorded_yet(night: Night, store: Store) -> None:
+    scanning, first, _, _ = night.whole_scan(1)
+    store.take([scanning, first])
+    assert store.recorded_ns == (first[0].time_ns or 0) - 1
+    store.flush()
+    assert store.recorded_ns == first[0].time_ns
+
+
+def test_a_full_disk_leaves_nothing_behind_and_all_is_recorded_later(
+    night: Night, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [night.control(), *night.whole_scan(1)]
+    real = os.fsync
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        store.take(given)
+    run = afspm.open_run(tmp_path)
+    assert (len(run.scans), list(run.packets()), list((tmp_path / "scans").iterdir())) == (0, [], [])
+    monkeypatch.setattr(os, "fsync", real)
+    store.take(given)
+    assert same(list(run.packets()), given)
+    assert len(run.scan(0)) == 2
+
+
+def test_a_file_that_was_written_right_before_a_kill_is_not_there_twice(night: Night, tmp_path: Path) -> None:
+    given = night.whole_scan(1)
+    store = Store(tmp_path, ABOUT)
+    store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])  # it gets number 1
+    store.close()
+    stamp = "20260314T200000.001000Z"
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / f"{stamp}-00001.h5").write_bytes(b"of a transaction that was not committed")
+    (tmp_path / "scans" / f"{stamp}-00002.h5.part").write_bytes(b"half")
+    again = Store(tmp_path, ABOUT)
+    again.take(given)
+    again.close()
+    assert [file.name for file in (tmp_path / "scans").iterdir()] == [f"{stamp}-00002.h5"]
+    assert afspm.open_run(tmp_path).scans[-1].file == f"scans/{stamp}-00002.h5"
+
+
+def test_sample_coordinates_are_named(night: Night, tmp_path: Path) -> None:
+    store = Store(tmp_path, About({"frame": "sample"}, ProblemNames(), Frame.SAMPLE))
+    store.take([*night.whole_scan(1), night.spectrum()])
+    store.close()
+    run = afspm.open_run(tmp_path)
+    assert run.scans[0].region is not None
+    assert run.scans[0].region.frame is Frame.SAMPLE
+    assert run.scan(0)["Height"].region.frame is run.spectrum(0).frame is Frame.SAMPLE
+
+
+def test_without_scans_there_is_the_journal_alone(night: Night, tmp_path: Path) -> None:
+    store = Store(tmp_path, About(measured=False))
+    store.take([night.control(), *night.whole_scan(1)])
+    store.close()
+    run = afspm.open_run(tmp_path)
+    assert (len(run.scans), len(run.control), (tmp_path / "scans").exists()) == (0, 1, False)
+    assert len(list(run.packets())) == 5
+
+
+def test_the_controllers_header_is_kept_where_its_file_can_be_read(night: Night, store: Store, tmp_path: Path) -> None:
+    head = b"Gwyddion Simple Field 1.0\nXRes = 2\nYRes = 2\nXReal = 1e-6\nYReal = 1e-6\nTitle = Mine\n"
+    (tmp_path / "scan-0001.gsf").write_bytes(head + bytes(4 - len(head) % 4) + bytes(4 * 4))
+    scanning, *channels, free = night.whole_scan(1)
+    store.take([scanning, *((_named(packet), source) for packet, source in channels), free])
+    run = afspm.open_run(tmp_path)
+    expected = read(tmp_path / "scan-0001.gsf").header
+    assert expected
+    assert {name: run.about(run.scans[0])[name] for name in expected} == dict(expected)
+
+
+def _named(packet: Packet) -> Packet:
+    from dataclasses import replace
+
+    scan = wire.decode("Scan2d", packet.payload)
+    return Packet(packet.envelope, wire.encode(replace(scan, filename="scan-0001.gsf"))[1], packet.time_ns)
+
+
+def test_requests_processes_and_log_lines_have_their_tables(night: Night, store: Store, tmp_path: Path) -> None:
+    entries = (
+        JournalEntry(1, "request", "series", "start-scan", 0, "", 0.01),
+        JournalEntry(2, "request", "dashboard:Ada", "start-scan", 6, "the series is in control", 0.02),
+    )
+    alive, again = (
+        ProcessState("series", "component", condition, since, 0.5, starts, 4711, exit_)
+        for condition, since, starts, exit_ in (
+            (ProcessCondition.ALIVE, 5, 1, ""),
+            (ProcessCondition.ALIVE, 9, 2, "killed by SIGKILL"),
+        )
+    )
+    states = [
+        night.packet(ProcessStates(time, "lab", (state,))) for time, state in ((5, alive), (7, alive), (9, again))
+    ]
+    log = night.packet(LogLines((LogLine(3, "series", "INFO", "scan 1 of 3"),)))
+    store.take([night.packet(JournalEntries(entries)), *states, log])
+    run = afspm.open_run(tmp_path)
+    assert tuple(run.journal) == entries
+    assert tuple(run.refusals) == entries[1:]
+    assert [row.starts for row in run.processes] == [1, 2]
+    assert [(row.name, row.starts, row.last_exit) for row in run.restarts] == [("series", 2, "killed by SIGKILL")]
+    assert [line.text for line in run.log] == ["scan 1 of 3"]
+
+
+def test_only_one_transaction_is_written_at_a_time_and_readers_never_wait(
+    night: Night, store: Store, tmp_path: Path
+) -> None:
+    run = afspm.open_run(tmp_path)
+    with store._all_or_nothing():
+        store._take(*night.control())
+        assert len(run.control) == 0
+    assert len(run.control) == 1
+    with pytest.raises(sqlite3.OperationalError):
+        run._journal.execute("DELETE FROM packets")
