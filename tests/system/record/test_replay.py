@@ -1,0 +1,118 @@
+"""A recorded run is published again, and joined like a running experiment."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import afspm
+from afspm import wire
+from afspm.errors import ConfigError, RequestError
+from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
+from afspm.record.store import About, Store
+from afspm.supervisor import replaying
+
+START_NS = 1_773_518_400_000_000_000
+STEP_NS = 60_000_000_000  # experiment time between two packets
+SCANS = 30
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half an hour, with a scan every minute."""
+    folder = tmp_path_factory.mktemp("recorded")
+    store = Store(folder, About({"experiment": "night", "simulated": True, "frame": "tip"}))
+    things: list[tuple[str, object]] = [
+        ("ControlState", ControlState(ControlMode.AUTOMATED, "series", ())),
+        ("ScopeStateMsg", ScopeStatus(ScopeState.FREE)),
+    ]
+    for number in range(SCANS):
+        values = np.full((4, 4), float(number))
+        scan = Scan(Region((0, 0), (1e-6, 1e-6)), "Height", "m", values, START_NS + number, f"{number}.nc")
+        things.append(("Scan2d_1000.0_Height", scan))
+    packets = [
+        Packet(envelope, wire.encode(thing)[1], START_NS + number * STEP_NS)
+        for number, (envelope, thing) in enumerate(things)
+    ]
+    store.take((packet, "") for packet in packets)
+    store.flush()
+    store.close()
+    (folder / "run.json").write_text(json.dumps({"name": "night", "clock": {"speed": 600.0}}), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def replay(recorded: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A replay that has said where it is: a scan a tenth of a second."""
+    command = [sys.executable, "-m", "afspm", "replay", str(recorded), "--stay"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert "at 600 experiment seconds a second" in line
+    yield process
+    process.kill()
+    process.stdout.close()
+    process.wait()
+
+
+def test_a_notebook_joins_gets_what_was_published_and_is_refused_clearly(
+    replay: subprocess.Popen[str], recorded: Path, tmp_path: Path
+) -> None:
+    with afspm.open_run(recorded) as run:
+        published = {(packet.envelope, packet.time_ns): bytes(packet.payload) for packet in run.packets()}
+    with afspm.connect(tmp_path / "runs") as scope:
+        seen = []
+        for event in scope.events("Scan2d", timeout_s=20.0):
+            seen.append(event)
+            if event.message.values[0, 0] == SCANS - 1:
+                break
+        assert scope.control_state is not None
+        assert scope.control_state.holder == "series"
+        times = [event.time_ns for event in seen]
+        assert times == sorted(times)
+        assert all((event.envelope, event.time_ns) in published for event in seen)
+        with pytest.raises(RequestError, match="this is a replay"):
+            scope.flag("thermal-drift")
+        with pytest.raises(RequestError, match="this is a replay"):
+            scope.action("start-scan")
+    with afspm.connect(tmp_path / "runs", "late") as late:  # who joins late gets what was kept
+        assert late.control_state is not None
+        assert late.control_state.holder == "series"
+
+
+def test_it_ends_as_an_experiment_does_with_its_folder_saying_so(recorded: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    options = replaying.Options(speed=1e6, only=["Scan2d"], runs=tmp_path / "runs")
+    assert replaying.replay(recorded, options, told.append) == SCANS
+    assert "1e+06 experiment seconds a second" in told[0]
+    (folder,) = (tmp_path / "runs").glob("replay-*")
+    facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    assert (facts["replay_of"], facts["ended"]) == (str(recorded), "the replay is over")
+
+
+def test_what_cannot_be_replayed_is_told(recorded: Path, tmp_path: Path) -> None:
+    for only, said in ((["Scan3d"], "no message 'Scan3d'"), (["Spec1d"], "nothing to replay")):
+        with pytest.raises(ConfigError, match=said):
+            replaying.replay(recorded, replaying.Options(only=only, runs=tmp_path), lambda _: None)
+
+
+def test_the_addresses_of_the_experiment_file_are_taken(recorded: Path, tmp_path: Path) -> None:
+    file = recorded / "experiment.toml"
+    file.write_text(
+        '[scheduler]\ncomponent = true\nclass = "Scheduler"\npubsubcache = "tcp://127.0.0.1:19471"\n'
+        'router = "tcp://127.0.0.1:19472"\n',
+        encoding="utf-8",
+    )
+    with afspm.open_run(recorded) as run:
+        assert replaying._addresses(run, replaying.Options()) == ("tcp://127.0.0.1:19471", "tcp://127.0.0.1:19472")
+        assert replaying._addresses(run, replaying.Options(publish="tcp://127.0.0.1:1", serve="tcp://127.0.0.1:2")) == (
+            "tcp://127.0.0.1:1",
+            "tcp://127.0.0.1:2",
+        )
+    file.unlink()

@@ -1,0 +1,131 @@
+"""What can be resumed, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.clock import NS_PER_S
+from afspm.errors import ConfigError, FileError
+from afspm.supervisor import resuming, run_folder
+from afspm.supervisor.run import Options
+
+EXPERIMENT = """
+[clock]
+start = 2026-03-14T20:00:00Z
+speed = 600.0
+
+[microscope]
+component = true
+class = "Simulator"
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[short]
+component = true
+class = "short.Short"
+"""
+COMPONENT = """
+from afspm import Component
+
+
+class Short(Component):
+    def run(self):
+        self.memory["lives"] = self.memory.get("lives", 0) + 1
+        self.memory.setdefault("began_s", self.clock.now_s())
+        self.memory["now_s"] = self.clock.now_s()
+        self.memory.save()
+        if self.memory["lives"] > 1:
+            self.scope.end_experiment()
+        self.scope.scan(shape=(16, 16), key="a")
+        while True:
+            self.scope.sleep(60.0)
+"""
+
+
+def afspm_run(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "afspm", "run", *arguments],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def output_until(process: subprocess.Popen[str], wanted: str) -> str:
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if wanted in line:
+            return line
+    raise AssertionError(f"{wanted!r} did not come:\n{''.join(lines)}")
+
+
+def memory(run: Path) -> dict[str, Any]:
+    kept: dict[str, Any] = json.loads((run / "state" / "short.json").read_text(encoding="utf-8"))
+    return kept
+
+
+def test_a_stopped_run_goes_on_where_it_was_and_an_ended_one_does_not(tmp_path: Path) -> None:
+    beside, away = tmp_path / "lab", tmp_path / "away"
+    beside.mkdir()
+    away.mkdir()
+    (beside / "night.toml").write_text(EXPERIMENT, encoding="utf-8")
+    (beside / "short.py").write_text(COMPONENT, encoding="utf-8")  # found again though the run is elsewhere
+    first = afspm_run(away, str(beside / "night.toml"))
+    run = Path(output_until(first, "processes, into").strip().rpartition(", into ")[2])
+    output_until(first, "is in control")
+    with pytest.raises(FileError, match="still going on"):
+        resuming.resume(resuming.find(run), Options())
+    first.kill()  # the supervisor alone: the others find out by themselves
+    first.wait()
+    assert first.stdout is not None
+    first.stdout.close()
+    before = memory(run)
+    seen_ns = resuming.last_seen_ns(run)
+    again = afspm_run(away, "--resume", "runs")
+    told = again.communicate(timeout=60.0)[0]
+    assert again.returncode == 0, told
+    after = memory(run)
+    assert after["lives"] == 2, told
+    assert after["began_s"] == before["began_s"]
+    assert after["now_s"] > seen_ns / NS_PER_S
+    assert after["now_s"] - before["now_s"] < 6 * 3600, "time stands still while nobody is there"
+    assert (run / "log.txt").read_text(encoding="utf-8").count("processes, into") == 2
+    with pytest.raises(ConfigError, match="has ended"):
+        resuming.find(run)
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileError):
+        resuming.find(tmp_path)
+    (tmp_path / "run.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(FileError, match="not the folder of a run"):
+        resuming.find(tmp_path)
+    (tmp_path / "run.json").write_text("half a", encoding="utf-8")
+    with pytest.raises(FileError, match=r"run\.json"):
+        resuming.find(tmp_path)
+
+
+def test_a_lock_is_given_back_by_who_leaves(tmp_path: Path) -> None:
+    (tmp_path / run_folder.STATE_DIR).mkdir()
+    with run_folder.locked(tmp_path), pytest.raises(FileError, match="still going on"):
+        run_folder.locked(tmp_path).__enter__()
+    with run_folder.locked(tmp_path):
+        pass
+
+
+def test_a_run_is_resumed_as_it_was_begun(tmp_path: Path) -> None:
+    process = afspm_run(tmp_path, "--resume", "runs", "--speed", "2")
+    told = process.communicate(timeout=60.0)[0]
+    assert process.returncode != 0
+    assert "a run is resumed as it was begun" in told
