@@ -32,7 +32,7 @@ class Before:
             bench.story.newest(ScanParameters),
             bench.story.newest(Feedback),
             bench.story.newest(ProbePosition),
-            {name: value for name, value in support.parameters.items() if value is not None},
+            {name: value for name, value in support.parameters.items() if value and name != names.CONTROLLER},
             support,
         )
 

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from afspm import wire
 from afspm.errors import WireError
 from afspm.model import Packet, Scan, ScopeState, ScopeStatus, Spectrum
 
 T = TypeVar("T")
+
+_OF_A_MICROSCOPE: Final = frozenset(
+    {"Scan2d", "Spec1d", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ScopeStateMsg"}
+)
+"""The rest is others' doing: who is in control, what the scheduler notes down, lines that only those want who asked."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class Heard:
 
 
 class Story:
-    """All that is heard, oldest first."""
+    """All that is heard of the microscope, oldest first."""
 
     def __init__(self) -> None:
         self.all: list[Heard] = []
@@ -56,15 +61,16 @@ class Story:
             thing = wire.decode(message, bytes(packet.payload))
         except WireError as error:
             thing = error
-        self.all.append(Heard(message, thing, packet.time_ns))
+        if message in _OF_A_MICROSCOPE or isinstance(thing, WireError):
+            self.all.append(Heard(message, thing, packet.time_ns))
 
     def mark(self) -> int:
         """Here: what comes later is news."""
         return len(self.all)
 
     def since(self, mark: int) -> list[Heard]:
-        """What came after `mark` of the microscope; who is in control is not its doing."""
-        return [one for one in self.all[mark:] if one.message not in ("ControlState", "ScanLines")]
+        """What came after `mark`."""
+        return self.all[mark:]
 
     def newest(self, kind: type[T]) -> T | None:
         """The last that was published of a kind."""
