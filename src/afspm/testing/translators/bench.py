@@ -50,6 +50,7 @@ class Bench:
         self.story = Story()
         self.at_start: tuple[Heard, ...] = ()
         self._stirred = True
+        self._interrupted = False
         link.listen(self.story.take)
 
     # --- beginning and ending ---
@@ -78,6 +79,17 @@ class Bench:
         """Give control back."""
         self._link.send_only(ControlRequest.RELEASE_CTRL)
 
+    def interrupt(self) -> None:
+        """Ctrl-C: KeyboardInterrupt where the checks next wait or ask. Raised anywhere, it could leave a request half
+        sent, and what is then put back would be taken for the rest of it."""
+        self._interrupted = True
+        self._link.port.wake_up()
+
+    def _heed(self) -> None:
+        if self._interrupted:
+            self._interrupted = False
+            raise KeyboardInterrupt
+
     # --- asking ---
 
     def ask(self, kind: ControlRequest, subject: Any = None) -> Response:
@@ -97,6 +109,7 @@ class Bench:
         return self._asked_by(self._direct, kind, subject)
 
     def _asked_by(self, link: Link, kind: ControlRequest, subject: Any) -> Response:
+        self._heed()
         try:
             with self._alive():
                 response = link.request(kind, subject, until_s=link.until(ANSWERED_S))
@@ -141,9 +154,16 @@ class Bench:
         self._wait(lambda: self.story.has_state(state, mark), within_s, f"SS_{state.name}", mark)
 
     def _wait(self, done: Callable[[], bool], within_s: float, expected: str, mark: int) -> None:
-        with self._alive():
-            came = self._link.wait(done, self._link.until(within_s))
+        came = self._awaited(done, within_s)
         expect(came, f"{expected} within {within_s:.3g} s", told(self.story.since(mark)))
+
+    def _awaited(self, done: Callable[[], bool], within_s: float) -> bool:
+        def done_or_interrupted() -> bool:
+            self._heed()
+            return done()
+
+        with self._alive():
+            return self._link.wait(done_or_interrupted, self._link.until(within_s))
 
     def settled(self, mark: int, experiment_s: float = MOVED_S) -> list[Heard]:
         """All that is published after `mark` until the microscope is free and quiet."""
@@ -160,9 +180,8 @@ class Bench:
         until_s = self.clock.monotonic_s() + NOTICED_S
         while self.clock.monotonic_s() < until_s:
             count = len(self.story.all)
-            with self._alive():
-                if not self._link.wait(lambda n=count: len(self.story.all) != n, self._link.until(QUIET_S)):  # type: ignore[misc]
-                    return
+            if not self._awaited(lambda n=count: len(self.story.all) != n, QUIET_S):  # type: ignore[misc]
+                return
 
     def real_s(self, experiment_s: float) -> float:
         """How long that may last in real time: never less than it takes to be noticed."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import tempfile
+import threading
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -126,11 +128,25 @@ def opened(options: Options) -> Iterator[Session]:
     with ExitStack() as stack:
         bench, folder = _bench(experiment, options, stack)
         stack.callback(bench.end)
+        stack.enter_context(_interrupting(bench))
         abilities = resolved.abilities(translator)
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
         support = find_out(bench, sorted(actions), sorted(parameters))
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
         yield Session(bench, support, named, resolved.simulated, folder, options)
+
+
+@contextmanager
+def _interrupting(bench: Bench) -> Iterator[None]:
+    """Ctrl-C interrupts the bench, where signals come to this thread at all."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda number, frame: bench.interrupt())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _bench(experiment: Experiment, options: Options, stack: ExitStack) -> tuple[Bench, Path]:
