@@ -11,8 +11,9 @@ from typing import Any
 from afspm.errors import AfspmError
 from afspm.logic import arbitration
 from afspm.logic.arbitration import Ask, Cause, Control, Do, Event
+from afspm.logic.bulletin import CONTROL_STATE, Bulletin
 from afspm.logic.cache import TIME_STEP_NS, Cache
-from afspm.logic.chronicle import ENTRIES, Chronicle
+from afspm.logic.chronicle import Chronicle
 from afspm.logic.desk import Desk, OwnEnd, reads
 from afspm.logic.events import (
     Announced,
@@ -44,7 +45,6 @@ from afspm.logic.frame import CoordinateFrame
 from afspm.logic.lease import Lease
 from afspm.logic.sessions import token_of
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.telling import Telling
 from afspm.logic.trust import TRANSLATOR, Trust
 from afspm.logic.watchdog import Watchdog
 from afspm.logic.words import is_routine, said
@@ -69,8 +69,6 @@ from afspm.model import (
 )
 
 __all__ = ["CONTROL_STATE", "SchedulerCore", "SchedulerSettings"]
-
-CONTROL_STATE = "ControlState"
 
 _TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
 """Messages from which we learn what the microscope is in. All others pass unread."""
@@ -113,7 +111,7 @@ class SchedulerCore:
         self._trust = Trust(settings.malfunction_after_s)
         self._frame = frame
         self._chronicle = chronicle = Chronicle(self._rules.problems)
-        self._telling = Telling(codec)
+        self._bulletin = Bulletin(codec, self._cache, chronicle, self._rules.roles, self._save)
         self._desk = desk = Desk(
             settings, codec, self._watchdog, self._lease, self._holder, self._save, chronicle, frame
         )
@@ -205,7 +203,7 @@ class SchedulerCore:
             "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
             "granted_to": self._granted_to,
-            "supervisors": self._telling.snapshot(),
+            "supervisors": self._bulletin.telling.snapshot(),
             **self._desk.snapshot(),
             **({} if self._frame is None else {"frame": self._frame.snapshot()}),
         }
@@ -222,7 +220,7 @@ class SchedulerCore:
         self._watchdog.restore(map(str, state["wanted"]))
         self._granted_to = state.get("granted_to")
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
-        self._telling.restore(state.get("supervisors", {}))
+        self._bulletin.telling.restore(state.get("supervisors", {}))
         self._desk.restore(state)
         if self._frame is not None and "frame" in state:
             self._frame.restore(state["frame"])
@@ -290,11 +288,7 @@ class SchedulerCore:
     def _on_announced(self, event: Announced, now_s: float, now_ns: int) -> None:
         # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
         time_ns = now_ns if event.before_ns is None else event.before_ns - TIME_STEP_NS
-        self._announce(event.envelope, event.payload, time_ns)
-
-    def _announce(self, envelope: str, payload: bytes, time_ns: int) -> None:
-        packet, cached = self._cache.stamp(envelope, payload, time_ns)
-        self._effects += [self._save(), Publish(packet, None, cached)]
+        self._effects += self._bulletin.announce(event.envelope, event.payload, time_ns)
 
     def _on_subscriber(self, event: SubscriberJoined, now_s: float, now_ns: int) -> None:
         self._effects.append(Replay(event.subscriber, self._cache.replay(event.prefixes, event.since_ns)))
@@ -313,11 +307,11 @@ class SchedulerCore:
         kind = request.kind
         control_event = _CONTROL_EVENTS.get(kind)
         if kind == TELL_REQUEST:  # a supervisor's last words come after the end
-            self._on_told(event, now_s, now_ns)
+            self._follow(event, self._bulletin.told(event, now_s, now_ns))
         elif self._control.ended:
             self._desk.answer(event, ControlResponse.FAILURE, "the experiment has ended")
         elif kind == RESTART_REQUEST:
-            self._on_restart(event, now_s)
+            self._follow(event, self._bulletin.ordered(event, now_s))
         elif kind == CLOCK_REQUEST:
             self._tell_time(event, now_ns)
         elif control_event is not None:
@@ -345,30 +339,11 @@ class SchedulerCore:
     def _on_unreadable(self, event: Unreadable, now_s: float, now_ns: int) -> None:
         self._chronicle.unreadable(event.name, event.response)
 
-    def _on_told(self, event: RequestIn, now_s: float, now_ns: int) -> None:
-        """Somebody has something to publish; a supervisor is told in return what it is to do."""
-        envelope, why = self._telling.envelope(event, now_s)
-        if not envelope:
-            self._desk.answer(event, ControlResponse.FAILURE, why)
-            return
-        orders = self._telling.orders_for(event.name)
-        payload = event.request.subject.payload
-        if not self._cache.holds(envelope, payload):  # else we were killed before we could answer
-            self._announce(envelope, payload, now_ns)
-        self._desk.answer(event, ControlResponse.SUCCESS, payload=self._codec.encode_orders(orders))
-
-    def _on_restart(self, event: RequestIn, now_s: float) -> None:
-        process = str(event.request.subject)
-        if not arbitration.may(self._rules.roles.restart, event.name):
-            why = f"{event.name} has not the role 'restart' ([control] roles)"
-        else:
-            why = self._telling.order(process, now_s)
-        if why:
-            self._desk.answer(event, ControlResponse.FAILURE, why)
-            return
-        self._effects.append(self._save())
-        self._log("INFO", f"{process} is to be started anew, as {event.name} wishes")
-        self._desk.answer(event, ControlResponse.SUCCESS)
+    def _follow(self, event: RequestIn, outcome: tuple[list[Effect], Response]) -> None:
+        """What followed from something that was told, or ordered, and its answer."""
+        effects, response = outcome
+        self._effects += effects
+        self._desk.answer(event, ControlResponse(response.code), response.reason, response.payload)
 
     # --- control ---
 
@@ -390,8 +365,7 @@ class SchedulerCore:
         if event is not None and row.response is not None:
             self._desk.answer(event, row.response, arbitration.reason(row, before, ask, self._rules))
         if after.ended and not before.ended:
-            self._publish_entries(now_ns)
-            self._effects.append(Kill())
+            self._effects += [*self._bulletin.entries(now_ns), Kill()]
 
     def _control_changed(
         self, before: Control, ask: Ask, row: arbitration.Row, now_s: float, now_ns: int, *, had_died: bool
@@ -431,22 +405,14 @@ class SchedulerCore:
         publish = self._stamp_control(now_ns)
         self._effects += [self._save(), publish]
 
-    def _publish_entries(self, now_ns: int) -> None:
-        """What has happened since the last time."""
-        entries = self._chronicle.take()
-        if entries.entries:
-            self._announce(ENTRIES, self._codec.encode(entries), now_ns)
-
     def _entries_due_s(self) -> float | None:
-        """When that is due; not while what was published before a restart may still come again."""
+        """When what has happened is to be published; not while what was before a restart may still come again."""
         return None if self._announce_at_s is not None else self._chronicle.due_s
 
     def _stamp_control(self, now_ns: int) -> Publish:
         """The control state as a packet, which has its time before it is published: that is saved first."""
         self._announce_at_s = None
-        payload = self._codec.encode_control_state(self._control.published())
-        packet, cached = self._cache.stamp(CONTROL_STATE, payload, now_ns)
-        return Publish(packet, None, cached)
+        return self._bulletin.control(self._control.published(), now_ns)
 
     def _holder_dead_at_s(self) -> float | None:
         """When the holder is given up, if it does not come back; None if it is there, or nobody is in control."""
@@ -526,7 +492,7 @@ class SchedulerCore:
         self._see_to_deadlines(now_s, now_ns)
         entries_due_s = self._entries_due_s()
         if entries_due_s is not None and now_s >= entries_due_s:
-            self._publish_entries(now_ns)
+            self._effects += self._bulletin.entries(now_ns)
 
     def _see_to_deadlines(self, now_s: float, now_ns: int) -> None:
         # one change of control in a step: it is saved and told before the next is decided
