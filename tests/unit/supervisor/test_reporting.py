@@ -1,0 +1,80 @@
+"""Who is told of the processes: the scheduler, wherever it runs, if it is one of ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from afspm.clock import ExperimentClock
+from afspm.experiment import Experiment, Start, load
+from afspm.supervisor import reporting
+from afspm.supervisor.reporter import Reporter
+from afspm.transport.keys import generate
+
+CLOCK = ExperimentClock.real()
+FILE = """
+[microscope]
+component = true
+class = "Simulator"
+publisher = "tcp://127.0.0.1:29100"
+control_server = "tcp://127.0.0.1:29101"
+
+[scheduler]
+component = true
+pubsubcache = "tcp://127.0.0.1:29102"
+router = "tcp://127.0.0.1:29103"
+{scheduler}
+
+[series]
+component = true
+class = "ScanSeries"
+size = ["1 um", "1 um"]
+"""
+OURS = 'class = "Scheduler"'
+
+
+def experiment(folder: Path, scheduler: str = OURS, more: str = "") -> Experiment:
+    file = folder / "experiment.toml"
+    file.write_text(FILE.format(scheduler=scheduler) + more, encoding="utf-8")
+    return load(file)
+
+
+def starts(made: Experiment, *only: str) -> list[Start]:
+    return made.launches(take_address=lambda: "tcp://127.0.0.1:29110", only=only)
+
+
+def test_a_scheduler_that_is_started_here_is_told(tmp_path: Path) -> None:
+    made = experiment(tmp_path)
+    reporter = reporting.reporter(made, starts(made), CLOCK)
+    assert isinstance(reporter, Reporter)
+    assert reporter._launch.sockets.control == "tcp://127.0.0.1:29103"
+    assert reporter._launch.name == f"supervisor:{reporter._supervisor}"
+
+
+def test_a_part_tells_the_scheduler_of_the_whole_under_a_name_of_its_own(tmp_path: Path) -> None:
+    made = experiment(tmp_path)
+    whole, part = (reporting.reporter(made, starts(made, *only), CLOCK) for only in ((), ("series",)))
+    assert isinstance(whole, Reporter)
+    assert isinstance(part, Reporter)
+    assert part._launch.sockets.control == whole._launch.sockets.control
+    assert part._launch.name != whole._launch.name
+
+
+@pytest.mark.parametrize("only", [(), ("series",)])
+def test_a_scheduler_of_another_language_is_not_asked_what_it_does_not_know(
+    tmp_path: Path, only: tuple[str, ...]
+) -> None:
+    made = experiment(tmp_path, 'command = ["python", "scheduler.py"]\nrole = "scheduler"')
+    assert reporting.reporter(made, starts(made, *only), CLOCK) is None
+
+
+def test_with_keys_it_expects_the_scheduler_s(tmp_path: Path) -> None:
+    generate(tmp_path / "keys", ["microscope", "scheduler", "series", "recorder", "supervisor"])
+    made = experiment(tmp_path, more='[security]\nkeys = "keys"\n')
+    reporter = reporting.reporter(made, starts(made), CLOCK)
+    assert isinstance(reporter, Reporter)
+    assert reporter._launch.keys == {
+        "folder": str(tmp_path / "keys"),
+        "tcp://127.0.0.1:29103": "scheduler",
+    }
