@@ -6,6 +6,7 @@ import typer
 
 from afspm.cli import (
     check,
+    dashboard,
     drift,
     emulate,
     export,
@@ -29,6 +30,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run)
+app.command("dashboard")(dashboard.dashboard)
 app.command("status")(status.status)
 app.command("watch")(status.watch)
 app.command("pause")(steer.pause)

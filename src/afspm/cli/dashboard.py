@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from afspm.experiment import Experiment
 
 RUNS = Path("runs")
-NAME = "dashboard"
 NAME_OF_CLASS = "Dashboard"
 
 
@@ -92,17 +91,21 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     import logging
     import sys
 
+    from afspm.cli.joining import looking
     from afspm.dashboard import Dashboard
     from afspm.dashboard.joining import join, url_in
+    from afspm.experiment.known import DASHBOARD
     from afspm.runtime.exit_codes import ExitCode
     from afspm.runtime.following import facts_of
 
-    url = url_in(facts_of(folder).get("processes"), folder, NAME)
+    url = url_in(facts_of(folder).get("processes"), folder, DASHBOARD)
     if url is not None:
         typer.echo(f"this run has a dashboard already: {url}")
         return 0
+    with looking(folder):
+        pass  # somebody is there
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
-    code = join(folder, Dashboard(**settings), NAME)
+    code = join(folder, Dashboard(**settings), DASHBOARD)
     return 0 if code in (ExitCode.ENDED, ExitCode.DONE, ExitCode.ORPHAN) else 1
 
 

@@ -34,6 +34,12 @@ def run(
             min=1e-6, help="Experiment seconds in a real second; simulated microscopes only.", show_default=False
         ),
     ] = None,
+    dashboard: Annotated[
+        bool,
+        typer.Option(
+            "--dashboard", help="Show it in the browser, too, if the file doesn't say so.", show_default=False
+        ),
+    ] = False,
     resume: Annotated[
         Path | None,
         typer.Option(
@@ -59,6 +65,7 @@ def run(
     import logging
     import sys
 
+    from afspm.cli.dashboard import with_dashboard
     from afspm.experiment import load
     from afspm.supervisor import resuming
     from afspm.supervisor import run as running
@@ -72,14 +79,14 @@ def run(
         log_level=logging.DEBUG if verbose else logging.INFO,
     )
     if resume is not None:
-        if files or only or without or speed or dry_run:
+        if files or only or without or speed or dry_run or dashboard:
             raise typer.BadParameter("a run is resumed as it was begun: give nothing else", param_hint="--resume")
         found = resuming.find(resume)
         _check(found.experiment)
         raise typer.Exit(resuming.resume(found, options, terminal=sys.stdout).outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
-    experiment = load(*files)
+    experiment = with_dashboard(files) if dashboard else load(*files)
     _check(experiment)
     if dry_run:
         for start in running.dry_run(experiment, options):

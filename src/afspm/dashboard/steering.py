@@ -81,7 +81,7 @@ class Steering:
         except Exception as error:
             self._log.exception("an act of %s failed", person)
             outcome = Outcome(f"that failed: {type(error).__name__}: {error}", ok=False)
-        self._log.info("%s: %s%s", person, outcome.text, "" if outcome.ok else " (not done)")
+        self._log.debug("%s: %s%s", person, outcome.text, "" if outcome.ok else " (not done)")
         return outcome
 
     def _connect(self, person: str) -> tuple[ZmqPort, Acts]:

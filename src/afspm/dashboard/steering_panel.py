@@ -117,7 +117,7 @@ class SteeringPanel:
         with self._by_hand:
             with ui.element("div").classes("acts"):
                 _button("Scan as set", lambda: self._do(lambda a: a.scan()))
-                _button("Spectrum here", lambda: self._do(lambda a: a.spectrum())).tooltip("where the probe stands")
+                _button("Spectrum at the probe", lambda: self._do(lambda a: a.spectrum()))
             ui.label("Or choose Scan here or Spectrum here over the scan, and click in it.").classes("quiet")
             with ui.element("div").classes("acts"):
                 self._parameter = ui.select(list(PARAMETERS), label="parameter", on_change=self._read)

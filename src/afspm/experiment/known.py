@@ -102,6 +102,9 @@ COMPONENT_ALIASES: Final[dict[str, str]] = {
     "afspm.components.scan.metadata.ScanMetadataWriter": "Metadata",
 }
 
+DASHBOARD: Final = "dashboard"
+"""The name under which `afspm dashboard` joins a run."""
+
 # Where a class named without a module is looked for, in this order.
 SHORT_NAME_PACKAGES: Final[tuple[str, ...]] = (
     "afspm.components",

@@ -11,6 +11,7 @@ from afspm.errors import ConfigError
 from afspm.experiment import limits, wiring
 from afspm.experiment.experiment import Start
 from afspm.experiment.findings import nearest
+from afspm.experiment.known import DASHBOARD
 from afspm.experiment.parts import Part, Role
 from afspm.model import Frame
 from afspm.runtime.launch import Launch, Sockets
@@ -201,8 +202,12 @@ def _first(a: int | None, b: int) -> int:
 
 
 def _operators(resolved: Resolved) -> list[str]:
-    """Components by which a person may command the microscope in MANUAL mode, as their classes say."""
-    return [name for name, component in resolved.classes.items() if getattr(component, "operates", False) is True]
+    """Components by which a person may command the microscope in MANUAL mode, as their classes say.
+
+    And a dashboard that joins the run later, which is under no other's name.
+    """
+    operators = [n for n, component in resolved.classes.items() if getattr(component, "operates", False) is True]
+    return operators if DASHBOARD in resolved.classes else [*operators, DASHBOARD]
 
 
 def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
