@@ -18,6 +18,7 @@ from afspm.model import Packet
 from afspm.record.ahead import FOLDER_SUFFIX, RECORDED_FILE, Ahead, written_ahead
 
 _PERIOD_S = 0.05
+_TIDY_S = 2.0  # where all is written, and only what is no longer cached is still to be deleted
 # the thread may take this part of the time at most, so that a flood of large scans is not slowed down by the disk
 _SHARE = 0.1
 _SUFFIX = ".packet"
@@ -92,13 +93,19 @@ class Journal:
 
     def changed(self) -> None:
         """The cache is no longer what it was at the last `follow`. Costs next to nothing."""
-        if self._due_s is None and self._folder is not None:
-            self._due_s = max(self._clock.monotonic_s() + _PERIOD_S, self._not_before_s)
+        self._is_due_in(_PERIOD_S)
+
+    def _is_due_in(self, period_s: float) -> None:
+        if self._folder is None or (self._due_s is not None and period_s >= _TIDY_S):
+            return
+        due_s = max(self._clock.monotonic_s() + period_s, self._not_before_s)
+        self._due_s = due_s if self._due_s is None else min(self._due_s, due_s)
 
     def keep(self, packet: Packet) -> None:
         """Write a packet of the scheduler's own at once; it is newer than all that is cached."""
         if self._folder is None or packet.time_ns is None:
             return
+        self._is_due_in(_TIDY_S)  # for what it takes the place of
         try:
             if not self._has_folder:
                 self._folder.mkdir(parents=True, exist_ok=True)

@@ -233,7 +233,7 @@ class Shell:
                     if not self.ended:  # what is said afterwards is of no use to a run that is resumed
                         self._journal.note(effect.packet, effect.source_ns, cached=effect.cached)
                     sockets.publisher.publish(effect.packet)
-                    if effect.cached:
+                    if effect.cached and effect.source_ns is not None:
                         self._journal.changed()
                 case events.Replay():
                     self._replay = effect.packets
