@@ -9,7 +9,17 @@ from pathlib import Path
 
 from benchmarks.rows import MEASUREMENTS, Row
 
-MODULES = ("codec", "control", "scans", "late_joiner", "translator", "controllers", "reading", "experiment")
+MODULES = (
+    "codec",
+    "control",
+    "scans",
+    "late_joiner",
+    "translator",
+    "controllers",
+    "reading",
+    "recording",
+    "experiment",
+)
 RESULT = Path("build/bench.json")
 
 

@@ -14,11 +14,41 @@ from afspm.model import ControlRequest, Request
 from afspm.transport.network import Network
 from afspm.transport.port import ControlConnected, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort
-from benchmarks.processes import CLOCK, roles
+from benchmarks.processes import CLOCK, Roles, roles
 from benchmarks.rows import Row, alternate, measurement
 
 ROUND_TRIPS = 600
 ALTERNATIONS = 9
+
+
+class Client:
+    """A component in control."""
+
+    def __init__(self, processes: Roles, router: str) -> None:
+        self._port = ZmqPort(Network(), "Client", CLOCK, control=router)
+        processes.callback(self._port.close)
+        while ControlConnected() not in self._port.poll(1.0):
+            pass
+        self._asked = 0
+        self._ask(ControlRequest.REQUEST_CTRL, 0)
+
+    def act(self) -> None:
+        """One action, there and back."""
+        self._ask(ControlRequest.ACTION, "start-scan")
+
+    def round_trip_us(self) -> float:
+        """The median of many."""
+        return _median_us(self.act)
+
+    def _ask(self, kind: int, subject: Any) -> None:
+        self._asked += 1
+        identity = f"Client/benchmark/{self._asked}"
+        self._port.send(wire.encode_request(Request(kind, subject, id=identity)))
+        while True:
+            for incoming in self._port.poll(5.0):
+                if isinstance(incoming, ReplyReceived) and incoming.response.id == identity:
+                    assert incoming.response.ok, incoming
+                    return
 
 
 @measurement
@@ -28,34 +58,17 @@ def control_round_trip() -> Iterator[Row]:
         processes.start("bare_rep", back=back)
         publish, serve = processes.start("translator").split()
         _, router = processes.scheduler(publish, serve)
+        client = Client(processes, router)
         requester: Any = processes.enter_context(zmq.Context()).socket(zmq.REQ)
         requester.connect(front)
-        port = ZmqPort(Network(), "Client", CLOCK, control=router)
-        processes.callback(port.close)
-        while ControlConnected() not in port.poll(1.0):
-            pass
         numbers = iter(range(10**9))
-
-        def ask(kind: int, subject: Any) -> None:
-            identity = f"Client/benchmark/{next(numbers)}"
-            port.send(wire.encode_request(Request(kind, subject, id=identity)))
-            while True:
-                for incoming in port.poll(5.0):
-                    if isinstance(incoming, ReplyReceived) and incoming.response.id == identity:
-                        assert incoming.response.ok, incoming
-                        return
 
         def ask_bare() -> None:  # the same frames, there and back, as ours
             requester.send_multipart([b"\1", payload, b"Client/benchmark/%d" % next(numbers)])
             requester.recv_multipart()
 
         payload = wire.encode_subject("start-scan")
-        ask(ControlRequest.REQUEST_CTRL, 0)
-        ours, bare = alternate(
-            lambda: _median_us(lambda: ask(ControlRequest.ACTION, "start-scan")),
-            lambda: _median_us(ask_bare),
-            ALTERNATIONS,
-        )
+        ours, bare = alternate(lambda: _median_us(client.act), lambda: _median_us(ask_bare), ALTERNATIONS)
         yield Row("control round trip", "µs", ours, bare, 1.5)
 
 

@@ -8,9 +8,11 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 from afspm.clock import ExperimentClock
+from afspm.record.ahead import expect_record
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
@@ -35,10 +37,22 @@ class Roles(ExitStack):
         assert process.stdout is not None
         return process.stdout.readline().strip()
 
-    def scheduler(self, translator_publish: str, translator_serve: str, **settings: Any) -> tuple[str, str]:
-        """The real scheduler, which keeps its state on disk; returns the addresses (publish, serve)."""
+    def scheduler(
+        self, translator_publish: str, translator_serve: str, *, recorded: bool = False, **settings: Any
+    ) -> tuple[str, str]:
+        """The real scheduler, which keeps its state on disk; returns the addresses (publish, serve).
+
+        Args:
+            recorded: there is a recorder, too, as in every experiment.
+        """
         folder = self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
         publish, serve = PORTS.address(), PORTS.address()
+        if recorded:
+            expect_record(Path(folder))
+            sockets = Sockets(subscribe=(publish,), control=serve)
+            recorder = "afspm.components.recorder.Recorder"
+            line = Launch("recorder", recorder, sockets=sockets, run_dir=folder, state_dir=folder, log_level="ERROR")
+            self._host(line)
         launch = Launch(
             "scheduler",
             "afspm.scheduler.Scheduler",

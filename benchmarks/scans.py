@@ -29,6 +29,8 @@ class Line:
 
     def __init__(self, processes: Roles) -> None:
         self._publish: Callable[[bytes, bytes], None]
+        self.rest: Callable[[float], object]
+        """Waits, and sees to what comes meanwhile."""
         self._context: Any = processes.enter_context(zmq.Context())
         self._tally = self._context.socket(zmq.PULL)
         self._tally_address = f"tcp://127.0.0.1:{self._tally.bind_to_random_port('tcp://127.0.0.1')}"
@@ -51,10 +53,10 @@ class Line:
         self._publish = publish
         self._wait_for(subscribers)
 
-    def ours(self, subscribers: int) -> None:
+    def ours(self, subscribers: int, *, recorded: bool = False) -> None:
         port = ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)
         self._processes.callback(port.close)
-        middle, _ = self._processes.scheduler(str(port.publish_address), port.serve_address)
+        middle, _ = self._processes.scheduler(str(port.publish_address), port.serve_address, recorded=recorded)
         for n in range(subscribers):
             self._processes.start("our_subscriber", source=middle, tally=self._tally_address, name=f"Subscriber {n}")
 
@@ -65,6 +67,7 @@ class Line:
             port.poll(0.05)
             publish(MARK.encode(), b"")
         self._publish = publish
+        self.rest = port.poll
         self._wait_for(subscribers)
 
     def _wait_for(self, subscribers: int) -> None:

@@ -22,6 +22,7 @@ _TIDY_S = 2.0  # where all is written, and only what is no longer cached is stil
 # the thread may take this part of the time at most, so that a flood of large scans is not slowed down by the disk
 _SHARE = 0.1
 _SUFFIX = ".packet"
+_COMPLAIN_EVERY_S = 60.0
 
 Entry = tuple[Packet, int | None]
 """A packet as it was published, and the time that the translator gave it."""
@@ -49,7 +50,7 @@ class Journal:
         self._condition = threading.Condition()
         self._closing = False
         self._failing = False
-        self._defenceless = False
+        self._complain_at_s = 0.0
         self._has_folder = False
         self._thread: threading.Thread | None = None
 
@@ -87,9 +88,9 @@ class Journal:
             complaint = "" if kept else "the recorder does not keep up"
         except OSError as error:
             complaint = str(error)
-        if complaint and not self._defenceless:
+        if complaint and self._clock.monotonic_s() >= self._complain_at_s:
+            self._complain_at_s = self._clock.monotonic_s() + _COMPLAIN_EVERY_S
             self._log.critical("what is published now would be lost in a power cut: %s", complaint)
-        self._defenceless = bool(complaint)
 
     def changed(self) -> None:
         """The cache is no longer what it was at the last `follow`. Costs next to nothing."""

@@ -1,0 +1,130 @@
+"""What the record costs an experiment, and how soon a long run is open."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from unittest import mock
+
+import numpy as np
+
+import afspm
+from afspm import wire
+from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
+from afspm.record.store import SCHEDULER, About, Store
+from benchmarks.codec import scan
+from benchmarks.control import Client
+from benchmarks.processes import roles
+from benchmarks.rows import Row, alternate, measurement
+from benchmarks.scans import Line
+
+ALTERNATIONS = 9
+FLOODS = 5
+PACE_S = 0.1
+"""Between scans at a realistic rate: ten channels of 512² a second are more than any microscope takes."""
+PACED = 20
+FAST = 20
+"""Scans of 512² a second: 40 MB/s, more than microscopes deliver."""
+FLOOD = 60
+"""Scans as fast as they can be sent: more than a gigabyte a second, which no disk takes. Then what is published goes on
+as fast as the rest of the computer allows, and the recorder has all of it in the end, or says what it has not."""
+SCANS = 10_000
+START_NS = 1_773_518_400_000_000_000
+
+
+@measurement
+def recording() -> Iterator[Row]:
+    """With a recorder beside without one."""
+    with roles() as processes:
+        clients = []
+        for recorded in (True, False):
+            publish, serve = processes.start("translator").split()
+            clients.append(Client(processes, processes.scheduler(publish, serve, recorded=recorded)[1]))
+        with_record, without = alternate(clients[0].round_trip_us, clients[1].round_trip_us, ALTERNATIONS)
+        yield Row("control round trip, recorded", "µs", with_record, without, 1.05)
+    payload = wire.encode(scan(512))[1]
+    with roles() as processes:
+        recorded_line, line = Line(processes), Line(processes)
+        recorded_line.ours(1, recorded=True)
+        line.ours(1)
+        with_record, without = alternate(
+            partial(_paced_ms, recorded_line, payload), partial(_paced_ms, line, payload), ALTERNATIONS
+        )
+        yield Row("a scan of 512² on its way, ten a second, recorded", "ms", with_record, without, 1.05)
+        with_record, without = alternate(
+            partial(_at_pace_per_s, recorded_line, payload), partial(_at_pace_per_s, line, payload), ALTERNATIONS
+        )
+        yield Row(f"scans of 512², {FAST} a second, recorded", "1/s", with_record, without, 0.95, "high")
+        with_record, without = alternate(
+            partial(recorded_line.scans_per_s, payload, FLOOD), partial(line.scans_per_s, payload, FLOOD), FLOODS
+        )
+        yield Row("a flood of scans of 512², recorded", "1/s", with_record, without, 0.1, "high")
+
+
+def _paced_ms(line: Line, payload: bytes) -> float:
+    """From the publication of a scan to its arrival."""
+    times = []
+    for _ in range(PACED):
+        began = perf_counter()
+        line.scans_per_s(payload, 1)
+        times.append((perf_counter() - began) * 1e3)
+        while perf_counter() < began + PACE_S:
+            line.rest(began + PACE_S - perf_counter())
+    return statistics.median(times)
+
+
+def _at_pace_per_s(line: Line, payload: bytes) -> float:
+    """How many scans a second arrive that are published at an even pace."""
+    began = perf_counter()
+    for number in range(FAST):
+        while (left_s := began + number / FAST - perf_counter()) > 0.0:
+            line.rest(left_s)
+        line.scans_per_s(payload, 1)
+    return FAST / (perf_counter() - began)
+
+
+@measurement
+def long_run() -> Iterator[Row]:
+    """A run of ten thousand scans: opened, its table made, the last scan read; and all that it came to."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        _write(folder)
+        yield Row(
+            f"a run of {SCANS} scans is open", "s", statistics.median(_open_s(folder) for _ in range(5)), None, 1.0
+        )
+
+
+def _open_s(folder: Path) -> float:
+    began = perf_counter()
+    with afspm.open_run(folder) as run:
+        table = run.scans
+        assert len(table) == SCANS
+        assert run.scan(-1).first.values.shape == (16, 16)
+    return perf_counter() - began
+
+
+def _write(folder: Path) -> None:
+    values = np.random.default_rng(1).normal(size=(16, 16))
+    region = Region((0.0, 0.0), (1e-6, 1e-6))
+    control = ControlState(ControlMode.AUTOMATED, "series")
+    store = Store(folder, About({"experiment": "long"}))
+    with mock.patch.object(os, "fsync"):  # only to be quick: nobody cuts the power here
+        for number in range(SCANS):
+            time_ns = START_NS + number * 60_000_000_000
+            things: list[tuple[str, object]] = [
+                ("ControlState", control),
+                ("ScopeStateMsg", ScopeStatus(ScopeState.SCANNING)),
+                ("Scan2d_1000.0_Height", Scan(region, "Height", "m", values, time_ns, f"scan-{number}.nc")),
+                ("Scan2d_1000.0_Phase", Scan(region, "Phase", "deg", values, time_ns, f"scan-{number}.nc")),
+                ("ScopeStateMsg", ScopeStatus(ScopeState.FREE)),
+            ]
+            store.take(
+                (Packet(envelope, wire.encode(thing)[1], time_ns + at * 1_000_000), SCHEDULER)
+                for at, (envelope, thing) in enumerate(things)
+            )
+    store.close()
