@@ -22,7 +22,7 @@ CHANNELS = ("Height", "Amplitude", "Deflection", "Phase")
 TIMES = 9
 AT_MOST_S = 0.15
 TIMES_BARE = 50.0
-"""Bare, nothing is made float64, turned or given a place. A list of a scan's values costs ten times as much as this."""
+"""Bare, nothing is made float64, turned or given a place; a quiet machine is assumed."""
 
 Paths = list[Path]
 
