@@ -16,9 +16,9 @@ from afspm.model import (
 )
 from afspm.testing.deterministic.codec import TableCodec
 from afspm.testing.deterministic.network import ControlLine, Feed, Weather
-from afspm.testing.deterministic.process import Process
+from afspm.testing.deterministic.process import Alarm, Process
 from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import Timeline, Timer
+from afspm.testing.deterministic.timeline import Timeline
 
 Doing = Generator[float, None, Any]
 """What a component does. It yields how long (real) it waits at most; it goes on when that is over or anything came."""
@@ -70,7 +70,7 @@ class Client(Process):
         self._line: ControlLine | None = None
         self._feed: Feed | None = None
         self._doing: Doing | None = None
-        self._timer: Timer | None = None
+        self._alarm = Alarm(self, self._go_on)
         self._requests = 0
         self._asked: Request | None = None
         self._answer: Response | None = None
@@ -112,9 +112,6 @@ class Client(Process):
         raise NotImplementedError
 
     def _go_on(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
         doing = self._doing
         if doing is None or self._stepping:
             return
@@ -129,7 +126,7 @@ class Client(Process):
         finally:
             self._stepping = False
         if self._doing is doing:
-            self._timer = self.later(wait_s, self._go_on)
+            self._alarm.set(wait_s)
 
     # --- what comes ---
 

@@ -53,9 +53,10 @@ class Pipe:
     def send(self, do: Deliver, *args: Any) -> None:
         timeline = self._timeline
         # mostly quick, now and then slow
-        delay_s = self._weather.delay_s * timeline.random.random() ** 4
-        self._last_s = max(self._last_s, timeline.monotonic_s() + delay_s)
-        timeline.after(self._last_s - timeline.monotonic_s(), self._arrive, do, args)
+        time_s = timeline.monotonic_s() + self._weather.delay_s * timeline.random.random() ** 4
+        if time_s > self._last_s:
+            self._last_s = time_s
+        timeline.at(self._last_s, self._arrive, (do, args))
 
     def _arrive(self, do: Deliver, args: tuple[Any, ...]) -> None:
         if self.open:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -12,6 +13,33 @@ class Cuttable(Protocol):
     """A connection that breaks when a process dies."""
 
     def cut(self) -> None: ...
+
+
+_SAME_S = 1e-6
+
+
+class Alarm:
+    """Rings for a process at a time that may change again and again; where it stays the same, nothing is done."""
+
+    def __init__(self, process: Process, ring: Callable[[], None]) -> None:
+        self._process = process
+        self._ring = ring
+        self._timer: Timer | None = None
+        self._at_s = 0.0
+
+    def set(self, delay_s: float | None) -> None:
+        """Ring in `delay_s`, if this life lasts that long, and not when it was to ring before; None: not at all."""
+        at_s = math.inf if delay_s is None else self._process.timeline.monotonic_s() + delay_s
+        if self._timer is not None:
+            if abs(at_s - self._at_s) < _SAME_S:
+                return
+            self._timer.cancel()
+        self._at_s = at_s
+        self._timer = None if delay_s is None else self._process.later(delay_s, self._rings)
+
+    def _rings(self) -> None:
+        self._timer = None
+        self._ring()
 
 
 class Process:

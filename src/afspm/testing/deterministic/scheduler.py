@@ -34,8 +34,8 @@ from afspm.logic.events import (
 from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
 from afspm.model import Packet, PacketHeader, Request, Response
 from afspm.testing.deterministic.network import ControlLine, ControlServer, Feed, Publisher, Weather
-from afspm.testing.deterministic.process import Process
-from afspm.testing.deterministic.timeline import Timeline, Timer
+from afspm.testing.deterministic.process import Alarm, Process
+from afspm.testing.deterministic.timeline import Timeline
 
 Entry = tuple[Packet, int | None]
 
@@ -117,7 +117,7 @@ class SchedulerHost(Process):
         self._by_connection: dict[int, ControlLine] = {}
         self._by_name: dict[str, ControlLine] = {}
         self._feeds: list[Feed] = []
-        self._ticking: Timer | None = None
+        self._ticking = Alarm(self, self._tick)
         self._journal_due = False
         self._replay: tuple[Packet, ...] = ()
 
@@ -138,8 +138,7 @@ class SchedulerHost(Process):
     def ended(self) -> None:
         self._link.close()
         self._from_translator.close()
-        if self._ticking is not None:
-            self._ticking.cancel()
+        self._ticking.set(None)
 
     def component_died(self, name: str) -> None:
         self._step(ComponentDied(name))
@@ -260,12 +259,7 @@ class SchedulerHost(Process):
         self.disk.journal = tuple(self.core.cached())
 
     def _plan_tick(self) -> None:
-        if self._ticking is not None:
-            self._ticking.cancel()
-            self._ticking = None
-        delay_s = self._wait_s()
-        if delay_s is not None:
-            self._ticking = self.later(delay_s, self._tick)
+        self._ticking.set(self._wait_s())
 
     def _wait_s(self) -> float | None:
         deadline_s, deadline_ns = self.core.deadline_s(), self.core.deadline_ns()
@@ -275,5 +269,4 @@ class SchedulerHost(Process):
         return min(waits, default=None)
 
     def _tick(self) -> None:
-        self._ticking = None
         self._step(Tick())

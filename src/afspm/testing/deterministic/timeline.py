@@ -70,9 +70,13 @@ class Timeline:
 
     def after(self, delay_s: float, do: Callable[..., None], *args: Any) -> Timer:
         """`do(*args)` in `delay_s` real seconds; of two at the same time the one first asked for comes first."""
+        return self.at(self._time_s + delay_s if delay_s > 0.0 else self._time_s, do, args)
+
+    def at(self, time_s: float, do: Callable[..., None], args: tuple[Any, ...]) -> Timer:
+        """`do(*args)` at a time that has not passed."""
         timer = Timer(do, args)
-        self._order += 1
-        heapq.heappush(self._coming, (self._time_s + max(0.0, delay_s), self._order, timer))
+        self._order = order = self._order + 1
+        heapq.heappush(self._coming, (time_s, order, timer))
         return timer
 
     def step(self) -> bool:
