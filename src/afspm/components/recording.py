@@ -80,6 +80,7 @@ class Writer:
         self._error: BaseException | None = None
         self._told_full = self._told_much = False
         self._recorded: deque[tuple[float, int]] = deque()
+        self._said_ns = -1
         self._held: list[_Item] | None = []  # until all that was kept has come, or nothing is going to say so
         self._began_s = clock.monotonic_s()
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
@@ -270,12 +271,13 @@ class Writer:
         if self._state is None or self._held is not None or self._missed:
             return
         sure_ns = store.recorded_ns if now else self._sure_ns(store.recorded_ns)
-        if sure_ns is None:
+        if sure_ns is None or sure_ns <= self._said_ns:
             return
         try:
             with self._step():
                 store.sync()
                 ahead.say_recorded(self._state / ahead.RECORDED_FILE, sure_ns)
+            self._said_ns = sure_ns
         except OSError as error:
             self._log.debug("what is recorded can't be said: %s", error)
 
