@@ -35,7 +35,7 @@ class Recorder(Component):
         scans: whether scans and spectra are kept; else only the journal is.
     """
 
-    listens: ClassVar = None
+    listens: ClassVar = ("",)
     records: ClassVar[bool] = True
     longest_step_s: ClassVar[float] = 120.0
 

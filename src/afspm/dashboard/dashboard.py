@@ -36,6 +36,7 @@ class Dashboard(Component):
     """
 
     operates = True
+    listens = ("",)
     longest_step_s = 60.0  # the first import of everything, on a busy computer
 
     def __init__(

@@ -72,7 +72,8 @@ class Component:
     publishes: ClassVar[tuple[str, ...]] = ()
     """Envelopes that it publishes itself: it then gets an address to do so."""
     listens: ClassVar[tuple[str, ...] | None] = None
-    """Envelopes, or how they begin, that it subscribes to where the experiment file doesn't say; None: all."""
+    """Envelopes, or how they begin, that it subscribes to where the experiment file doesn't say. None: all but what is
+    told of processes, requests and logs; `("",)`: that too."""
     operates: ClassVar[bool] = False
     """Whether a person commands the microscope by it in MANUAL mode, where the experiment file names nobody else."""
     needs_actions: tuple[str, ...] = ()

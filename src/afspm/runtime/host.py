@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from afspm import wire
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ConfigError
 from afspm.runtime import failure, log
@@ -135,8 +136,10 @@ def _telling(launch: Launch, clock: Clock) -> Iterator[None]:
 
 def _open_port(launch: Launch, clock: Clock, parent: Parent) -> Port:
     """The port of a component: hears, besides what it subscribed to, what `Scope` has to know."""
-    if launch.envelopes is not None and launch.sockets.control is not None:
-        launch = replace(launch, envelopes=tuple(sorted({*launch.envelopes, *KEPT, *MEASURED})))
+    envelopes = wire.messages_of_the_experiment() if launch.envelopes is None else launch.envelopes
+    if launch.sockets.control is not None:
+        envelopes = tuple(sorted({*envelopes, *KEPT, *MEASURED}))
+    launch = replace(launch, envelopes=envelopes)
     port = open_port(launch, clock)
     parent.when_gone(lambda: port.wake_up(ParentGone()))
     return port

@@ -19,7 +19,7 @@ from afspm.wire.frames import (
     encode_time,
 )
 from afspm.wire.journal import decode_orders, encode_orders
-from afspm.wire.messages import known_messages, message_of, message_type, register
+from afspm.wire.messages import known_messages, message_of, message_type, messages_of_the_experiment, register
 from afspm.wire.places import encode_place, place_in, relocated
 
 __all__ = [
@@ -46,6 +46,7 @@ __all__ = [
     "known_messages",
     "message_of",
     "message_type",
+    "messages_of_the_experiment",
     "place_in",
     "register",
     "relocated",

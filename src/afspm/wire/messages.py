@@ -45,6 +45,8 @@ from afspm.wire.generated.spectroscopy_pb2 import ProbePosition, Spec1d, SpecDat
 
 M = TypeVar("M", bound=Message)
 
+_BESIDE = "journal.proto"
+
 _messages: dict[str, type[Message]] = {
     message.DESCRIPTOR.name: message
     for message in (
@@ -88,6 +90,11 @@ def message_type(name: str) -> type[Message]:
 def known_messages() -> tuple[str, ...]:
     """The names of all message types, those of users included."""
     return tuple(_messages)
+
+
+def messages_of_the_experiment() -> tuple[str, ...]:
+    """Those of them that are about sample, microscope and control; not what is told of processes, requests and logs."""
+    return tuple(name for name, message in _messages.items() if message.DESCRIPTOR.file.name != _BESIDE)
 
 
 def message_of(envelope: str) -> str:

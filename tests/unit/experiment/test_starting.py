@@ -58,7 +58,7 @@ def test_a_recorder_is_part_of_every_experiment(write: Write) -> None:
     experiment = write(CORRECTOR)
     assert experiment.recorders == ["recorder"]
     launch = starts(experiment)["recorder"].launch
-    assert (launch.class_, launch.settings, launch.envelopes) == ("afspm.components.recorder.Recorder", {}, None)
+    assert (launch.class_, launch.settings, launch.envelopes) == ("afspm.components.recorder.Recorder", {}, ("",))
 
 
 def test_the_file_may_do_without_a_recorder_or_have_its_own(write: Write) -> None:
@@ -66,6 +66,15 @@ def test_the_file_may_do_without_a_recorder_or_have_its_own(write: Write) -> Non
     own = '[keeper]\ncomponent = true\nclass = "Recorder"\nscans = false\n'
     assert set(starts(write(CORRECTOR + own))) == {"microscope", "scheduler", "repair", "keeper"}
     assert starts(write(CORRECTOR + "[record]\nscans = false\n"))["recorder"].launch.settings == {"scans": False}
+
+
+def test_without_h5py_the_journal_alone_is_kept_and_that_is_said(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    experiment = write(CORRECTOR)
+    (finding,) = experiment.check()
+    assert "h5py is not installed" in finding.what
+    assert not finding.is_error
+    assert starts(experiment)["recorder"].launch.settings == {"scans": False}
 
 
 def test_a_component_called_recorder_keeps_its_name(write: Write) -> None:
