@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from afspm.record.overview import DriftPoint, Overview
 
 RUN_FILE, EXPERIMENT_FILE, LATEST_FILE = "run.json", "experiment.toml", "latest"
+REPLAY_OF = "replay_of"
+"""In run.json of a replay: the folder of the run that it publishes again."""
 
 
 def open_run(path: str | Path = "runs") -> Run:
@@ -44,7 +46,7 @@ def open_run(path: str | Path = "runs") -> Run:
         [entry.reason for entry in run.refusals]
 
     Args:
-        path: the folder of the run; or the folder of all runs: its newest is meant.
+        path: the folder of the run; or the folder of all runs: its newest is meant. Of a replay, what it replays.
 
     Raises:
         FileError: there is no record, or it is damaged.
@@ -199,11 +201,7 @@ class Run:
     @property
     def facts(self) -> dict[str, Any]:
         """run.json: clock, addresses, how it ended. Empty if it can't be read."""
-        try:
-            facts = json.loads((self.folder / RUN_FILE).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-        return facts if isinstance(facts, dict) else {}
+        return _facts(self.folder)
 
     @property
     def name(self) -> str:
@@ -286,8 +284,17 @@ class Run:
 def _folder(path: Path) -> Path:
     latest = path / LATEST_FILE
     if not (path / journal.JOURNAL_FILE).is_file() and latest.is_file():
-        return path / latest.read_text(encoding="utf-8").strip()
-    return path
+        path = path / latest.read_text(encoding="utf-8").strip()
+    replayed = None if (path / journal.JOURNAL_FILE).is_file() else _facts(path).get(REPLAY_OF)
+    return Path(replayed) if isinstance(replayed, str) else path
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    try:
+        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
 
 
 def _scan_row(row: Any) -> ScanRow:

@@ -16,7 +16,7 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment.wiring import is_address
 from afspm.model import Frame, Packet
-from afspm.record.run import Run, open_run
+from afspm.record.run import REPLAY_OF, Run, open_run
 from afspm.runtime.connect import ENDED, GUEST
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.messages import register_all
@@ -26,7 +26,6 @@ from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import now
 from afspm.transport.complaints import Complaints
 
-REPLAY_OF = "replay_of"
 BEFORE_S = 1.0
 """Real: those who join at once find the beginning still to come."""
 

@@ -14,6 +14,7 @@ from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load_expanded
 from afspm.record import ahead
 from afspm.record.journal import JOURNAL_FILE, open_to_read
+from afspm.record.run import REPLAY_OF
 from afspm.runtime.connect import RUN_FILE, find_run
 from afspm.supervisor import run as running
 from afspm.supervisor import run_folder
@@ -48,6 +49,8 @@ def find(where: Path) -> Resumable:
     """
     folder = find_run(where).resolve()
     facts = _facts(folder)
+    if REPLAY_OF in facts:
+        raise ConfigError("this is a replay, and not a run", where=str(folder), hint=f"it is of {facts[REPLAY_OF]}")
     if facts.get(HOW) in _OVER:
         raise ConfigError("this run has ended as it should", where=str(folder), hint="`afspm run FILE` begins another")
     file = folder / run_folder.EXPERIMENT_FILE

@@ -16,7 +16,7 @@ from afspm import wire
 from afspm.errors import ConfigError, RequestError
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.store import About, Store
-from afspm.supervisor import replaying
+from afspm.supervisor import replaying, resuming
 
 START_NS = 1_773_518_400_000_000_000
 STEP_NS = 60_000_000_000  # experiment time between two packets
@@ -94,6 +94,9 @@ def test_it_ends_as_an_experiment_does_with_its_folder_saying_so(recorded: Path,
     (folder,) = (tmp_path / "runs").glob("replay-*")
     facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     assert (facts["replay_of"], facts["ended"]) == (str(recorded), "the replay is over")
+    assert afspm.open_run(tmp_path / "runs").folder == recorded, "the newest is a replay: what it replays is meant"
+    with pytest.raises(ConfigError, match="this is a replay"):
+        resuming.find(folder)
 
 
 def test_what_cannot_be_replayed_is_told(recorded: Path, tmp_path: Path) -> None:
