@@ -265,6 +265,8 @@ class Writer:
         if ended:
             self._safely(lambda: store.note("ended_ns", self._clock.now_ns()))
         self._say(store, now=True)
+        if ended:
+            store.settle()
 
     def _say(self, store: Store, *, now: bool) -> None:
         """Say up to when everything is recorded, to those who keep it until then."""

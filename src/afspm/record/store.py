@@ -122,6 +122,12 @@ class Store:
         with suppress(FileNotFoundError), (self._folder / f"{journal.JOURNAL_FILE}-wal").open("rb+") as file:
             os.fsync(file.fileno())
 
+    def settle(self) -> None:
+        """Nothing more is to come: the journal becomes one file that can be read without making others beside it."""
+        self._journal.execute("PRAGMA busy_timeout = 1000")
+        with suppress(sqlite3.OperationalError):  # somebody reads it: it stays as it is, which is as good
+            self._journal.execute("PRAGMA journal_mode = DELETE")
+
     def close(self) -> None:
         """Safe to repeat."""
         self._journal.close()

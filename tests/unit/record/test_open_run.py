@@ -44,6 +44,31 @@ def test_reading_changes_nothing(night: Night, tmp_path: Path) -> None:
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.suffix in (".sqlite", ".h5")} == before
 
 
+def test_a_run_that_has_ended_is_one_file_and_reading_makes_no_other(
+    night: Night, store: Store, tmp_path: Path
+) -> None:
+    store.take(night.whole_scan(1))
+    store.settle()
+    store.close()
+    with afspm.open_run(tmp_path) as run:
+        assert len(run.scans) == 1
+    assert [file.name for file in tmp_path.iterdir() if file.is_file()] == [JOURNAL_FILE]
+    again = Store(tmp_path, ABOUT)  # as a run that is resumed all the same
+    again.take(night.whole_scan(2))
+    assert len(afspm.open_run(tmp_path).scans) == 2
+    again.close()
+
+
+def test_who_reads_while_it_ends_is_not_disturbed(night: Night, store: Store, tmp_path: Path) -> None:
+    store.take(night.whole_scan(1))
+    with afspm.open_run(tmp_path) as run:
+        rows = run._journal.execute("SELECT * FROM packets")
+        rows.fetchone()  # in the middle of it
+        store.settle()
+        assert len(rows.fetchall()) == 3
+        assert len(run.scans) == 1
+
+
 def test_the_newest_of_a_folder_of_runs_is_meant(night: Night, tmp_path: Path) -> None:
     (tmp_path / "night-2").mkdir()
     Store(tmp_path / "night-2", ABOUT).close()
