@@ -6,6 +6,7 @@ import gc
 import os
 import signal
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any
 
 import pytest
@@ -25,13 +26,8 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-TOGETHER = (
-    "tests/system/components/test_tip_repair.py",
-    "tests/system/microscopes/test_every_microscope.py",
-    "tests/ui/",
-    "tests/unit/components/test_tip_",
-)
-"""How the names of tests begin that one process does: what they share takes long to make, and is made once for all."""
+TOGETHER = ("tests/ui/", "tests/unit/components/test_tip_")
+"""How the names of tests begin that one process does, in a row, since they share what is made once in a process."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -39,16 +35,23 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Who does which test, with pytest-xdist."""
     from xdist.scheduler import LoadScopeScheduling
 
+    @cache
+    def shares(module: str) -> bool:
+        return 'scope="module"' in (config.rootpath / module).read_text(encoding="utf-8")
+
     class FromBothEnds(LoadScopeScheduling):
         """Takes tests from both ends in turn: at the one are those that compute, at the other those that wait.
 
-        Its own marks for groups are not seen with the structured ids of pytest 9.2 (pytest-xdist 3.8, issue 1386).
+        What a module makes once is made once. (The marks of pytest-xdist 3.8 for groups go unseen with pytest 9.2:
+        its issue 1386.)
         """
 
         _from_the_end = False
 
         def _split_scope(self, nodeid: str) -> str:
-            return next((name for name in TOGETHER if nodeid.startswith(name)), nodeid)
+            module = nodeid.split("::")[0]
+            own = module if shares(module) else nodeid
+            return next((name for name in TOGETHER if nodeid.startswith(name)), own)
 
         def _assign_work_unit(self, node: Any) -> None:
             if self._from_the_end:
