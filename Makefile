@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test test-translators check bench bench-drift soak chaos simulate power-cut clean
+.PHONY: demo demo-drift test test-ui test-translators check bench bench-drift soak chaos simulate power-cut clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -24,6 +24,10 @@ demo-drift: $(SETUP)
 TESTS_AT_A_TIME ?= 4
 test: $(SETUP)
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME)
+
+## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots
+test-ui: $(SETUP)
+	@$(BIN)/pytest tests/ui
 
 ## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
 TRANSLATORS ?= simulator image nanonis asylum gxsm

@@ -19,6 +19,7 @@ MODULES = (
     "reading",
     "recording",
     "experiment",
+    "dashboard",
 )
 RESULT = Path("build/bench.json")
 

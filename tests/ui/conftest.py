@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,21 @@ from typing import Any
 import pytest
 from ui_lab import SCREENSHOTS, Night
 
+sys.path.insert(0, str(Path(__file__).parents[2]))  # `benchmarks` has a stage to publish on, which serves here too
+
 NO_BROWSER = (
     "no chromium is found: `apt install chromium` (or another way to have it; AFSPM_CHROMIUM=/path says where), "
     "and the package playwright"
 )
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """With all other tests only the smoke test runs; all of these take minutes, and run with `make test-ui`."""
     here = Path(__file__).parent
+    if not any((config.invocation_params.dir / arg.partition("::")[0]).is_relative_to(here) for arg in config.args):
+        later = [item for item in items if item.path.is_relative_to(here) and item.path.name != "test_smoke.py"]
+        config.hook.pytest_deselected(items=later)
+        items[:] = [item for item in items if item not in later]
     for item in items:
         if item.path.is_relative_to(here):  # one browser, one experiment: one after the other
             item.add_marker(pytest.mark.xdist_group("ui"))

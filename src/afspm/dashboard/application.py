@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,9 +38,10 @@ def application(
     host: str,
     encrypted: bool,
 ) -> tuple[App, Callable[[float], bool]]:
-    """The application, once a process; and what waits until all pages have been told of the end, so many seconds."""
+    """The application, once a process; and what waits, so many seconds, until all pages have been told of the end."""
     from fastapi import FastAPI
     from fastapi.staticfiles import StaticFiles
+    from nicegui import app as nicegui
     from nicegui import ui
 
     from afspm.dashboard.page import Page, Services
@@ -54,7 +56,8 @@ def application(
 
     app = FastAPI(lifespan=lifespan, openapi_url=None)
     add_entrance(app, access, title, encrypted=encrypted, only_here=is_loopback(host))
-    Live(watch, bell, archive).add_to(app)
+    live = Live(watch, bell, archive)
+    live.add_to(app)
     app.mount("/assets", StaticFiles(directory=ASSETS))
     audience = Audience()
     services = Services(watch, Contents(watch, limits), steering, audience, title, simulated)
@@ -63,5 +66,17 @@ def application(
         request = ui.context.client.request
         Page(services, getattr(request.state, VISITOR, Visitor()))
 
+    nicegui.on_exception(_tell)
     ui.run_with(app, root=page, title=title, show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
-    return Guard(app, access, host), audience.wait_told
+
+    def farewell(within_s: float) -> bool:
+        told = audience.wait_told(within_s)
+        live.close()
+        return told
+
+    return Guard(app, access, host), farewell
+
+
+def _tell(error: Exception) -> None:
+    """What goes wrong on a page is no reason to end."""
+    logging.getLogger("afspm.dashboard").error("the page has an error", exc_info=error)

@@ -71,7 +71,7 @@ class Dashboard(Component):
         self._watch = Watch(self.clock, self._context.problems)
         self._steering = Steering(launch, self.clock, self._watch)
         folder = self.run_dir if launch.run_dir else None
-        app, self._told = application(
+        app, self._farewell = application(
             self._watch,
             self._steering,
             access,
@@ -94,7 +94,7 @@ class Dashboard(Component):
         if self._server is None:
             return
         self._watch.tell(ended=True)
-        self._told(TOLD_WITHIN_S)
+        self._farewell(TOLD_WITHIN_S)
         self._steering.close()
         self._server.stop()
 

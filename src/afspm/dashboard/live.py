@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 POLL_S = 20.0  # then the browser asks anew: what is in between may close connections that say nothing for longer
 GROWING_S = 0.2  # between two pictures of a growing scan
-FINISHED_S = 0.04  # between two of finished ones, for each viewer
+FINISHED_S = 0.004  # between two of finished ones, for each who looks on, and ten times that at least
 
 
 class Live:
@@ -42,6 +42,12 @@ class Live:
         self._archive = archive
         self._drawer = Drawer()
         self._waiting = 0
+        self._closing = False
+
+    def close(self) -> None:
+        """Whoever waits for a picture is answered at once, and nobody waits any more. From any thread."""
+        self._closing = True
+        self._bell.ring()
 
     def add_to(self, app: FastAPI) -> None:
         """Serve /live/image, /live/value, /live/profile and /live/palette."""
@@ -110,14 +116,14 @@ class Live:
         self._waiting += 1
         try:
             # many viewers at full speed get fewer pictures each, and not the experiment less time
-            finished_s = now_s + FINISHED_S * max(1, self._waiting // 4)
+            finished_s = now_s + FINISHED_S * max(10, self._waiting)
             while True:
                 number, complete = self._newest(channel)
                 due_s = now_s if not after else finished_s if complete else growing_s
                 now_s = loop.time()
                 if number > after and now_s >= due_s:
                     return True
-                if now_s >= end_s:
+                if now_s >= end_s or self._closing:
                     return False
                 await self._bell.wait((due_s if number > after else end_s) - now_s)
         finally:

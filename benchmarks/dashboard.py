@@ -1,0 +1,97 @@
+"""The dashboard in a browser: how soon a scan is on the page, alone and with many who look on."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from benchmarks.rows import Row, measurement
+from benchmarks.stage import Stage, picture
+
+SIDE, TIMES = 512, 12
+VIEWERS, COUNTED_S = 20, 8.0
+MS_PER_NS = 1e-6
+
+
+@measurement
+def dashboard() -> Iterator[Row]:
+    """From the publication of a scan until the browser has drawn it; the clock is that of one computer."""
+    with _browser() as browser, Stage() as stage:
+        if browser is None:
+            return
+        page = open_page(browser, stage.url)
+        late_ms = [latency_ms(page, stage, seed) for seed in range(TIMES)][2:]
+        yield Row(f"scan of {SIDE}² on the page after its publication", "ms", statistics.median(late_ms), None, 150.0)
+        yield Row(f"scan of {SIDE}² on the page, the slowest of {len(late_ms)}", "ms", max(late_ms), None, 300.0)
+        with viewers(stage.url, VIEWERS):
+            busy_s, begin_s = cpu_s(stage.process.pid), perf_counter()
+            late_ms = [latency_ms(page, stage, seed) for seed in range(TIMES)][2:]
+            while perf_counter() - begin_s < COUNTED_S:  # a scan a second, which few microscopes take
+                late_ms.append(latency_ms(page, stage, len(late_ms)))
+                page.wait_for_timeout(1000)
+            share = (cpu_s(stage.process.pid) - busy_s) / (perf_counter() - begin_s)
+        yield Row(f"the same while {VIEWERS} look on", "ms", statistics.median(late_ms), None, 150.0)
+        yield Row(f"dashboard with {VIEWERS} viewers, a scan a second", "cores", share, None, 0.5)
+
+
+def latency_ms(page: Any, stage: Stage, seed: int, side: int = SIDE) -> float:
+    """Publish one scan, and wait until it is drawn."""
+    time_ns = stage.scan(picture(side, seed))
+    page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{time_ns}'")
+    return float(page.get_attribute(".picture", "data-at")) - time_ns * MS_PER_NS
+
+
+def open_page(browser: Any, url: str) -> Any:
+    """A page that has been drawn once."""
+    page = browser.new_page(viewport={"width": 1400, "height": 1000})
+    page.goto(url)
+    page.wait_for_selector("text=is in control")
+    page.wait_for_function("window.afspm?.image")
+    return page
+
+
+@contextmanager
+def viewers(url: str, count: int) -> Iterator[None]:
+    """So many look on while in the block, from a process of their own."""
+    command = (sys.executable, "-m", "benchmarks.viewers", url, str(count))
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            if process.stdout.readline().strip() != "ready":
+                raise RuntimeError("the viewers see nothing")
+            yield
+        finally:
+            process.stdin.close()
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time of a process so far (Linux)."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@contextmanager
+def _browser() -> Iterator[Any]:
+    """None where there is none."""
+    program = os.environ.get("AFSPM_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        program = None
+    if program is None:
+        print("the dashboard is not measured: no chromium, or no playwright, is found")
+        yield None
+        return
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield started
+        started.close()
