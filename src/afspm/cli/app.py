@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
 from afspm.cli import (
@@ -23,27 +25,48 @@ from afspm.cli import (
 
 app = typer.Typer(
     name="afspm",
-    help="Automate scanning probe microscopes: run experiments of several components that share one microscope.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode="markdown",  # paragraphs are filled; [security] is text
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _version(asked: bool) -> None:
+    from importlib.metadata import version
+
+    if asked:
+        typer.echo(f"afspm {version('afspm')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _afspm(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which this is, and end.")
+    ] = False,
+) -> None:
+    """Automate scanning probe microscopes: run experiments of several components that share one microscope."""
+
+
+BEFORE, MEANWHILE, AFTERWARDS, MICROSCOPES = "Before", "While it runs", "Afterwards", "Microscopes"
+
 app.command("run")(run.run)
-app.command("dashboard")(dashboard.dashboard)
-app.command("status")(status.status)
-app.command("watch")(status.watch)
-app.command("pause")(steer.pause)
-app.command("resume")(steer.resume)
-app.command("end")(steer.end)
-app.command("problems")(steer.problems)
-app.command("report")(report.report)
-app.command("export")(export.export)
-app.command("replay")(replay.replay)
-app.command("check")(check.check)
-app.command("graph")(graph.graph)
-app.command("keys")(keys.keys)
-app.command("emulate")(emulate.emulate)
-app.command("test-translator")(test_translator.check_translator)
-app.add_typer(new.app, name="new")
-app.add_typer(drift.app, name="drift")
+app.command("check", rich_help_panel=BEFORE)(check.check)
+app.command("graph", rich_help_panel=BEFORE)(graph.graph)
+app.command("keys", rich_help_panel=BEFORE)(keys.keys)
+app.command("dashboard", rich_help_panel=MEANWHILE)(dashboard.dashboard)
+app.command("status", rich_help_panel=MEANWHILE)(status.status)
+app.command("watch", rich_help_panel=MEANWHILE)(status.watch)
+app.command("pause", rich_help_panel=MEANWHILE)(steer.pause)
+app.command("resume", rich_help_panel=MEANWHILE)(steer.resume)
+app.command("end", rich_help_panel=MEANWHILE)(steer.end)
+app.command("problems", rich_help_panel=MEANWHILE)(steer.problems)
+app.command("report", rich_help_panel=AFTERWARDS)(report.report)
+app.command("export", rich_help_panel=AFTERWARDS)(export.export)
+app.command("replay", rich_help_panel=AFTERWARDS)(replay.replay)
+app.add_typer(drift.app, name="drift", rich_help_panel=AFTERWARDS)
+app.add_typer(new.app, name="new", rich_help_panel=MICROSCOPES)
+app.command("test-translator", rich_help_panel=MICROSCOPES)(test_translator.check_translator)
+app.command("emulate", rich_help_panel=MICROSCOPES)(emulate.emulate)

@@ -24,6 +24,7 @@ class FilesUnlessNamed(TyperGroup):
 app = typer.Typer(
     cls=FilesUnlessNamed,
     no_args_is_help=True,
+    rich_markup_mode="markdown",
     help="Follow drift in recorded scans (afspm drift FILE…), or study settings in simulated nights (… study).",
 )
 Jobs = Annotated[

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Make something to begin with.")
+app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Make something to begin with.")
 
 
 @app.callback()

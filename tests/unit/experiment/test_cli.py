@@ -68,3 +68,26 @@ def test_keys_makes_a_pair_for_each_process_and_person_and_leaves_old_ones(
     result = runner.invoke(app, ["keys", "night.toml", "--also", "ana"])
     assert "there already" in result.output
     assert (tmp_path / "keys" / "public" / "ana.key").read_text() == before
+
+
+def test_help_keeps_names_in_brackets_and_fills_its_paragraphs(runner: CliRunner) -> None:
+    helped = " ".join(runner.invoke(app, ["keys", "--help"]).output.replace("│", " ").split())
+    assert "Default: [security] keys of the file" in helped
+    lines = runner.invoke(app, ["run", "--help"]).output.splitlines()
+    paragraph = [line for line in lines if "Ctrl-C ends the" in line]
+    assert len(paragraph) == 1
+    assert len(paragraph[0].rstrip()) > 70
+
+
+def test_every_command_is_listed_under_when_it_is_used(runner: CliRunner) -> None:
+    helped = runner.invoke(app, ["--help"]).output
+    order = ["run ", "Before", "check", "While it runs", "watch", "Afterwards", "report", "Microscopes", "emulate"]
+    places = [helped.index(f"─ {title}" if title[0].isupper() else f"│ {title}") for title in order]
+    assert places == sorted(places)
+
+
+def test_says_its_version(runner: CliRunner) -> None:
+    result = runner.invoke(app, ["--version"])
+    assert result.exit_code == 0
+    assert result.output.split()[0] == "afspm"
+    assert result.output.split()[1][0].isdigit()
