@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ui_lab import SCREENSHOTS, Night
+from ui_lab import SCREENSHOTS, Night, Opened
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # `benchmarks` has a stage to publish on, which serves here too
 
@@ -54,9 +54,6 @@ def night(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ni
     one = Night(tmp_path_factory.mktemp("night"))
     yield one
     one.close()
-
-
-Opened = Callable[..., Any]
 
 
 @pytest.fixture

@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import signal
 
-from ui_lab import Night
+from ui_lab import Night, Opened
 
 from afspm.model import ProcessCondition
-from conftest import Opened
 
 
 def pid_of(night: Night, name: str) -> int:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from conftest import Opened
-from ui_lab import Night
+from ui_lab import Night, Opened
 
 import afspm
 from afspm.model import ControlMode

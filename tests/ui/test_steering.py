@@ -6,10 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from ui_lab import Night
+from ui_lab import Night, Opened
 
 from afspm.model import ControlMode, ControlResponse, ProcessCondition, ScopeState
-from conftest import Opened
 
 ADA = "dashboard:Ada"
 
@@ -85,7 +84,7 @@ def test_parameters_are_read_and_set_and_refusals_give_their_reason(night: Night
     page.fill("input[aria-label='value with unit']", "7 V")
     press(page, "Set")
     page.wait_for_selector(".outcomes .refused")
-    refusal = night.entry(ADA, "tip-bias-voltage", after=after)
+    refusal = night.entry(ADA, "tip-bias-voltage = 7", after=after)
     assert refusal.refused
     assert refusal.reason in page.inner_text(".outcomes")
     assert "above the highest allowed, 3 V" in refusal.reason

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ui_lab import Night
+from ui_lab import Night, Opened
 
 import afspm
 from afspm.dashboard.levelling import Levelling, levelled
 from afspm.dashboard.palettes import colours
 from afspm.dashboard.pictures import Contrast, indices, span_of
 from afspm.model import Region, Scan
-from conftest import Opened
 
 TURNED = Region((0.4e-6, -0.3e-6), (0.8e-6, 0.5e-6), 0.4)
 

@@ -16,6 +16,7 @@ from afspm.runtime.following import SMALL, Follower
 
 DEADLINE_S = 30.0
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
+Opened = Callable[..., Any]
 SCREENSHOTS = Path(__file__).parents[2] / "build" / "screenshots"
 
 EXPERIMENT = """
