@@ -33,7 +33,7 @@ class Notifier(Component):
     ended.
 
     Args:
-        command: program and arguments, run where the experiment file is; the notice is JSON on its standard input.
+        program: a command and its arguments, run where the experiment file is; the notice is JSON on its standard input.
         webhook: where that JSON is posted to; "$NAME" is taken from the environment.
         on: of what to tell: "unsolved-problem", "given-up".
         unsolved_after: how long a problem may be flagged before it counts as unsolved, experiment time.
@@ -47,13 +47,13 @@ class Notifier(Component):
 
     def __init__(
         self,
-        command: list[str] | None = None,
+        program: list[str] | None = None,
         webhook: str = "",
         on: list[str] | None = None,
         unsolved_after: Duration = 900.0,
         folder: str = "",
     ) -> None:
-        self.targets = Targets(tuple(command or ()), webhook, folder)
+        self.targets = Targets(tuple(program or ()), webhook, folder)
         self.on = tuple(OCCASIONS if on is None else on)
         self.unsolved_after = unsolved_after
         if not self.targets.ways:

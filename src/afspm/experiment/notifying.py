@@ -33,7 +33,7 @@ def implied(resolved: Resolved, section: Notify) -> Part | None:
     if not (section.command or section.webhook) or not told or there_is_one or not resolved.with_role(Role.SCHEDULER):
         return None
     wanted = targets(section, resolved.document.folders[0])
-    settings: dict[str, Any] = {"command": list(wanted.command)} if wanted.command else {}
+    settings: dict[str, Any] = {"program": list(wanted.command)} if wanted.command else {}
     settings |= {"webhook": wanted.webhook} if wanted.webhook else {}
     settings |= {"on": list(section.on), "unsolved_after": section.unsolved_after, "folder": wanted.folder}
     taken = {part.name.casefold() for part in resolved.parts.components}

@@ -178,7 +178,7 @@ def test_a_notifier_that_is_killed_goes_on_and_tells_nothing_twice(tmp_path: Pat
 
 def test_each_way_is_tried_by_itself(tmp_path: Path, hook: Hook) -> None:
     hook.codes = [500, 200]
-    night = Night(tmp_path, webhook=hook.url, command=recording(tmp_path))
+    night = Night(tmp_path, webhook=hook.url, program=recording(tmp_path))
     night.given_up("judge")
     night.passes(100)
     assert len(hook.got) == 1
@@ -190,7 +190,7 @@ def test_no_log_holds_the_secret(tmp_path: Path, hook: Hook, caplog: pytest.LogC
     hook.codes = [404]
     url = hook.url
     for webhook in (url, f"http://127.0.0.1:1/{SECRET}", f"http://nowhere.invalid/{SECRET}"):
-        night = Night(tmp_path, webhook=webhook, command=[sys.executable, "-c", "exit(3)", SECRET])
+        night = Night(tmp_path, webhook=webhook, program=[sys.executable, "-c", "exit(3)", SECRET])
         night.given_up(f"judge {webhook[:18]}")
         night.passes(100)
     assert "tried again" in caplog.text

@@ -39,7 +39,7 @@ def test_the_end_alone_needs_no_component(write: Write) -> None:
 
 def test_python_is_the_one_that_runs_us(write: Write) -> None:
     settings = notifier(write('[notify]\ncommand = ["python", "call.py"]\n'))
-    assert settings["command"] == [sys.executable, "call.py"]
+    assert settings["program"] == [sys.executable, "call.py"]
 
 
 @pytest.mark.parametrize(
@@ -71,8 +71,9 @@ def test_an_error_does_not_repeat_an_address_that_may_be_a_secret(write: Write) 
     assert "T0PSECRET" not in str(finding)
 
 
-def test_what_it_expands_to_reads_back_as_the_same(write: Write) -> None:
-    experiment = write(HOOK)
+@pytest.mark.parametrize("more", ["", 'command = ["python", "call.py"]\n'])
+def test_what_it_expands_to_reads_back_as_the_same(write: Write, more: str) -> None:
+    experiment = write(HOOK + more)
     settings = notifier(experiment)
     again = write(experiment.expanded(), frame="")
     assert notifier(again) == settings
