@@ -33,7 +33,7 @@ class Notifier(Component):
     ended.
 
     Args:
-        program: a command and its arguments, run where the experiment file is; the notice is JSON on its standard input.
+        program: a command with arguments, run where the experiment file is; the notice is JSON on its standard input.
         webhook: where that JSON is posted to; "$NAME" is taken from the environment.
         on: of what to tell: "unsolved-problem", "given-up".
         unsolved_after: how long a problem may be flagged before it counts as unsolved, experiment time.
