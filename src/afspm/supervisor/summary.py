@@ -7,6 +7,9 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from afspm.errors import FileError
+from afspm.record.run import open_run
+
 if TYPE_CHECKING:
     from afspm.supervisor.supervisor import Outcome
 
@@ -24,12 +27,23 @@ def lines(outcome: Outcome, folder: Path) -> list[str]:
             told.append(f"{report.name} was started anew {_times(report.ordered)}, as ordered")
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
-    told += _measured(folder / TABLE)
+    told += _recorded(folder) or _tabled(folder / TABLE)
     told.append(f"everything is in {folder}")
     return told
 
 
-def _measured(table: Path) -> list[str]:
+def _recorded(folder: Path) -> list[str]:
+    """What the record counts, where there is one."""
+    try:
+        with open_run(folder) as run:
+            whole = sum(not row.interrupted for row in run.scans)
+            interrupted, spectra = len(run.scans) - whole, len(run.spectra)
+    except FileError:
+        return []
+    return [_measured(whole, spectra) + (f"; {interrupted} interrupted" if interrupted else "")]
+
+
+def _tabled(table: Path) -> list[str]:
     """What the table of measurements counts, where the experiment kept one; a scan's channels are one scan."""
     try:
         with table.open(encoding="utf-8", newline="") as file:
@@ -37,7 +51,11 @@ def _measured(table: Path) -> list[str]:
     except (OSError, ValueError, csv.Error):
         return []
     counts = Counter(measurement for measurement, _ in rows)
-    return [f"measured: {counts['scan']} scans, {counts['spectrum']} spectra"]
+    return [_measured(counts["scan"], counts["spectrum"])]
+
+
+def _measured(scans: int, spectra: int) -> str:
+    return f"measured: {scans} scan{'' if scans == 1 else 's'}, {spectra} spectr{'um' if spectra == 1 else 'a'}"
 
 
 def _times(count: int) -> str:

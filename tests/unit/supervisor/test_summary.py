@@ -1,7 +1,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from afspm import wire
+from afspm.model import Packet, Region, Scan, ScopeState, ScopeStatus, Spectrum
+from afspm.record.store import SCHEDULER, About, Store
 from afspm.supervisor.ending import Why
 from afspm.supervisor.summary import lines
 from afspm.supervisor.supervisor import Outcome, Report
@@ -29,7 +35,21 @@ def test_a_scan_of_two_channels_is_one_scan(tmp_path: Path) -> None:
     rows = ["time,measurement,channel", "t1,scan,Height", "t1,scan,Phase", "t2,scan,Height", "t3,spectrum,IV"]
     (tmp_path / "metadata.csv").write_text("\n".join(rows), encoding="utf-8")
     told = lines(Outcome(Why.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)
-    assert "measured: 2 scans, 1 spectra" in told
+    assert "measured: 2 scans, 1 spectrum" in told
+
+
+def test_without_a_table_the_record_is_counted(tmp_path: Path) -> None:
+    store = Store(tmp_path, About({}))
+    region = Region((0.0, 0.0), (1e-6, 1e-6))
+    scans = [Scan(region, channel, "m", np.zeros((2, 2)), 2, "a.nc") for channel in ("Height", "Phase")]
+    published: list[Any] = [ScopeStatus(ScopeState.SCANNING), *scans, ScopeStatus(ScopeState.FREE)]
+    published += [ScopeStatus(ScopeState.SCANNING), ScopeStatus(ScopeState.INTERRUPTED)]
+    published += [Spectrum((0.0, 0.0), "IV", ("Bias",), ("V",), np.zeros((3, 1)), 6, "b")]
+    store.take([(Packet(*wire.encode(thing), time_ns), SCHEDULER) for time_ns, thing in enumerate(published)])
+    store.settle()
+    store.close()
+    told = lines(Outcome(Why.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)
+    assert "measured: 1 scan, 1 spectrum; 1 interrupted" in told
 
 
 def test_a_table_that_can_not_be_read_is_no_reason_to_fail(tmp_path: Path) -> None:
