@@ -76,7 +76,9 @@ class PlannedScans(Component):
             return
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
         if left_out := rhythm.left_out(self.memory.get("due_s", due_s), due_s):
-            self.log.warning("%d scans were due meanwhile; they are not made up for", left_out * len(self.plan.regions))
+            count = left_out * len(self.plan.regions)
+            said = "a scan was due meanwhile; it is" if count == 1 else f"{count} scans were due meanwhile; they are"
+            self.log.warning("%s not made up for", said)
         self.scope.sleep(max(0.0, due_s - self.clock.now_s()))
         # before it is asked for: a scan that a kill interrupts belongs to the beat that it was begun on
         self.memory["begun"], self.memory["due_s"] = step.index, due_s

@@ -67,7 +67,16 @@ def test_rounds_missed_while_control_was_lost_are_not_made_up_for(caplog: pytest
     assert len(lab.finished) == 3
     # the second was due at 900 s and is taken at 3000 s, the third on the old beat
     assert 3600.0 < lab.clock.passed_s < 3600.0 + 2 * SCAN_S
-    assert "2 scans were due meanwhile" in caplog.text
+    assert "2 scans were due meanwhile; they are not made up for" in caplog.text
+
+
+def test_one_missed_scan_is_told_as_one(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("series")
+    lab.at(150.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(2000.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    with caplog.at_level("WARNING"):
+        run(series(), lab)
+    assert "a scan was due meanwhile; it is not made up for" in caplog.text
 
 
 def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool) -> Lab:
