@@ -53,6 +53,10 @@ class SpectrumTaken:
     packet: Packet
     spectrum: Spectrum
 
+    def packets(self) -> Iterator[Packet]:
+        """That one."""
+        yield self.packet
+
 
 Taken = ScanTaken | SpectrumTaken
 

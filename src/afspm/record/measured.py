@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sqlite3
 import sys
@@ -11,7 +12,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from afspm.errors import AfspmError
 from afspm.model import Packet, ProblemNames, Scan, ScopeState
 from afspm.record import circumstances, nexus
 from afspm.record.circumstances import Stood
@@ -23,6 +23,7 @@ SCANS, SPECTRA = "scans", "spectra"
 SCHEDULER = ""
 """The source of what the scheduler publishes; that of others is their address."""
 SUFFIX = ".h5"
+_log = logging.getLogger("afspm.record")
 PART = ".part"
 
 
@@ -200,11 +201,12 @@ def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
     from afspm.files import read
 
     path = folder / filename if filename else folder
-    if not path.is_file():
-        return {}
     try:
+        if not path.is_file():
+            return {}
         content = read(path)
-    except (AfspmError, OSError):
+    except Exception as error:  # a folder that can't be reached, a file that a reader errs at: the scan is recorded
+        _log.debug("the header of %s is left out: %s", filename, error)
         return {}
     return {"controller": content.controller, **content.header}
 

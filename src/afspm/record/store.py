@@ -7,6 +7,7 @@ files are written aside and renamed before the journal names them, in one transa
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator
@@ -36,6 +37,9 @@ from afspm.wire.values import without_values
 
 __all__ = ["SCHEDULER", "About", "Store"]
 
+_log = logging.getLogger("afspm.record")
+_ALL_OF_THEM = (OSError, sqlite3.OperationalError)
+"""What is wrong with the disk, and so with whatever is written next."""
 _PROCESS = "SELECT role, condition, since_ns, starts, pid, last_exit FROM processes WHERE name = ? ORDER BY rowid DESC"
 
 
@@ -177,7 +181,21 @@ class Store:
 
     def _write(self, taken: Iterable[Taken]) -> None:
         for one in taken:
-            self._files.write(one)
+            self._journal.execute("SAVEPOINT measured")
+            try:
+                self._files.write(one)
+            except _ALL_OF_THEM:
+                raise
+            except Exception as error:  # what is wrong with one must not be the end of the record
+                self._journal.execute("ROLLBACK TO measured")
+                self._keep(one)
+                _log.error("no file can be made of what was measured, its packets are kept as they are: %s", error)
+            self._journal.execute("RELEASE measured")
+
+    def _keep(self, taken: Taken) -> None:
+        """Packets whole, with their values, since there is no file that has them."""
+        for packet in taken.packets():
+            insert_packet(self._journal, packet, wire.message_of(packet.envelope), bytes(packet.payload))
 
     def _placed(self, thing: Any) -> Any:
         """With the frame of its place, which the wire does not say."""

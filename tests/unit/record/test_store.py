@@ -228,11 +228,39 @@ def test_the_controllers_header_is_kept_where_its_file_can_be_read(night: Night,
     assert {name: run.about(run.scans[0])[name] for name in expected} == dict(expected)
 
 
+@pytest.mark.parametrize("filename", ["no-such-disk/" + 300 * "x", 5000 * "x", "a\0b"])
+def test_a_controllers_file_that_can_not_be_looked_for_costs_its_header_alone(
+    night: Night, store: Store, tmp_path: Path, filename: str
+) -> None:
+    scanning, *channels, free = night.whole_scan(1)
+    store.take([scanning, *((_with(packet, filename=filename), source) for packet, source in channels), free])
+    assert len(afspm.open_run(tmp_path).scan(0)) == 2
+
+
+def test_what_no_file_can_be_made_of_is_kept_and_all_else_recorded(
+    night: Night, store: Store, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scanning, *channels, free = night.whole_scan(1)
+    wrong = [(_with(packet, unit="m\0"), source) for packet, source in channels]  # HDF5 has no such texts
+    given = [scanning, *wrong, free, *night.whole_scan(2)]
+    store.take(given)
+    run = afspm.open_run(tmp_path)
+    assert same(list(run.packets()), given)
+    assert len(run.scans) == 1
+    assert len(run.scan(0)) == 2
+    assert "no file can be made of what was measured" in caplog.text
+    assert store.recorded_ns >= (given[-1][0].time_ns or 0)
+
+
 def _named(packet: Packet) -> Packet:
+    return _with(packet, filename="scan-0001.gsf")
+
+
+def _with(packet: Packet, **changes: Any) -> Packet:
     from dataclasses import replace
 
     scan = wire.decode("Scan2d", packet.payload)
-    return Packet(packet.envelope, wire.encode(replace(scan, filename="scan-0001.gsf"))[1], packet.time_ns)
+    return Packet(packet.envelope, wire.encode(replace(scan, **changes))[1], packet.time_ns)
 
 
 def test_requests_processes_and_log_lines_have_their_tables(night: Night, store: Store, tmp_path: Path) -> None:
