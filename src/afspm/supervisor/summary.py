@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
 from afspm.record.run import open_run
+from afspm.supervisor.ending import Why
 
 if TYPE_CHECKING:
     from afspm.supervisor.supervisor import Outcome
@@ -29,6 +30,9 @@ def lines(outcome: Outcome, folder: Path) -> list[str]:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     told += _recorded(folder) or _tabled(folder / TABLE)
     told.append(f"everything is in {folder}")
+    if outcome.why is Why.STOPPED:
+        named = f'"{folder}"' if " " in str(folder) else folder
+        told.append(f"`afspm run --resume {named}` goes on with it")
     return told
 
 

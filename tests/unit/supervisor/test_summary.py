@@ -54,4 +54,9 @@ def test_without_a_table_the_record_is_counted(tmp_path: Path) -> None:
 
 def test_a_table_that_can_not_be_read_is_no_reason_to_fail(tmp_path: Path) -> None:
     (tmp_path / "metadata.csv").write_bytes(b"\xff\xfe\x00,\x00")
-    assert lines(Outcome(Why.STOPPED, "", (), 1.0), tmp_path)[-1] == f"everything is in {tmp_path}"
+    assert lines(Outcome(Why.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)[-1] == f"everything is in {tmp_path}"
+
+
+def test_who_stops_a_run_is_told_how_it_goes_on(tmp_path: Path) -> None:
+    told = lines(Outcome(Why.STOPPED, "stopped by Ctrl-C", (), 1.0), tmp_path)
+    assert told[-2:] == [f"everything is in {tmp_path}", f"`afspm run --resume {tmp_path}` goes on with it"]
