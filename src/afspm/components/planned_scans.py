@@ -56,7 +56,7 @@ class PlannedScans(Component):
         self.memory.save()
         self._set_parameters()
         done = int(self.memory.get("done", 0))
-        if done:
+        if done and done != self.plan.total:
             self.log.info("going on with scan %d%s", done + 1, self._of_total())
         with self.scope.control() if self.keep_control else nullcontext():
             for step in self.plan.steps(done):

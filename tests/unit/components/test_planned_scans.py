@@ -101,6 +101,19 @@ def test_killed_anywhere_no_scan_is_missing_or_there_twice(tmp_path: Path, is_la
         assert len(lab.finished) == 3, f"killed at call {call}"
 
 
+def test_started_again_it_says_where_it_goes_on_unless_nothing_is_left(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO"):
+        _killed_at(40, lambda: series(scans=9), tmp_path / "killed", is_late=False)
+        assert "going on with scan" in caplog.text
+        caplog.clear()
+        run(series(end_when_done=False), Lab("series"), tmp_path)
+        run(series(), Lab("series"), tmp_path)
+    assert "going on with" not in caplog.text
+    assert caplog.text.count("all 3 scans are taken") == 2
+
+
 def test_a_list_is_gone_through_in_its_order_round_after_round() -> None:
     lab = Lab("list")
     places = [{"center": [x, 0.0], "size": [1e-6, 1e-6]} for x in (1e-6, 2e-6)]
