@@ -5,6 +5,7 @@ In a page, what stands between `<!-- from the code: NAME -->` and `<!-- end -->`
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import re
 import sys
@@ -14,7 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from afspm import components
+from afspm.dashboard import Dashboard
 from afspm.logic import arbitration, diagram
+from afspm.microscopes.simulator import Simulator
+from afspm.microscopes.simulator.faults import Fault
+from afspm.microscopes.simulator.instrument import PanelEvent
+from afspm.simulation.drift import Relaxation
+from afspm.simulation.surfaces import KINDS
+from afspm.simulation.world_settings import WorldSettings
 from afspm.units import Unit
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,10 +57,39 @@ def _done(do: arbitration.Do) -> str:
 
 def component_pages() -> str:
     """Each ready-made component: what it does, and its settings."""
-    pages = []
-    for name in components.__all__:
-        pages.append(_class_page(name, getattr(components, name)))
-    return "\n".join(pages)
+    found = {name: getattr(components, name) for name in components.__all__} | {"Dashboard": Dashboard}
+    return "\n".join(_class_page(name, found[name]) for name in sorted(found))
+
+
+def simulator_page() -> str:
+    """The simulated microscope: its settings, and those of each table in them."""
+    parts = [_class_page("Settings", Simulator)]
+    parts += [_table_page(f'surface = "{kind}"', cls) for kind, cls in KINDS.items()]
+    hints = typing.get_type_hints(WorldSettings)
+    parts += [_table_page(name, hints[name]) for name in WorldSettings.__dataclass_fields__]
+    parts += [_table_page("relaxing, in drift", Relaxation)]
+    parts += [_table_page("each of faults", Fault), _table_page("each of panel", PanelEvent)]
+    return "\n".join(parts)
+
+
+def _table_page(title: str, cls: type) -> str:
+    """A table of settings that is a dataclass in the code."""
+    text, meanings = _docstring(cls, "Attributes")
+    lines = [f"### {title}", "", text, "", "| key | default | meaning |", "| --- | --- | --- |"]
+    for one in dataclasses.fields(cls):
+        default = one.default if one.default_factory is dataclasses.MISSING else one.default_factory()
+        told = "(needed)" if default is dataclasses.MISSING else _plain(default)
+        lines.append(f"| `{one.name}` | {told} | {meanings.get(one.name, '')} |")
+    return "\n".join([*lines, ""])
+
+
+def _plain(value: Any) -> str:
+    """A default as it would be written in a file."""
+    if isinstance(value, bool) or value is None:
+        return _value(value, Any, ())
+    if isinstance(value, (list, tuple)):
+        return "`[" + ", ".join(_plain(one).strip("`") for one in value) + "]`"
+    return f"`{value:g}`" if isinstance(value, (float, int)) else f'`"{value}"`'
 
 
 def _class_page(name: str, cls: type) -> str:
@@ -75,9 +112,10 @@ def _class_page(name: str, cls: type) -> str:
     return "\n".join(lines)
 
 
-def _docstring(cls: type) -> tuple[str, dict[str, str]]:
+def _docstring(cls: type, list_of: str = "Args") -> tuple[str, dict[str, str]]:
     """The docstring without its list of settings, and what that says of each."""
-    text, _, listed = (inspect.getdoc(cls) or "").partition("\nArgs:\n")
+    text, _, listed = (inspect.getdoc(cls) or "").partition(f"\n{list_of}:\n")
+    listed = listed.partition("\n\n")[0]  # and not what it raises
     meanings = {}
     for entry in re.split(r"\n(?=    \w)", f"\n{listed}"):
         names, _, meaning = entry.strip().partition(":")
@@ -136,6 +174,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "state-diagram": state_diagram,
     "transition-table": transition_table,
     "components": component_pages,
+    "simulator": simulator_page,
 }
 
 

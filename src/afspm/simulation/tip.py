@@ -59,7 +59,7 @@ class TipSettings:
     """The tip at its best, and how bad it gets; sizes of flaws are in units of its radius.
 
     Attributes:
-        condition: at the start, one of CONDITIONS.
+        condition: at the start: "sharp", "blunt", "double" or "contaminated".
         spread: relative scatter of every size that is drawn.
     """
 
@@ -88,7 +88,7 @@ class TipChangeSettings:
         per_metre: the same a metre of scanned line.
         hardness_exponent: both grow as (force against that at a gentle setpoint) to this power.
         blunt_weight, double_weight, contaminated_weight: how likely each is.
-        schedule: (seconds after the start, condition): changes that come for certain.
+        schedule: pairs of seconds after the start and a condition: changes that come for certain.
         wear_m_per_m: the radius grows so much a metre scanned at a gentle setpoint.
         pulse_threshold_v: below, a pulse does nothing.
         pulse_cures, pulse_worsens, crash_cures, crash_worsens: probabilities.

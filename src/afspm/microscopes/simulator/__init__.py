@@ -62,14 +62,18 @@ class Simulator(Microscope):
 
     Args:
         seed: everything that is left to chance follows from it.
-        surface, tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force: of the simulated world, see
-            `afspm.simulation.World`.
+        surface: a kind, or a table of `kind` and its settings.
+        tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force: a table of its own settings.
         initial: values of parameters at the start, by their generic names.
         approach_s: how long engaging and retracting take.
-        faults: what goes wrong when, each a table of `kind`, `at_s`, `count`, `duration_s` (see `Fault`).
+        faults: what goes wrong when, each a table of `kind`, `at_s`, `count`, `duration_s` (below).
         fault_action: whether the action "x-fault" makes faults on demand.
         panel: what a person does at the controller itself, each a table of `at_s` with `set` or `action`.
-        parameters, actions, poll_period_s, result_timeout_s, live_lines_s: as for every microscope.
+        parameters: rows added to the table of parameters, or changed in it.
+        actions: generic actions added: `{name = {set = {<parameter> = <value>}}}`.
+        poll_period_s: how often it is looked at, in real seconds, when nothing is about to happen.
+        result_timeout_s: how long after a scan or spectrum its file may take to appear.
+        live_lines_s: how often the lines of a running scan are published; by default not at all.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
