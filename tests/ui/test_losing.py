@@ -59,5 +59,6 @@ def test_the_end_is_asked_for_twice_and_then_told(night: Night, opened: Opened, 
     page.click("button:has-text('Yes, end the experiment')")
     assert night.process.wait(40.0) == 0
     page.wait_for_selector("#trouble:has-text('The experiment has ended')")
+    assert page.evaluate("document.querySelector('.steer').inert")
     assert callable(keep)
     keep(page, "ended")

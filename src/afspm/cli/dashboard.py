@@ -113,9 +113,15 @@ def _start_part(file: Path) -> int:
     """The dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
     import sys
 
+    from afspm.errors import ConfigError
     from afspm.supervisor import run as running
 
     experiment = with_dashboard([file])
     names = [name for name, path in experiment.resolved.class_paths.items() if path.endswith(f".{NAME_OF_CLASS}")]
+    try:
+        running.dry_run(experiment, running.Options(only=tuple(names)))
+    except ConfigError as error:
+        what = f"nothing of it runs here, and where its scheduler would be is not in the file: {error.what}"
+        raise ConfigError(what, where=str(file), hint="start it with `afspm run`") from error
     ended = running.run(experiment, running.Options(only=tuple(names)), terminal=sys.stdout)
     return ended.outcome.exit_code

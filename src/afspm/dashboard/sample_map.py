@@ -64,7 +64,7 @@ def map_html(content: MapContent, *, whole: bool = True) -> str:
         f'<figure class="map" role="img" aria-label="Map of the sample: {words}">'
         f'<div class="map-area" style="aspect-ratio:{frame.width:.6g}/{frame.height:.6g}">'
         f'<svg viewBox="0 0 {frame.width:.6g} {frame.height:.6g}">{"".join(shapes)}</svg>{ticks}</div>'
-        f"{_keys(content, spectra)}{_drift_words(content)}{more}</figure>"
+        f"{_keys(content, spectra, whole=whole)}{_drift_words(content)}{more}</figure>"
     )
 
 
@@ -186,12 +186,12 @@ def _ticks(frame: _Frame) -> str:
     return f'{"".join(parts)}<span class="map-unit">{unit}</span>'
 
 
-def _keys(content: MapContent, spectra: Sequence[SpectrumTaken]) -> str:
+def _keys(content: MapContent, spectra: Sequence[SpectrumTaken], *, whole: bool) -> str:
     keys = {
         "scan": ("scans; click one to see it", bool(content.scans)),
         "current": ("set now", content.current is not None),
         "spectrum": ("spectra", bool(spectra)),
-        "limits": ("limits", content.limits is not None),
+        "limits": ("limits", content.limits is not None and whole),
     }
     shown = "".join(f'<span class="key-{name}">{text}</span>' for name, (text, is_there) in keys.items() if is_there)
     return f'<div class="map-keys">{shown}</div>'

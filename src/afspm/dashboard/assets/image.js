@@ -131,7 +131,7 @@ export class ImageView {
     this.#drawAxes(area);
     this.#drawBar(area);
     this.#drawMarks(area);
-    if (this.profile) drawProfile(this.find("profile"), this.profile);
+    if (this.profile) drawProfile(this.find("profile"), this.profile, this.head.levelling === "none" ? "value" : "levelled value");
   }
 
   showValue(found, asked) {
@@ -230,31 +230,35 @@ export class ImageView {
     context.fillText(found.unit ? `[${found.unit}]` : "", x, box.y - 5);
   }
 
-  #drawMarks({ context, accent }) {
+  #drawMarks({ context }) {
     context.save();
-    context.strokeStyle = accent;
-    context.lineWidth = 2;
+    // white within black is seen on any colour
+    for (const [colour, width] of [["rgba(0,0,0,0.7)", 3.5], ["#fff", 1.4]]) {
+      context.strokeStyle = colour;
+      context.lineWidth = width;
+      context.stroke(this.#marks());
+    }
+    context.restore();
+  }
+
+  #marks() {
+    const path = new Path2D();
     if (this.line) {
       const [a, b] = this.line.map((place) => this.geometry.toScreen(place));
-      if (this.tool === "scan") context.strokeRect(Math.min(a[0], b[0]), Math.min(a[1], b[1]), Math.abs(a[0] - b[0]), Math.abs(a[1] - b[1]));
+      if (this.tool === "scan") path.rect(Math.min(a[0], b[0]), Math.min(a[1], b[1]), Math.abs(a[0] - b[0]), Math.abs(a[1] - b[1]));
       else {
-        context.beginPath();
-        context.moveTo(...a);
-        context.lineTo(...b);
-        context.stroke();
+        path.moveTo(...a);
+        path.lineTo(...b);
       }
     }
     if (this.cursor) {
       const [x, y] = this.geometry.toScreen(this.geometry.fromPixel(this.cursor));
-      context.lineWidth = 1;
-      context.beginPath();
       for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-        context.moveTo(x + 4 * dx, y + 4 * dy);
-        context.lineTo(x + 12 * dx, y + 12 * dy);
+        path.moveTo(x + 4 * dx, y + 4 * dy);
+        path.lineTo(x + 12 * dx, y + 12 * dy);
       }
-      context.stroke();
     }
-    context.restore();
+    return path;
   }
 
   #askValue() {

@@ -16,7 +16,13 @@ function update(state) {
   image?.setChannels(state.channels);
   image?.setSteering(state.may_measure);
   showTrouble(state.trouble);
+  allowSteering(!ended);
   return localStorage.getItem("afspm-theme") ?? "";
+}
+
+/** What would reach nobody can't be pressed. */
+function allowSteering(may) {
+  for (const element of document.querySelectorAll(".steer, .processes")) element.inert = !may;
 }
 
 function showTrouble(text) {
@@ -29,6 +35,8 @@ function showTrouble(text) {
 
 setInterval(() => {
   if (Date.now() - updated < LOST_AFTER_MS && window.socket?.connected !== false) return;
+  allowSteering(false);
+  image?.setSteering(false);
   const seconds = Math.round((Date.now() - updated) / 1000);
   showTrouble(ended ? "The experiment has ended, and the dashboard with it. What is shown is how it ended."
     : `The connection to the dashboard is lost: what is shown is ${seconds} s old. It is tried again.`);

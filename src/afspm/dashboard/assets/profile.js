@@ -2,7 +2,7 @@
 
 import { drawAxis, fitted } from "./axes.js";
 
-export function drawProfile(canvas, { distances_m: distances, values, unit }) {
+export function drawProfile(canvas, { distances_m: distances, values, unit }, label) {
   const area = fitted(canvas);
   const known = values.filter((value) => value !== null);
   if (!area || known.length < 2) return;
@@ -14,7 +14,7 @@ export function drawProfile(canvas, { distances_m: distances, values, unit }) {
   high += around;
   const end = distances.at(-1) || 1;
   drawAxis(context, box, 0, end, "m", "x", "along the line");
-  drawAxis(context, box, low, high, unit, "y", "levelled value");
+  drawAxis(context, box, low, high, unit, "y", label);
   context.strokeRect(box.x, box.y, box.width, box.height);
   context.beginPath();
   let pen = false;
