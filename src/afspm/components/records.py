@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from afspm.errors import FileError
+from afspm.record.whole import ToldOnce
+
+_log = logging.getLogger("afspm.records")
 
 
 class LineFile:
@@ -20,6 +26,8 @@ class LineFile:
         self.path = path
         self._header = header
         self._is_open = False
+        self._waiting = ""
+        self._told = ToldOnce("lines wait to be written", _log, only_full=True)
 
     def lines(self) -> list[str]:
         """What is there, the header not counted; without a last line that is not whole.
@@ -39,19 +47,26 @@ class LineFile:
     def append(self, lines: Iterable[str]) -> None:
         """Write lines at the end, the header first if the file is new.
 
+        Where the disk is full it is said, and they wait until more come and there is room.
+
         Raises:
-            FileError: the disk is full …
+            FileError: the folder is gone …
         """
-        text = "".join(f"{line}\n" for line in lines)
+        self._waiting += "".join(f"{line}\n" for line in lines)
+        with self._told.trying():
+            self._write()
+
+    def _write(self) -> None:
         try:
             if not self._is_open:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                text = self._mended() + text
+                header = self._mended()
+                _append(self.path, header)
                 self._is_open = True
-            with self.path.open("ab") as file:
-                file.write(text.encode())
+            _append(self.path, self._waiting)
         except OSError as error:
             raise FileError(f"can't be written: {error}", where=str(self.path)) from error
+        self._waiting = ""
 
     def _mended(self) -> str:
         """Cut off half a line at the end; returns the header that has to come before what is written."""
@@ -63,3 +78,15 @@ class LineFile:
             with self.path.open("r+b") as file:
                 file.truncate(whole)
         return f"{self._header}\n" if self._header and whole == 0 else ""
+
+
+def _append(path: Path, text: str) -> None:
+    """All of it or nothing. Raises OSError."""
+    size = path.stat().st_size if path.exists() else 0
+    try:
+        with path.open("ab") as file:
+            file.write(text.encode())
+    except OSError:
+        with suppress(OSError):
+            os.truncate(path, size)
+        raise

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import logging
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -39,6 +41,42 @@ def write_whole(path: Path, parts: Iterable[bytes], *, synced: bool = True) -> N
         with contextlib.suppress(OSError):
             new.unlink()
         raise FileError(f"can't be written: {error}", where=str(path)) from error
+
+
+class ToldOnce:
+    """A disk that is full must not end an experiment: what can't be written is told once, until it can be again.
+
+    Args:
+        loss: what it means, for people.
+        only_full: whatever else is wrong, such as a folder that is gone, is raised.
+    """
+
+    def __init__(self, loss: str, log: logging.Logger, *, only_full: bool = False) -> None:
+        self._loss = loss
+        self._log = log
+        self._only_full = only_full
+        self._is_failing = False
+
+    @contextlib.contextmanager
+    def trying(self) -> Iterator[None]:
+        """Around what writes, and raises FileError."""
+        try:
+            yield
+        except FileError as error:
+            if self._only_full and not is_full(error):
+                raise
+            if not self._is_failing:
+                self._log.critical("%s: %s", self._loss, error)
+            self._is_failing = True
+        else:
+            if self._is_failing:
+                self._log.info("there is room again, no longer so: %s", self._loss)
+            self._is_failing = False
+
+
+def is_full(error: FileError) -> bool:
+    """Whether nothing could be written since there was no room for it."""
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def former(path: Path) -> Path:

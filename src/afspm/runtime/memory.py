@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Any
 
 from afspm.errors import InvalidValue
-from afspm.record.whole import Generations, load, write_whole
+from afspm.record.whole import Generations, ToldOnce, load, write_whole
+
+_log = logging.getLogger("afspm.memory")
 
 
 class Memory(MutableMapping[str, Any]):
@@ -29,6 +32,7 @@ class Memory(MutableMapping[str, Any]):
     def __init__(self, path: Path | None, *, synced: bool = True) -> None:
         self._path = path
         self._generations = Generations(path) if path and not synced else None
+        self._told = ToldOnce("a restart would not know what was done until now", _log, only_full=True)
         self.damage = ""
         self._values: dict[str, Any] = {}
         if path is not None:
@@ -38,9 +42,11 @@ class Memory(MutableMapping[str, Any]):
     def save(self) -> None:
         """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
 
+        A disk that is full must not end the experiment: it is said, and the experiment goes on.
+
         Raises:
             InvalidValue: a value is not of JSON's types.
-            FileError: the disk is full, the folder is gone …
+            FileError: the folder is gone …
         """
         try:
             text = json.dumps(self._values, ensure_ascii=False)
@@ -48,10 +54,11 @@ class Memory(MutableMapping[str, Any]):
             raise InvalidValue(
                 f"a value can't be kept: {error}", where="memory", hint="keep numbers, texts, lists and dicts"
             ) from error
-        if self._generations is not None:
-            self._generations.save(text.encode())
-        elif self._path is not None:
-            write_whole(self._path, [text.encode()])
+        with self._told.trying():
+            if self._generations is not None:
+                self._generations.save(text.encode())
+            elif self._path is not None:
+                write_whole(self._path, [text.encode()])
 
     def __getitem__(self, key: str) -> Any:
         return self._values[key]

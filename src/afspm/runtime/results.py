@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 import struct
 import zlib
@@ -12,9 +13,10 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
-from afspm.record.whole import write_whole
+from afspm.record.whole import ToldOnce, write_whole
 from afspm.runtime.memory import Memory
 
+_log = logging.getLogger("afspm.memory")
 _MAGIC = b"afspm-result-1\n"
 _LENGTH = struct.Struct("<Q")
 LONGEST_KEY = 100
@@ -43,6 +45,7 @@ class Results:
 
     def __init__(self, folder: Path | None, name: str) -> None:
         self._folder = folder / f"{name}.results" if folder else None
+        self._told = ToldOnce("what is measured can't be kept", _log, only_full=True)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
     @property
@@ -74,10 +77,10 @@ class Results:
         return Result(things, head["interruptions"])
 
     def fulfil(self, key: str, plan: dict[str, Any], result: Result) -> None:
-        """Keep the result; the intent is fulfilled.
+        """Keep the result; the intent is fulfilled. Where the disk is full, another life measures it again.
 
         Raises:
-            FileError: the disk is full …
+            FileError: the folder is gone …
         """
         path = self._path(key)
         if path is not None:
@@ -86,7 +89,8 @@ class Results:
             for thing in result.things:
                 message, payload = wire.encode(thing)
                 parts += [*_framed(message.encode()), *_framed(payload)]
-            write_whole(path, parts)
+            with self._told.trying():
+                write_whole(path, parts)
         self._memory.pop("pending", None)
         self._memory.save()
 

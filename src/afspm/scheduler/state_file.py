@@ -7,8 +7,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from afspm.errors import FileError
-from afspm.record.whole import Generations, load
+from afspm.record.whole import Generations, ToldOnce, load
 
 
 class StateFile:
@@ -22,6 +21,7 @@ class StateFile:
         self.path = path
         self._generations = None if path is None else Generations(path)
         self._log = log
+        self._told = ToldOnce("a restart would not know what is in force now", log)
 
     def load(self) -> dict[str, Any]:
         """What was saved last; empty if nothing was.
@@ -52,10 +52,8 @@ class StateFile:
         """
         if self._generations is None:
             return
-        try:
+        with self._told.trying():
             self._generations.save(json.dumps(state, ensure_ascii=False).encode())
-        except FileError as error:
-            self._log.critical("a restart would not know what is in force now: %s", error)
 
     def close(self) -> None:
         """Make sure that what was saved last is on the disk."""

@@ -96,7 +96,8 @@ class RunLog:
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        with contextlib.suppress(OSError):  # what waits for room on a full disk is lost with us
+            self._file.close()
 
 
 def colour_of(name: str) -> str:

@@ -98,7 +98,10 @@ def go(
         reporter = reporting.reporter(experiment, starts, clock)
         supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy(), reporter)
         outcome = supervisor.run()
-        run_folder.write_run(folder, {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()})
+        try:
+            run_folder.write_run(folder, {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()})
+        except OSError as error:  # a full disk must not keep people from being told of the end
+            log.write(SUPERVISOR, logging.ERROR, f"how it ended is not in run.json: {error}")
         for line in summary.lines(outcome, folder):
             log.write(SUPERVISOR, logging.INFO, line)
         aftermath.follow(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import errno
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,6 +121,42 @@ def test_a_header_that_a_kill_cut_in_two_is_written_again(tmp_path: Path) -> Non
     path.write_text("a,")
     LineFile(path, "a,b").append(["1,2"])
     assert path.read_text() == "a,b\n1,2\n"
+
+
+def test_rows_wait_for_room_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "table.csv"
+    table = LineFile(path, "a,b")
+    table.append(["1,2"])
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "open", _full_after(Path.open, 3))
+        table.append(["3,4"])
+        table.append(["5,6"])
+    assert path.read_text() == "a,b\n1,2\n"
+    table.append(["7,8"])
+    assert path.read_text() == "a,b\n1,2\n3,4\n5,6\n7,8\n"
+
+
+def _full_after(real: Any, room: int) -> Any:
+    """Path.open of a disk that has room for so many more bytes."""
+
+    def opened(path: Path, mode: str) -> Any:
+        file = real(path, mode)
+        written = file.write
+
+        class Full:
+            def __enter__(self) -> Full:
+                return self
+
+            def __exit__(self, *_: object) -> None:
+                file.close()
+
+            def write(self, data: bytes) -> None:
+                written(data[:room])
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+        return Full()
+
+    return opened
 
 
 def test_nothing_measured_leaves_no_file(tmp_path: Path) -> None:

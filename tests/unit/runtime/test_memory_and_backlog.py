@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import logging
+import os
 from collections import deque
 from pathlib import Path
 
@@ -53,6 +56,25 @@ def test_a_folder_that_can_not_be_written_to_is_told(tmp_path: Path) -> None:
     memory._path = tmp_path / "file" / "x.json"
     with pytest.raises(FileError):
         memory.save()
+
+
+def test_a_full_disk_is_told_once_and_all_is_kept_when_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    caplog.set_level(logging.INFO)
+    memory = Memory(tmp_path / "x.json")
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", full)
+        for step in range(3):
+            memory["step"] = step
+            memory.save()
+    assert [record.levelname for record in caplog.records] == ["CRITICAL"]
+    memory.save()
+    assert dict(Memory(tmp_path / "x.json")) == {"step": 2}
+    assert "there is room again" in caplog.text
 
 
 OPERATIONS = st.lists(st.one_of(st.none(), st.tuples(st.binary(max_size=40), st.none() | st.integers(0, 2**62))))

@@ -4,6 +4,8 @@ import io
 import logging
 from pathlib import Path
 
+import pytest
+
 from afspm.clock import ExperimentClock
 from afspm.supervisor.log import COLOURS, LineReader, RunLog, colour_of
 
@@ -49,6 +51,15 @@ def test_the_file_says_the_experiments_time_where_it_is_another(tmp_path: Path) 
     log.write("scheduler", logging.INFO, "begin")
     log.close()
     assert "[2001-09-" in (tmp_path / "log.txt").read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk here that is always full")
+def test_a_full_disk_does_not_end_the_run() -> None:
+    terminal = io.StringIO()
+    log = RunLog(Path("/dev/full"), ExperimentClock.real(), terminal=terminal)
+    log.write("scheduler", logging.INFO, "going on")
+    log.close()
+    assert "going on" in terminal.getvalue()
 
 
 def test_a_terminal_that_is_gone_does_not_end_the_run(tmp_path: Path) -> None:
