@@ -22,6 +22,7 @@ from afspm.emulators.emulator import Emulator
 from afspm.emulators.faults import Fault
 from afspm.model import (
     ControlRequest,
+    ControlResponse,
     Parameter,
     ProbePosition,
     Region,
@@ -66,6 +67,13 @@ class Peer:
 
     def act(self, action: str) -> Response:
         return self.ask(ControlRequest.ACTION, action)
+
+    def act_once_free(self, action: str) -> Response:
+        """The first answer that is not that it is busy: for what may be over before anybody sees it."""
+        deadline_s = time.monotonic() + DEADLINE_S
+        while (response := self.act(action)).code == ControlResponse.NOT_FREE:
+            assert time.monotonic() < deadline_s, response.reason
+        return response
 
     def set(self, name: str, value: object, unit: str | None = None) -> Response:
         text = str(value).lower() if isinstance(value, bool) else str(value)

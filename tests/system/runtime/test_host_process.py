@@ -31,7 +31,7 @@ def test_a_component_ends_cleanly_when_its_parent_lets_go(host: Host) -> None:
     child.let_go()
     child.expect("end")
     assert child.exit_code() == ExitCode.ORPHAN
-    assert CLOCK.monotonic_s() - began_s < 1.0
+    assert CLOCK.monotonic_s() - began_s < 2.0
     assert child.error_text == ""
 
 

@@ -31,7 +31,7 @@ UNDEFINED = ScopeState.UNDEFINED
 )
 def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, kind: str, told: str) -> None:
     made = bench()
-    peer = small(made, reply_timeout_s=0.3)
+    peer = small(made, reply_timeout_s=1.0)
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
@@ -42,8 +42,8 @@ def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, k
 
 def test_a_dialog_on_its_screen_silences_it_until_it_is_answered(bench: Make) -> None:
     made = bench(speed=1.0)
-    peer = small(made, reply_timeout_s=0.3)
-    made.strike("dialog", duration_s=1.5)
+    peer = small(made, reply_timeout_s=1.0)
+    made.strike("dialog", duration_s=4.0)
     peer.until(UNDEFINED)
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
@@ -132,7 +132,8 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
     assert peer.act(names.START_SCAN).ok
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith("nanonis-0001.npz")
-    made.until_said("unnamed001.sxm): it was fetched from Nanonis")
+    # by the name that Nanonis had said, or by the folder if it had not said any in time
+    made.until_said("unnamed001.sxm): it was fetched from Nanonis", "session): it was fetched from Nanonis")
 
 
 def test_the_name_of_an_older_file_is_not_believed(bench: Make) -> None:
@@ -161,13 +162,11 @@ def test_a_spectrum_that_is_not_saved_is_fetched(bench: Make) -> None:
 
 def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
     made = bench(speed=20.0)
-    peer = small(made)
+    peer = small(made, result_timeout_s=1e6)  # whoever waits for a file waits longer than this test does
     made.strike("autosave-off", duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
-    ends_s = made.clock.now_s()
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith(".npz")
-    assert made.clock.now_s() - ends_s < 8.0 + 5.0, "the scan itself lasts 8 s, and no file is waited for"
 
 
 # --- the tip, and people ---
@@ -191,13 +190,12 @@ def test_after_the_safe_tip_nothing_is_measured_until_the_tip_is_brought_back(be
     for action in (names.START_SCAN, names.START_SPEC, names.CRASH):
         response = peer.act(action)
         assert response.code in (ControlResponse.ACTION_ERROR, ControlResponse.NOT_FREE), action
-    peer.until(FREE)
-    response = peer.act(names.START_SCAN)
+    response = peer.act_once_free(names.START_SCAN)
     assert "safe tip" in response.reason
     made.until_said("Nanonis' safe tip has withdrawn the tip")
     assert peer.act(names.ENGAGE).ok
-    peer.until(FREE)
-    assert peer.act(names.START_SCAN).ok
+    assert peer.act_once_free(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
     assert scans(peer.until(FREE))
 
 

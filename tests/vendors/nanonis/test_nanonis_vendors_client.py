@@ -22,11 +22,16 @@ from afspm.clock import ExperimentClock
 from afspm.emulators.nanonis import NanonisEmulator, wire
 from afspm.files import read
 
+SEEN = pytest.mark.parametrize("client", [2.0], indirect=True)
+"""A speed at which what takes a second is seen while it lasts, on a busy computer too."""
+
 
 @pytest.fixture
-def client(tmp_path: Path) -> Iterator[Any]:
+def client(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
+    """Of an emulator at speed 100, or as marked."""
+    speed = getattr(request, "param", 100.0)
     emulator = NanonisEmulator(port=0, surface="lattice")
-    with emulator.running(tmp_path, ExperimentClock.starting_now(speed=100.0)) as address:
+    with emulator.running(tmp_path, ExperimentClock.starting_now(speed=speed)) as address:
         host, port = address.split(":")
         with socket.create_connection((host, int(port)), timeout=20.0) as connection:
             client = Client(connection)
@@ -136,6 +141,7 @@ def test_it_takes_a_spectrum_with_a_row_for_each_channel(client: Any, module: st
     np.testing.assert_allclose(values.T, spectrum.values, rtol=1e-4, atol=1e-18)
 
 
+@SEEN
 @pytest.mark.parametrize("module", ["BiasSpectr", "ZSpectr"])
 def test_it_stops_a_spectrum_and_there_is_no_file_of_it(client: Any, module: str) -> None:
     ask(client, f"{module}_Open")
@@ -233,6 +239,7 @@ def test_it_reads_lists_of_names_and_values(client: Any) -> None:
     assert ask(client, "Util_SessionPathGet")[1] == str(client.folder)
 
 
+@SEEN
 def test_it_withdraws_pulses_shapes_and_walks(client: Any) -> None:
     ask(client, "Bias_Pulse", 1, 0.1, 4.0, 1, 2)
     ask(client, "TipShaper_Start", 1, -1)
