@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,22 @@ _COLUMNS = "time_ns, envelope, message, payload, scan, spectrum, channel, first_
 
 
 def packets(
-    journal: sqlite3.Connection, folder: Path, since_ns: int, messages: Sequence[str] | None
+    journal: sqlite3.Connection,
+    folder: Path,
+    since_ns: int,
+    messages: Sequence[str] | None,
+    tell: Callable[[str], None] | None,
 ) -> Iterator[Packet]:
     """Packets of the scheduler as they were published, oldest first."""
     values = _Values(journal, folder)
     for time_ns, envelope, message, payload, *place in _rows(journal, since_ns, messages):
-        found = values.of(*place)
+        try:
+            found = values.of(*place)
+        except FileError as error:
+            if tell is None:
+                raise
+            tell(str(error))
+            continue
         yield Packet(envelope, payload if found is None else with_values(message, payload, found), time_ns)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -171,13 +171,23 @@ class Run:
 
     # --- everything ---
 
-    def packets(self, *, since_ns: int = -1, messages: Sequence[str] | None = None) -> Iterator[Packet]:
+    def packets(
+        self,
+        *,
+        since_ns: int = -1,
+        messages: Sequence[str] | None = None,
+        tell: Callable[[str], None] | None = None,
+    ) -> Iterator[Packet]:
         """What the scheduler published and is newer than `since_ns`, oldest first, whole, as it was published.
 
         Args:
             messages: names of those wanted, e.g. "ControlState"; None: all.
+            tell: is told what is left out since its file is missing or damaged; None: that is an error.
+
+        Raises:
+            FileError: a file is missing or damaged.
         """
-        yield from packets(self._journal, self.folder, since_ns, messages)
+        yield from packets(self._journal, self.folder, since_ns, messages, tell)
 
     def overview(self, messages: Sequence[str] | None = None) -> Overview:
         """What it came to, as the dashboard shows it. Files of scans are not read for it."""

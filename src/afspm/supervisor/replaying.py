@@ -62,7 +62,14 @@ def replay(where: Path, options: Options, tell: Callable[[str], None]) -> int:
         guest = _guest(run)
         register_all(guest.messages)
         _check(options.only)
-        packets = run.packets(messages=tuple(options.only) or None)
+        left_out: set[str] = set()
+
+        def leave_out(why: str) -> None:
+            if why not in left_out:  # once, not with each channel
+                tell(f"left out: {why}")
+            left_out.add(why)
+
+        packets = run.packets(messages=tuple(options.only) or None, tell=leave_out)
         first = next(packets, None)
         if first is None:
             raise ConfigError("there is nothing to replay", where=str(run.folder))

@@ -170,6 +170,31 @@ def test_an_unknown_format_and_an_impossible_folder_are_refused(run: Run, tmp_pa
         list(export(run, "gwy", tmp_path / "file"))
 
 
+@pytest.mark.parametrize("to", ["gwy", "nc", "png"])
+def test_a_damaged_file_costs_what_is_in_it_alone(run: Run, tmp_path: Path, to: str) -> None:
+    if to == "png":
+        pytest.importorskip("matplotlib")
+    whole = len(list(export(run, to, tmp_path / "whole")))
+    with (tmp_path / run.scans[1].file).open("r+b") as file:
+        file.truncate(1000)
+    told: list[str] = []
+    assert 0 < len(list(export(run, to, tmp_path / "out", tell=told.append))) < whole
+    (said,) = told
+    assert run.scans[1].file in said
+    with pytest.raises(FileError, match="damaged"):
+        list(export(run, to, tmp_path / "out"))
+
+
+def test_packets_of_a_damaged_file_are_left_out_if_wanted(run: Run, tmp_path: Path) -> None:
+    (tmp_path / run.scans[1].file).unlink()
+    told: list[str] = []
+    packets = list(run.packets(tell=told.append))
+    assert [row.file for row in run.scans if any(row.file in said for said in told)] == [run.scans[1].file]
+    assert len({packet.envelope for packet in packets if packet.envelope.startswith("Scan2d")}) == 2
+    with pytest.raises(FileError):
+        list(run.packets())
+
+
 def test_what_was_not_seen_is_told_and_left_out(night: Night, store: Store, tmp_path: Path) -> None:
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])
     told: list[str] = []

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
 FORMATS = {"gwy": "gwyddion", "nc": "netcdf", "png": "png", "csv": "tables"}
-"""By suffix, the module of this package; each has `write(run, scans, spectra, folder)`, which yields files."""
+"""By suffix, the module of this package; each has `write(run, row, folder)`, which yields the files of one row."""
 
-Writer = Callable[[Run, list[ScanRow], list[SpectrumRow], Path], Iterator[Path]]
+Writer = Callable[[Run, ScanRow | SpectrumRow, Path], Iterator[Path]]
 
 
 def export(
@@ -26,11 +27,11 @@ def export(
         to: one of `FORMATS`.
         folder: made if it is not there.
         scans: numbers of scans, as for `chosen`; None: all scans and spectra.
-        tell: is told what is left out, and why.
+        tell: is told what is left out, and why; None: a file of the record that is damaged is an error.
 
     Raises:
         InvalidValue: there is no such format, or no such scan.
-        FileError: a file can't be written, or what it needs is not installed.
+        FileError: a file can't be read or written, or what it needs is not installed.
     """
     if to not in FORMATS:
         raise InvalidValue(f"there is no format {to!r}", hint=f"one of {', '.join(FORMATS)}")
@@ -39,12 +40,32 @@ def export(
         if not row.file and tell is not None:
             tell(f"scan {row.number} was interrupted before anything of it was seen")
     spectra = list(run.spectra) if scans is None else []
+    wanted = [row for row in wanted if row.file]
+    if to == "png" and importlib.util.find_spec("matplotlib") is None:
+        raise FileError("pictures need matplotlib", hint='pip install "afspm[plot]"')
     write: Writer = import_module(f"afspm.record.export.{FORMATS[to]}").write
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        yield from write(run, [row for row in wanted if row.file], spectra, folder)
+        if to == "csv":
+            from afspm.record.export.tables import write_tables
+
+            yield from write_tables(run, wanted, spectra, folder)
+        yield from _one_by_one(write, run, [*wanted, *spectra], folder, tell)
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(folder)) from error
+
+
+def _one_by_one(
+    write: Writer, run: Run, rows: Sequence[ScanRow | SpectrumRow], folder: Path, tell: Callable[[str], None] | None
+) -> Iterator[Path]:
+    """A file that is damaged costs what is in it, and not all the others."""
+    for row in rows:
+        try:
+            yield from write(run, row, folder)
+        except FileError as error:
+            if tell is None:
+                raise
+            tell(str(error))
 
 
 def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:

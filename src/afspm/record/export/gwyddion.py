@@ -29,13 +29,13 @@ Item = tuple[str, str, Any]
 """The name, the type (Gwyddion's letter) and the value of a component."""
 
 
-def write(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
+def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
     """A file for each scan and each spectrum."""
-    for row in scans:
-        yield _written(folder / f"{stem(row.file)}.gwy", scan_file(list(run.scan(row).values()), _said(run.about(row))))
-    for spectrum in spectra:
-        target = folder / f"{stem(spectrum.file)}.gwy"
-        yield _written(target, spectrum_file(run.spectrum(spectrum), _said(run.about(spectrum))))
+    said, target = _said(run.about(row)), folder / f"{stem(row.file)}.gwy"
+    if isinstance(row, ScanRow):
+        yield _written(target, scan_file(list(run.scan(row).values()), said))
+    else:
+        yield _written(target, spectrum_file(run.spectrum(row), said))
 
 
 def _written(path: Path, data: bytes) -> Path:

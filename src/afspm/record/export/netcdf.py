@@ -21,12 +21,13 @@ _RENAMED = {"mode": "control_mode", "filename": "controller_file"}
 """scipy's reader, which xarray uses, has attributes of its own by these names."""
 
 
-def write(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
+def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
     """A file for each scan and each spectrum."""
-    for row in scans:
-        yield _written(folder / f"{stem(row.file)}.nc", scan_file(run.scan(row), run.about(row)))
-    for one in spectra:
-        yield _written(folder / f"{stem(one.file)}.nc", spectrum_file(run.spectrum(one), run.about(one)))
+    about, target = run.about(row), folder / f"{stem(row.file)}.nc"
+    if isinstance(row, ScanRow):
+        yield _written(target, scan_file(run.scan(row), about))
+    else:
+        yield _written(target, spectrum_file(run.spectrum(row), about))
 
 
 def _written(path: Path, data: bytes) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from afspm.errors import FileError
 from afspm.model import Scan, Spectrum
 from afspm.record.export.exporting import plain, stem
 from afspm.record.nexus import iso
@@ -24,18 +22,16 @@ _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k"}
 _DPI = 150
 
 
-def write(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
-    """A picture for each channel and each spectrum. Raises FileError: matplotlib is not installed."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise FileError("pictures need matplotlib", hint='pip install "afspm[plot]"')
-    for row in scans:
+def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
+    """A picture for each channel of a scan, or for a spectrum. Needs matplotlib."""
+    time = f"{iso(row.time_ns)[:19].replace('T', ' ')} UTC"
+    if isinstance(row, ScanRow):
         for channel, scan in run.scan(row).items():
-            title = _title(run, f"{channel}, {iso(row.time_ns)[:19].replace('T', ' ')} UTC", row.interrupted)
+            title = _title(run, f"{channel}, {time}", row.interrupted)
             yield _saved(scan_figure(scan, title), folder / f"{stem(row.file)}_{plain(channel)}.png")
-    for one in spectra:
-        spectrum = run.spectrum(one)
-        title = _title(run, f"{one.kind}, {iso(one.time_ns)[:19].replace('T', ' ')} UTC", interrupted=False)
-        yield _saved(spectrum_figure(spectrum, title), folder / f"{stem(one.file)}.png")
+    else:
+        title = _title(run, f"{row.kind}, {time}", interrupted=False)
+        yield _saved(spectrum_figure(run.spectrum(row), title), folder / f"{stem(row.file)}.png")
 
 
 def scan_figure(scan: Scan, title: str) -> Figure:

@@ -15,8 +15,16 @@ from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow, Table
 
 
-def write(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
-    """A table of each kind, and a file for each spectrum."""
+def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
+    """A file for each spectrum."""
+    if isinstance(row, SpectrumRow):
+        spectrum = run.spectrum(row)
+        header = [f"{name} [{unit}]" for name, unit in zip(spectrum.names, spectrum.units, strict=True)]
+        yield _written(folder / f"{stem(row.file)}.csv", header, spectrum.values.tolist())
+
+
+def write_tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Path) -> Iterator[Path]:
+    """A table of each kind."""
     tables: dict[str, Table[Any]] = {
         "scans": Table(scans, ScanRow),
         "spectra": Table(spectra, SpectrumRow),
@@ -32,10 +40,6 @@ def write(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow], folder: Pa
         columns = table.columns()
         rows = zip(*(_told(column, values) for column, values in columns.items()), strict=True)
         yield _written(folder / f"{name}.csv", [_named(column) for column in columns], rows)
-    for row in spectra:
-        spectrum = run.spectrum(row)
-        header = [f"{name} [{unit}]" for name, unit in zip(spectrum.names, spectrum.units, strict=True)]
-        yield _written(folder / f"{stem(row.file)}.csv", header, spectrum.values.tolist())
 
 
 def _named(column: str) -> str:
