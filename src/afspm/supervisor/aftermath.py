@@ -59,7 +59,7 @@ def report(folder: Path, log: RunLog) -> None:
     """Write the report of a run, in a process of its own, which can neither harm the run nor hold it up for long."""
     if not (folder / JOURNAL_FILE).is_file():
         return  # nothing was recorded
-    command = [sys.executable, "-m", "afspm.record.report", str(folder)]
+    command = [sys.executable, "-P", "-m", "afspm.record.report", str(folder)]
     environment = {**os.environ, "MPLBACKEND": "agg"}
     try:
         done = subprocess.run(

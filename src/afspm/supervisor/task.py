@@ -47,7 +47,9 @@ class Task:
 
 def from_start(start: Start) -> Task:
     """A task of what the experiment file says: Python classes by our host, other languages by our guard."""
-    ours = (sys.executable, "-m", HOST) if not start.command else (sys.executable, "-m", GUARD, "--", *start.command)
+    # -P: modules are those beside the experiment file, and never what happens to lie where the run was started
+    python = (sys.executable, "-P", "-m")
+    ours = (*python, GUARD, "--", *start.command) if start.command else (*python, HOST)
     before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
     return Task(
         launch=start.launch,

@@ -10,10 +10,12 @@ from experiment_lab import AFSPM, EXPERIMENT, WITNESS, AfspmRun, Run
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Run]:
-    """Starts `afspm run` of EXPERIMENT, `more` and a second file laid over it; it is killed after the test."""
+    """Starts `afspm run` of EXPERIMENT, `more` and a second file laid over it, `where` that is; it is killed after the test."""
     runs: list[AfspmRun] = []
 
-    def start(*options: str, more: str = "", over: str = "", scans: int = 4, speed: float = 120.0) -> AfspmRun:
+    def start(
+        *options: str, more: str = "", over: str = "", scans: int = 4, speed: float = 120.0, where: Path = tmp_path
+    ) -> AfspmRun:
         (tmp_path / "witness.py").write_text(WITNESS, encoding="utf-8")
         file = tmp_path / "experiment.toml"
         file.write_text(EXPERIMENT.format(scans=scans, speed=speed) + more, encoding="utf-8")
@@ -23,7 +25,7 @@ def run(tmp_path: Path) -> Iterator[Run]:
         command = (*AFSPM, "run", *files, "--runs", folder, "--verbose", "--no-report", *options)
         # in a group of its own, so that a Ctrl-C for it is not one for the tests
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=tmp_path
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=where
         )
         runs.append(AfspmRun(process))
         return runs[-1]

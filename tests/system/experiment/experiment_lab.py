@@ -19,7 +19,7 @@ from typing import Any
 import afspm
 
 DEADLINE_S = 60.0
-AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
+AFSPM = (sys.executable, "-P", "-c", "from afspm.cli import main; main()")
 Run = Callable[..., "AfspmRun"]
 
 EXPERIMENT = """

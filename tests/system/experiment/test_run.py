@@ -86,6 +86,16 @@ def test_the_second_file_wins(run: Run) -> None:
     require_each_once(one, 1)
 
 
+def test_modules_beside_the_file_are_meant_not_those_where_it_was_started(run: Run, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for name in ("witness", "queue"):  # one of the experiment's, one that Python itself needs
+        (elsewhere / f"{name}.py").write_text("raise RuntimeError('the wrong one')\n", encoding="utf-8")
+    one = run(scans=1, where=elsewhere)
+    assert one.end() == 0, one.output
+    require_each_once(one, 1)
+
+
 @posix_only
 def test_ctrl_c_ends_all_cleanly_within_about_two_seconds(run: Run) -> None:
     one = run(scans=1000)

@@ -46,7 +46,7 @@ class Registrar:
         """Begin, or kill what is there and begin anew."""
         self._end(kill=True)
         self._life += 1
-        command = (sys.executable, "-m", "afspm.scheduler.drift.worker")
+        command = (sys.executable, "-P", "-m", "afspm.scheduler.drift.worker")
         try:
             # it complains where we do; small matrices are not worth more threads than one
             environment = {**dict.fromkeys(_THREADS, "1"), **os.environ}
