@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -47,11 +48,12 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
     """
     from afspm.runtime.following import LINES, SMALL, Follower
 
-    with Follower(_running(where), TERMINAL, (*SMALL, LINES) if lines else SMALL) as follower:
-        with _only_if_running():
+    folder = _running(where)
+    with Follower(folder, TERMINAL, (*SMALL, LINES) if lines else SMALL) as follower:
+        with _only_if_running(folder):
             follower.catch_up()
         if follower.ended:
-            say_nothing_runs(f"{follower.folder.name} has just ended")
+            say_nothing_runs(f"{folder.resolve().name} has just ended")
         yield follower
 
 
@@ -61,7 +63,7 @@ def acting(where: Path) -> Iterator[Scope]:
     from afspm.runtime.connect import connect
 
     folder = _running(where)
-    with _only_if_running():
+    with _only_if_running(folder):
         scope = connect(folder, person())
     with scope:
         yield scope
@@ -111,15 +113,18 @@ def _running(where: Path) -> Path:
         raise  # not reached
     ended = facts_of(folder).get(ENDED)
     if ended:
-        say_nothing_runs(f"{folder.name} has ended ({ended})")
+        say_nothing_runs(f"{folder.resolve().name} has ended ({ended})")
     return folder
 
 
 @contextmanager
-def _only_if_running() -> Iterator[None]:
+def _only_if_running(folder: Path) -> Iterator[None]:
     from afspm.errors import ExperimentEnded, NoResponse
 
     try:
         yield
-    except (ExperimentEnded, NoResponse) as error:
+    except ExperimentEnded as error:
         say_nothing_runs(str(error))
+    except NoResponse:
+        resume = f"`afspm run --resume {shlex.quote(str(folder))}`"
+        say_nothing_runs(f"nobody answers in {folder.resolve().name}; if it was cut off, {resume} goes on with it")

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from afspm.runtime.following import Follower
 
 REFRESH_S = 0.25
+UNBROKEN = 10_000  # columns: what programs and files get has a line for a line
 RUNS = Path("runs")
 
 
@@ -108,4 +109,7 @@ def _in_lines(follower: Follower) -> None:
 def _console() -> Console:
     from rich.console import Console
 
-    return Console(highlight=False, markup=False)
+    console = Console(highlight=False, markup=False)
+    if not console.is_terminal:
+        console.width = UNBROKEN
+    return console

@@ -179,7 +179,11 @@ def _progress(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
         if told.of <= 0:
             continue
         line = _label("progress").append(f"{told.name}: {told.done} of {told.of}  {_bar(told.done / told.of, about)} ")
-        yield line.append("done" if told.done >= told.of else _left(told.remaining_ns(now_ns), about))
+        left_ns = told.remaining_ns(now_ns)
+        if told.done >= told.of:
+            yield line.append("done")
+        else:
+            yield line.append("longer than expected" if left_ns == 0 else _left(left_ns, about))
 
 
 def _processes(seen: Overview, now_ns: int) -> Iterator[Text]:
@@ -194,8 +198,15 @@ def _processes(seen: Overview, now_ns: int) -> Iterator[Text]:
         is_bad = state.condition in (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
         condition = state.condition.name.lower().replace("_", " ")
         line = _label("process").append(f"{state.name} ").append(condition, "bold red" if is_bad else "yellow")
-        line.append(_since(state.since_ns, now_ns))
+        line.append(_lately(state, now_ns))
         yield line.append(f" ({state.last_exit})" if state.last_exit else "")
+
+
+def _lately(state: ProcessState, now_ns: int) -> str:
+    """Since when it is so; of what is over, when that was."""
+    if state.condition is ProcessCondition.ENDED and state.since_ns is not None:
+        return f" {lasting(now_ns - state.since_ns)} ago"
+    return _since(state.since_ns, now_ns)
 
 
 def _well(state: ProcessState) -> str:

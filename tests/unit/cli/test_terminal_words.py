@@ -38,6 +38,7 @@ def night() -> Overview:
         (121, "ProcessStates", model.ProcessStates(START, "lab", (
             process("series", ProcessCondition.BUSY, step_age_s=12.0),
             process("judge", ProcessCondition.GIVEN_UP, last_exit="exit code 1"),
+            process("grid", ProcessCondition.ENDED, last_exit="done"),
         ))),
         (122, "JournalEntries", model.JournalEntries((
             model.JournalEntry(START + 122 * S, "request", "judge", "scan-speed = 1 m/s", 9, "at most 1e-5 m/s"),
@@ -71,12 +72,19 @@ def shown(overview: Overview, about: About = ABOUT, width: int = 140, silent_s: 
         "7 min 20 s left",
         "series (busy for 12 s)",
         "judge given up for 2 min 40 s (exit code 1)",
+        "grid ended 2 min 40 s ago (done)",
         "judge: scan-speed = 1 m/s: at most 1e-5 m/s",
         "lost the tip [/x]",
     ],
 )
 def test_what_is_so_is_said(night: Overview, said: str) -> None:
     assert said in shown(night)
+
+
+def test_what_takes_longer_than_it_said_does_not_promise_its_end(night: Overview) -> None:
+    night.take("Progress", model.Progress(START + 121 * S, "series", 1, 5, 10.0), START + 121 * S)
+    assert "20 % longer than expected" in shown(night)
+    assert "0 s left" not in shown(night).replace("50 s left", "")
 
 
 def test_nothing_is_cut_off_in_a_narrow_terminal(night: Overview) -> None:
@@ -120,7 +128,7 @@ def test_json_says_the_same(night: Overview) -> None:
     assert [(one["name"], one["by"]) for one in told["problems"]] == [("tip-shape-changed", "judge")]
     assert told["scan"] == {"part": 0.5, "remaining_s": 50.0}
     assert told["progress"]["series"] == {"done": 1, "of": 5, "remaining_s": 440.0}
-    assert [one["condition"] for one in told["processes"]] == ["BUSY", "GIVEN_UP"]
+    assert [one["condition"] for one in told["processes"]] == ["BUSY", "GIVEN_UP", "ENDED"]
     assert told["refusals"][0]["reason"] == "at most 1e-5 m/s"
     assert told["log"][0]["text"] == "lost the tip [/x]"
 

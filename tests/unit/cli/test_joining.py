@@ -1,0 +1,56 @@
+"""What the commands of the terminal say where nothing runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import pytest
+import typer
+
+from afspm.cli.joining import NOT_RUNNING, acting, looking
+from afspm.cli.status import _console
+from afspm.errors import NoResponse
+
+
+@pytest.mark.parametrize("command", [looking, acting])
+def test_a_run_that_was_cut_off_says_how_it_goes_on(
+    command: Callable[[Path], AbstractContextManager[object]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def nobody(*_: object) -> None:
+        raise NoResponse("nobody is there")
+
+    (tmp_path / "night-1").mkdir()
+    (tmp_path / "night-1" / "run.json").write_text('{"name": "night"}', encoding="utf-8")
+    monkeypatch.setattr("afspm.runtime.connect.connect", nobody)
+    monkeypatch.setattr("afspm.runtime.following.Follower.__init__", lambda *_: None)
+    monkeypatch.setattr("afspm.runtime.following.Follower.close", lambda *_: None)
+    monkeypatch.setattr("afspm.runtime.following.Follower.catch_up", nobody)
+    with pytest.raises(typer.Exit), command(tmp_path / "night-1"):
+        pass
+    said = capsys.readouterr().err
+    assert "nobody answers in night-1" in said
+    assert f"`afspm run --resume {tmp_path / 'night-1'}` goes on with it" in said
+
+
+def test_a_run_that_has_ended_is_named_from_its_folder_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "night-1"
+    folder.mkdir()
+    (folder / "run.json").write_text('{"ended": "the experiment has ended"}', encoding="utf-8")
+    monkeypatch.chdir(folder)
+    with pytest.raises(typer.Exit) as exit, looking(Path()):
+        pass
+    assert exit.value.exit_code == NOT_RUNNING
+    assert "night-1 has ended (the experiment has ended)" in capsys.readouterr().err
+
+
+def test_what_is_no_terminal_gets_a_line_for_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    text = 100 * "word "
+    _console().print(text)
+    assert capsys.readouterr().out == text + "\n"
