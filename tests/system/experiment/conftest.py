@@ -10,7 +10,7 @@ from experiment_lab import AFSPM, EXPERIMENT, WITNESS, AfspmRun, Run
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Run]:
-    """Starts `afspm run` of EXPERIMENT, `more` and a second file laid over it, `where` that is; it is killed after the test."""
+    """Starts `afspm run` of EXPERIMENT, `more` and a second file laid over it, in `where`; killed after the test."""
     runs: list[AfspmRun] = []
 
     def start(
