@@ -29,6 +29,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "experiments").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#]+)")
 FILE_NAME = re.compile(r"(?:#|//) ([\w./-]+\.(?:py|toml|proto))\n")
 
 
@@ -88,5 +89,21 @@ def test_the_pages_are_found() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_link_within_the_project_leads_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\((?!https?:|#|mailto:)([^)#]+)", page.read_text(encoding="utf-8")):
+    for target in LINK.findall(page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}, which is not there"
+
+
+@pytest.mark.parametrize(
+    ("listing", "pages"),
+    [
+        ("docs/README.md", "docs/*/*.md"),
+        ("docs/explanation/decisions/README.md", "docs/explanation/decisions/*.md"),
+        ("experiments/README.md", "experiments/*/README.md"),
+    ],
+)
+def test_every_page_is_listed(listing: str, pages: str) -> None:
+    page = ROOT / listing
+    linked = {(page.parent / target).resolve() for target in LINK.findall(page.read_text(encoding="utf-8"))}
+    found = {file for file in ROOT.glob(pages) if file != page}
+    assert found
+    assert found <= linked
