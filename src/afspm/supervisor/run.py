@@ -90,7 +90,7 @@ def go(
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:
         starts = _starts(experiment, options, clock, FreePorts(), folder)
-        facts = {**run_facts(name, starts, clock), **_to_resume(experiment, options)}
+        facts = {**run_facts(name, starts, clock), **to_resume(experiment, starts, options)}
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
             ahead.expect_record(folder / run_folder.STATE_DIR)
@@ -117,10 +117,18 @@ def go(
     return Run(folder, outcome)
 
 
-def _to_resume(experiment: Experiment, options: Options) -> dict[str, object]:
-    """What else run.json says, so that the run can be resumed with that file alone."""
-    only = [*options.only, *(experiment.recorders if options.only else ())]
-    return {HOMES: list(map(str, experiment.folders)), ONLY: only, WITHOUT: list(options.without)}
+def to_resume(experiment: Experiment, starts: Sequence[Start], options: Options) -> dict[str, object]:
+    """What else run.json says, so that the run can be resumed with that file alone.
+
+    There the recorder and others that go where the scheduler is are named like all the rest, and so are chosen by name.
+    """
+    here = [start.launch.name for start in starts]
+    elsewhere = [name for name in experiment.component_names if name not in here]
+    return {
+        HOMES: list(map(str, experiment.folders)),
+        ONLY: here if options.only else [],
+        WITHOUT: elsewhere if options.without and not options.only else [],
+    }
 
 
 def dry_run(experiment: Experiment, options: Options = Options()) -> list[Start]:
