@@ -69,7 +69,12 @@ def screen(seen: Overview, about: About, now_ns: int, *, silent_s: float = 0.0, 
         told = f"no news for {silent_s:.0f} s: the scheduler is being started again, or can't be reached"
         lines.append(Text(told, "bold yellow"))
     lines += [_control(seen, now_ns), *_problems(seen, now_ns), _scanning(seen, about, now_ns)]
-    lines += [*_progress(seen, about, now_ns), *_processes(seen, now_ns), *_refusals(seen), *_log(seen, log_lines)]
+    lines += [
+        *_progress(seen, about, now_ns),
+        *_processes(seen, about, now_ns),
+        *_refusals(seen),
+        *_log(seen, log_lines),
+    ]
     for line in lines:
         line.no_wrap, line.overflow = False, "fold"
     return Group(*lines)
@@ -186,13 +191,23 @@ def _progress(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
             yield line.append("longer than expected" if left_ns == 0 else _left(left_ns, about))
 
 
-def _processes(seen: Overview, now_ns: int) -> Iterator[Text]:
+def unheard_of_ns(seen: Overview, name: str, speed: float) -> int | None:
+    """For how long nobody has said how a process is, while others are told of: its computer is gone. None: not so."""
+    silent_ns = seen.newest_ns - seen.processes_told_ns[name]
+    return silent_ns if silent_ns > OLD_S * speed * NS_PER_S else None
+
+
+def _processes(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
     """Those that are well in one line; each of the others in its own."""
     states = seen.processes.values()
-    well = [state for state in states if state.condition in WELL]
+    unheard = {name: ns for name in seen.processes if (ns := unheard_of_ns(seen, name, about.speed)) is not None}
+    well = [state for state in states if state.condition in WELL and state.name not in unheard]
     if well:
         yield _label("processes").append(", ".join(map(_well, well)))
     for state in states:
+        if state.condition in WELL and state.name in unheard:
+            line = _label("process").append(f"{state.name} ").append("not heard of", "bold red")
+            yield line.append(f" for {lasting(unheard[state.name])}: whoever started it is gone, or can't be reached")
         if state.condition in WELL:
             continue
         is_bad = state.condition in (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
@@ -265,7 +280,7 @@ def as_json(seen: Overview, about: About, now_ns: int) -> dict[str, Any]:
             name: _progress_json(told.done, told.of, told.remaining_ns(now_ns))
             for name, told in seen.told_progress.items()
         },
-        "processes": [_process_json(state) for state in seen.processes.values()],
+        "processes": [_process_json(state, seen, about) for state in seen.processes.values()],
         "refusals": [_entry_json(entry) for entry in seen.refusals],
         "log": [_line_json(line) for line in seen.log],
     }
@@ -280,8 +295,9 @@ def _progress_json(done: int, of: int, left_ns: int | None) -> dict[str, Any]:
     return {"done": done, "of": of, "remaining_s": None if left_ns is None else left_ns / NS_PER_S}
 
 
-def _process_json(state: ProcessState) -> dict[str, Any]:
+def _process_json(state: ProcessState, seen: Overview, about: About) -> dict[str, Any]:
     return {
+        "heard_of": unheard_of_ns(seen, state.name, about.speed) is None,
         "name": state.name,
         "role": state.role,
         "condition": state.condition.name,

@@ -128,7 +128,7 @@ class Overview:
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
         status, control, scan_parameters, feedback, probe_position: the newest of each; None before the first.
-        processes, told_progress: by name.
+        processes, told_progress: by name; `processes_told_ns`: when each process was told of last.
         log, entries, refusals: newest last, bounded.
         controls: lane of who was in control; `modes`, `states`: lanes of mode and scope state, in lower case.
         problem_lanes: by number; `process_lanes`: by name. A process that is busy counts as alive.
@@ -144,6 +144,7 @@ class Overview:
         self.feedback: Feedback | None = None
         self.probe_position: ProbePosition | None = None
         self.processes: dict[str, ProcessState] = {}
+        self.processes_told_ns: dict[str, int] = {}
         self.told_progress: dict[str, Progress] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
@@ -312,6 +313,7 @@ class Overview:
 
     def _take_processes(self, states: ProcessStates, time_ns: int) -> None:
         for state in states.processes:
+            self.processes_told_ns[state.name] = time_ns
             before, self.processes[state.name] = self.processes.get(state.name), state
             condition = state.condition
             if condition is ProcessCondition.BUSY:

@@ -87,6 +87,20 @@ def test_what_takes_longer_than_it_said_does_not_promise_its_end(night: Overview
     assert "0 s left" not in shown(night).replace("50 s left", "")
 
 
+def test_who_is_not_told_of_while_others_are_is_not_well(night: Overview) -> None:
+    elsewhere = process("scheduler", ProcessCondition.ALIVE)
+    for after_s in (121, 121 + 7 * 60):  # at 60 times real time
+        now_ns = START + after_s * S
+        night.take("ProcessStates", model.ProcessStates(now_ns, "other", (elsewhere,)), now_ns, "ProcessStates_other")
+        is_gone = "series not heard of for 7 min 00 s" in shown(night)
+        assert is_gone is (after_s > 121)
+    assert "scheduler not heard of" not in shown(night)
+    told = telling.as_json(night, ABOUT, START + 600 * S)["processes"]
+    assert {one["name"]: one["heard_of"] for one in told} == {
+        "series": False, "judge": False, "grid": False, "scheduler": True,
+    }  # fmt: skip
+
+
 def test_nothing_is_cut_off_in_a_narrow_terminal(night: Overview) -> None:
     wide, narrow = shown(night, width=300), shown(night, width=30)
     assert max(map(len, narrow.splitlines())) <= 30
