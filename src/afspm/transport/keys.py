@@ -32,6 +32,7 @@ class Keys:
         public, secret: the own pair, as Z85 text.
         peers: the public keys that are let in, and the names of their owners.
         servers: the names of those who bind the addresses that we connect to, by address.
+        folder: where they came from; keys that are put there later are found; None: these are all.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Keys:
     secret: bytes = field(repr=False)
     peers: Mapping[bytes, str]
     servers: Mapping[str, str] = field(default_factory=dict)
+    folder: Path | None = None
 
     def server_key(self, address: str) -> bytes:
         """The public key that whoever binds `address` must have."""
@@ -67,9 +69,14 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
     entries = _read(secret_file, name)
     if "secret-key" not in entries:
         raise ConfigError("there is no secret key in this file", where=str(secret_file))
-    public_files = sorted((folder / "public").glob("*.key"))
-    peers = {_read(file, name)["public-key"]: file.name.removesuffix(".key") for file in public_files}
-    return Keys(name, entries["public-key"], entries["secret-key"], peers, dict(servers or {}))
+    peers = public_keys(folder, name)
+    return Keys(name, entries["public-key"], entries["secret-key"], peers, dict(servers or {}), folder)
+
+
+def public_keys(folder: Path, name: str) -> dict[bytes, str]:
+    """The public keys in a folder, with the names of their owners; read for `name`. Raises ConfigError, as `load`."""
+    files = sorted((folder / "public").glob("*.key"))
+    return {_read(file, name)["public-key"]: file.name.removesuffix(".key") for file in files}
 
 
 def from_launch(name: str, entries: Mapping[str, str] | None) -> Keys | None:

@@ -48,7 +48,7 @@ class Network:
         if keys is not None:
             from afspm.transport.zap import Authenticator
 
-            self._authenticator = Authenticator(self._context, keys.peers)
+            self._authenticator = Authenticator(self._context, keys)
 
     @classmethod
     def from_launch(cls, name: str, entries: Mapping[str, str] | None) -> Network:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import zmq
 from zmq.utils import z85
 
+from afspm.errors import ConfigError
+from afspm.transport.keys import Keys, public_keys
 from afspm.transport.wakeup import WakeUp
 
 DOMAIN = b"afspm"
@@ -17,11 +19,14 @@ _ADDRESS = "inproc://zeromq.zap.01"
 class Authenticator:
     """Answers, in a thread of its own, whether the owner of a key may connect, and what the owner's name is.
 
-    The name then is the "User-Id" of each message that comes by the connection.
+    The name then is the "User-Id" of each message that comes by the connection. Whoever is given a key while the
+    experiment runs is let in, too: when an unknown one knocks, the folder of keys is looked at if it has changed.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], peers: Mapping[bytes, str]) -> None:
-        self._names = {z85.decode(key): name.encode() for key, name in peers.items()}
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys) -> None:
+        self._keys = keys
+        self._names = {z85.decode(key): name.encode() for key, name in keys.peers.items()}
+        self._read_ns: int | None = None
         self._stop: WakeUp[None] = WakeUp()
         # bound before anything else is: a connection that finds no handler would be refused for ever
         self._socket: zmq.Socket[bytes] = context.socket(zmq.REP)
@@ -43,10 +48,29 @@ class Authenticator:
         """The reply to one request of the protocol: 200 and the name, or 400 and no name."""
         version, request_id, domain, _address, _identity, mechanism, *credentials = [*request, *[b""] * 7][:7]
         known = version == b"1.0" and domain == DOMAIN and mechanism == b"CURVE" and len(request) == 7
-        name = self._names.get(credentials[0]) if known else None
+        name = self._name_of(credentials[0]) if known else None
         if name is None:
             return [b"1.0", request_id, b"400", b"this key is not among the public keys", b"", b""]
         return [b"1.0", request_id, b"200", b"OK", name, b""]
+
+    def _name_of(self, key: bytes) -> bytes | None:
+        if key not in self._names:
+            self._look_again()
+        return self._names.get(key)
+
+    def _look_again(self) -> None:
+        """What was known stays as it was: no new file gives a key another name."""
+        folder = self._keys.folder
+        if folder is None:
+            return
+        try:
+            changed_ns = (folder / "public").stat().st_mtime_ns
+            if changed_ns == self._read_ns:
+                return
+            found = {z85.decode(key): name.encode() for key, name in public_keys(folder, self._keys.name).items()}
+        except (OSError, ConfigError, ValueError):
+            return  # one that is just being written: whoever knocks next has it looked at again
+        self._names, self._read_ns = {**found, **self._names}, changed_ns
 
     def close(self) -> None:
         """Stop the thread, before the context is closed."""

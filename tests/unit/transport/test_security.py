@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 import zmq
+from zmq.utils import z85
 
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, TransportError
 from afspm.transport import keys
 from afspm.transport.network import Network, is_local
 from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, RequestReceived
+from afspm.transport.zap import Authenticator
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
 
@@ -113,6 +115,35 @@ def test_with_keys_the_server_knows_who_asks_and_packets_arrive(tmp_path: Path, 
     port.send([b"\1", b"", b""])
     until(lambda: any(isinstance(a, RequestReceived) for a in asked), (server, asked))
     assert RequestReceived([b"\1", b"", b""], "scheduler") in asked
+
+
+def test_a_key_that_is_made_while_it_runs_is_let_in(tmp_path: Path, open_: Any, until: Any) -> None:
+    keys.generate(tmp_path, ["translator"])
+    server = open_(locked_server(tmp_path))
+    keys.generate(tmp_path, ["scheduler"])
+    port = open_(locked_component(tmp_path, "scheduler", server))
+    found: list[Any] = []
+    until(lambda: ControlConnected() in found, (server, []), (port, found))
+
+
+def test_who_knocks_while_a_key_is_being_written_does_not_spoil_it(tmp_path: Path) -> None:
+    keys.generate(tmp_path, ["translator", "late"])
+    whole = (tmp_path / "public" / "late.key").read_bytes()
+    (tmp_path / "public" / "late.key").unlink()
+    own = keys.load(tmp_path, "translator")
+    context: zmq.Context[Any] = zmq.Context()
+    authenticator = Authenticator(context, own)
+    key = z85.decode(keys._read(tmp_path / "private" / "late.key_secret", "late")["public-key"])
+    knock = [b"1.0", b"1", b"afspm", b"", b"", b"CURVE", key]
+    (tmp_path / "public" / "late.key").write_bytes(b"")
+    assert authenticator.answer(knock)[2] == b"400"
+    (tmp_path / "public" / "late.key").write_bytes(whole)  # which does not change the time of the folder
+    assert authenticator.answer(knock)[2:5] == [b"200", b"OK", b"late"]
+    (tmp_path / "public" / "other.key").write_bytes(whole)  # a name that is taken is not taken over
+    assert authenticator.answer([*knock[:-1], b"\0" * 32])[2] == b"400"
+    assert authenticator.answer(knock)[4] == b"late"
+    authenticator.close()
+    context.term()
 
 
 def test_a_known_key_that_is_not_the_schedulers_may_not_ask_a_translator(
