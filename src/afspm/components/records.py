@@ -27,7 +27,7 @@ class LineFile:
         self._header = header
         self._is_open = False
         self._waiting = ""
-        self._told = ToldOnce("lines wait to be written", _log, only_full=True)
+        self._told = ToldOnce("lines wait to be written", _log)
 
     def lines(self) -> list[str]:
         """What is there, the header not counted; without a last line that is not whole.
@@ -47,10 +47,8 @@ class LineFile:
     def append(self, lines: Iterable[str]) -> None:
         """Write lines at the end, the header first if the file is new.
 
-        Where the disk is full it is said, and they wait until more come and there is room.
-
-        Raises:
-            FileError: the folder is gone …
+        Where that can't be, on a full disk or while somebody has the file open in a program that locks it, it is said,
+        and they wait until more come.
         """
         self._waiting += "".join(f"{line}\n" for line in lines)
         with self._told.trying():

@@ -136,6 +136,23 @@ def test_rows_wait_for_room_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.M
     assert path.read_text() == "a,b\n1,2\n3,4\n5,6\n7,8\n"
 
 
+def test_rows_wait_while_another_program_has_locked_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def locked(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    path = tmp_path / "table.csv"
+    table = LineFile(path, "a,b")
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "open", locked)
+        table.append(["1,2"])
+        table.append(["3,4"])
+    assert caplog.text.count("lines wait to be written") == 1
+    table.append(["5,6"])
+    assert path.read_text() == "a,b\n1,2\n3,4\n5,6\n"
+
+
 def _full_after(real: Any, room: int) -> Any:
     """Path.open of a disk that has room for so many more bytes."""
 
