@@ -133,10 +133,15 @@ class Gathering:
 
 
 def _same(taken: ScanTaken, scan: Scan) -> bool:
-    """Whether this is another channel of the scan. One that comes again, from a translator started anew, is too."""
+    """Whether this is another channel of the scan. One that comes again, from a translator started anew, is too.
+
+    Some controllers write a file for each channel: then it is the time that says so, and a channel that is there
+    already out of another file is that of another scan.
+    """
     first = taken.channels[0][1]
-    if (scan.region, scan.shape, scan.filename) != (first.region, first.shape, first.filename):
+    if (scan.region, scan.shape, scan.time_ns) != (first.region, first.shape, first.time_ns):
         return False
-    if scan.filename or scan.time_ns is not None:
-        return scan.time_ns == first.time_ns
-    return all(scan.channel != other.channel for _, other in taken.channels)
+    for _, other in taken.channels:
+        if other.channel == scan.channel:
+            return scan.filename == other.filename and (scan.filename != "" or scan.time_ns is not None)
+    return scan.time_ns is not None or scan.filename == first.filename

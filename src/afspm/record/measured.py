@@ -7,11 +7,12 @@ import logging
 import os
 import sqlite3
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from afspm import wire
 from afspm.model import Packet, ProblemNames, Scan, ScopeState
 from afspm.record import circumstances, nexus
 from afspm.record.circumstances import Stood
@@ -61,19 +62,35 @@ class MeasuredFiles:
         packet, first = taken.channels[0]
         published_ns = packet.time_ns or 0
         measured_ns = published_ns if first.time_ns is None else first.time_ns
-        new = {scan.channel: scan for _, scan in reversed(taken.channels)}
-        known = self._journal.execute(
-            "SELECT number, file FROM scans WHERE time_ns = ? AND filename = ? AND NOT interrupted",
-            (measured_ns, first.filename),
-        ).fetchone()
+        new: dict[str, Scan] = {}
+        for _, scan in taken.channels:
+            new.setdefault(scan.channel, scan)
+        known = self._known(new, measured_ns)
         if known is None:
-            scans = [new[channel] for channel in dict.fromkeys(scan.channel for _, scan in taken.channels)]
             stood = circumstances.stood(self._journal, published_ns, ScopeState.SCANNING, measured_ns)
-            number = self._add_scan(scans, measured_ns, stood, published_ns, interrupted=False)
+            number = self._add_scan(list(new.values()), measured_ns, stood, published_ns, interrupted=False)
         else:
             number = known[0]
             self._add_channels(number, self._folder / known[1], new)
         self._insert_scan_packets(taken, number)
+
+    def _known(self, new: Mapping[str, Scan], measured_ns: int) -> tuple[int, str] | None:
+        """The number and file of the scan that these are channels of, if it is there: none came out of another file."""
+        rows = self._journal.execute(
+            "SELECT number, file FROM scans WHERE time_ns = ? AND NOT interrupted ORDER BY number", (measured_ns,)
+        )
+        for number, file in rows.fetchall():
+            there = dict(self._channels(number))
+            if all(there.get(channel, scan.filename) == scan.filename for channel, scan in new.items()):
+                return number, file
+        return None
+
+    def _channels(self, number: int) -> Iterator[tuple[str, str]]:
+        """Channels of a scan that is there, and the controller's files that they came out of."""
+        rows = self._journal.execute("SELECT payload FROM packets WHERE scan = ? AND message = 'Scan2d'", (number,))
+        for (payload,) in rows:
+            message: Any = wire.message_type("Scan2d").FromString(payload)
+            yield message.channel, message.filename
 
     def _write_interrupted(self, taken: ScanTaken, time_ns: int) -> None:
         scans = taken.as_seen()

@@ -48,9 +48,21 @@ class Night:
     def feedback(self) -> Given:
         return self.packet(Feedback(True, 0.125, 1500.0, 0.75))
 
-    def scans(self, number: int, channels: tuple[str, ...] = ("Height", "Height Retrace")) -> list[Given]:
-        filename, time_ns = f"scan-{number:04d}.nc", self.now_ns
+    def scans(
+        self, number: int, channels: tuple[str, ...] = ("Height", "Height Retrace"), time_ns: int | None = None
+    ) -> list[Given]:
+        filename, time_ns = f"scan-{number:04d}.nc", self.now_ns if time_ns is None else time_ns
         made = [Scan(REGION, name, "m", self.random.normal(size=(6, 8)), time_ns, filename) for name in channels]
+        return [self.packet(scan, f"Scan2d_1000.0_{scan.channel}") for scan in made]
+
+    def scan_in_files(self, number: int, channels: tuple[str, ...] = ("Topo", "Current", "Phase")) -> list[Given]:
+        """As controllers give it that write a file for each channel."""
+        time_ns = self.now_ns
+        values = self.random.normal(size=(len(channels), 6, 8))
+        made = [
+            Scan(REGION, name, "m", z, time_ns, f"s{number}-{name}.nc")
+            for name, z in zip(channels, values, strict=True)
+        ]
         return [self.packet(scan, f"Scan2d_1000.0_{scan.channel}") for scan in made]
 
     def lines(self, rows: int = 2, first: int = 0, channel: str = "Height") -> Given:

@@ -104,6 +104,38 @@ def _fields(lines: Any) -> dict[str, Any]:
     return {name: getattr(lines, name) for name in ("region", "shape", "channel", "unit", "first_row", "began_ns")}
 
 
+def test_channels_in_files_of_their_own_are_one_scan(night: Night, store: Store, tmp_path: Path) -> None:
+    given = [night.scan_in_files(number) for number in (1, 2)]
+    store.take([*given[0], *given[1], night.state(ScopeState.FREE)])
+    run = afspm.open_run(tmp_path)
+    assert [row.filename for row in run.scans] == ["s1-Topo.nc", "s2-Topo.nc"]
+    assert list(run.scan(0)) == ["Topo", "Current", "Phase"]
+    assert same(list(run.packets()), [*given[0], *given[1], (list(run.packets())[-1], "")])
+
+
+def test_channels_in_files_of_their_own_find_their_scan_after_a_kill(night: Night, tmp_path: Path) -> None:
+    given = night.scan_in_files(1)
+    store = Store(tmp_path, ABOUT)
+    store.take(given[:1])
+    store.flush()
+    store.close()
+    again = Store(tmp_path, ABOUT)
+    again.take(given[1:])
+    again.take([night.state(ScopeState.FREE)])
+    again.close()
+    run = afspm.open_run(tmp_path)
+    assert len(run.scans) == 1
+    assert list(run.scan(0)) == ["Topo", "Current", "Phase"]
+
+
+def test_scans_of_one_time_in_several_files_are_not_mixed(night: Night, store: Store, tmp_path: Path) -> None:
+    """A controller whose clock has seconds may take two scans in one."""
+    scans = [*night.scans(1, ("Height",), START_NS), *night.scans(2, ("Height",), START_NS)]
+    store.take([*scans, night.state(ScopeState.FREE)])
+    run = afspm.open_run(tmp_path)
+    assert [row.filename for row in run.scans] == ["scan-0001.nc", "scan-0002.nc"]
+
+
 def test_packets_of_unknown_messages_are_kept_as_they_are(store: Store, tmp_path: Path) -> None:
     strange = (Packet("Peaks_of_mine", b"\x01\x02", START_NS), "")
     store.take([strange])
