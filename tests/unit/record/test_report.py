@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 from html.parser import HTMLParser
@@ -196,6 +197,17 @@ def test_without_a_record_there_is_no_report(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no record"):
         write(tmp_path)
     assert not (tmp_path / REPORT_FILE).exists()
+
+
+@pytest.mark.parametrize("what", ["afspm.record.report.pictures.draw", "pathlib.Path.replace"])
+def test_a_folder_that_can_not_be_written_to_is_told(run: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(what, full)
+    with pytest.raises(FileError, match="can't be written: No space left on device"):
+        write(run)
+    assert not list(run.glob(".report*"))
 
 
 def test_a_scan_whose_file_is_gone_is_told_without_a_picture(run: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from afspm.errors import FileError
@@ -26,13 +27,14 @@ def write(folder: str | Path) -> Path:
     with open_run(folder) as run:
         told = story.read(run)
         shown = pictures.smalls(run, told.scans)
-        pictures.draw(run, told, shown)
-        text = page.html(told, shown, pictures.figures(run.folder))
         target = run.folder / REPORT_FILE
-    aside = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
-        aside.write_text(text, encoding="utf-8")
-        aside.replace(target)
-    except OSError as error:
-        raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
+        aside = target.with_name(f".{target.name}.{os.getpid()}")
+        try:
+            pictures.draw(run, told, shown)
+            aside.write_text(page.html(told, shown, pictures.figures(run.folder)), encoding="utf-8")
+            aside.replace(target)
+        except OSError as error:
+            with suppress(OSError):
+                aside.unlink(missing_ok=True)
+            raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
     return target
