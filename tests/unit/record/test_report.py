@@ -226,6 +226,18 @@ def test_a_problem_is_told_with_who_repaired_it(run: Path) -> None:
     assert told(run).repairs(problem) == ["corrector"]
 
 
+def test_times_of_more_than_a_day_have_the_day(tmp_path: Path) -> None:
+    store = Store(tmp_path, About({"experiment": "days"}))
+    for at_s in (0, 30 * 3600):
+        thing = scan(at_s)
+        store.take([(model.Packet("Scan2d_1_x", wire.encode(thing)[1], START + at_s * S), "")])
+    store.flush()
+    store.close()
+    text = write(tmp_path).read_text(encoding="utf-8")
+    assert "1 · 14 Nov 22:13:20" in text
+    assert "2 · 16 Nov 04:13:20" in text
+
+
 def test_time_is_shared_out(run: Path) -> None:
     shares = dict(told(run).shares(told(run).overview.controls))
     assert shares["corrector"] == 90 * S

@@ -14,6 +14,7 @@ from afspm.record.report.pictures import Small
 from afspm.record.report.story import MOST_ROWS, Story, sentence, states_in_words
 from afspm.record.report.style import CSS
 
+_DAY_NS = 86_400_000_000_000
 _LEGEND = (
     "The bar below a scan has the colour of who was in control; framed: a problem was flagged, or it was interrupted."
 )
@@ -112,12 +113,12 @@ def _problems(story: Story) -> str:
         rows.append(
             [
                 escape(span.label),
-                _clock(span.start_ns),
+                _clock(story, span.start_ns),
                 escape(span.by or "not known"),
                 escape(", ".join(story.repairs(span)) or "nobody"),
                 escape(", ".join(story.done_meanwhile(span))),
                 lasting(end_ns - span.start_ns),
-                "<b>not solved</b>" if span.end_ns is None else _clock(end_ns),
+                "<b>not solved</b>" if span.end_ns is None else _clock(story, end_ns),
             ]
         )
     return (
@@ -133,10 +134,10 @@ def _sheet(story: Story, shown: Sequence[Small]) -> str:
     left_out = len(story.scans) - len(shown)
     note = f'<p class="note">{left_out} more are not shown.</p>' if left_out else ""
     note += f'<p class="note">{_LEGEND}</p>'
-    return f'<div class="sheet">{"".join(_thumb(small, styles) for small in shown)}</div>{note}'
+    return f'<div class="sheet">{"".join(_thumb(small, story, styles) for small in shown)}</div>{note}'
 
 
-def _thumb(small: Small, styles: dict[str, str]) -> str:
+def _thumb(small: Small, story: Story, styles: dict[str, str]) -> str:
     row = small.row
     width, height = row.region.size_m if row.region else (1.0, 1.0)
     picture = (
@@ -152,7 +153,7 @@ def _thumb(small: Small, styles: dict[str, str]) -> str:
     title = ", ".join(filter(None, (f"scan {row.number}", small.channel, size, holder, *row.problems, row.filename)))
     return (
         f'<figure class="{"bad" if is_bad else ""}" title="{escape(title)}">{picture}<i class="{style}"></i>'
-        f"<figcaption>{row.number} · {_clock(row.time_ns)}{mark}</figcaption></figure>"
+        f"<figcaption>{row.number} · {_clock(story, row.time_ns)}{mark}</figcaption></figure>"
     )
 
 
@@ -166,7 +167,7 @@ def _figure(path: Path) -> str:
 def _refusals(story: Story) -> str:
     rows = [
         [
-            _clock(one.first_ns) + (f" … {_clock(one.last_ns)}" if one.count > 1 else ""),
+            _clock(story, one.first_ns) + (f" … {_clock(story, one.last_ns)}" if one.count > 1 else ""),
             str(one.count),
             escape(one.who),
             escape(one.what),
@@ -181,7 +182,7 @@ def _refusals(story: Story) -> str:
 
 def _restarts(story: Story) -> str:
     rows = [
-        [_clock(one.time_ns), escape(one.name), str(one.starts), escape(one.last_exit)]
+        [_clock(story, one.time_ns), escape(one.name), str(one.starts), escape(one.last_exit)]
         for one in story.restarts[:MOST_ROWS]
     ]
     return _table(["when", "process", "start number", "had ended"], rows) or "<p>None.</p>"
@@ -212,8 +213,10 @@ def _data(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
-def _clock(time_ns: int) -> str:
-    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%H:%M:%S}"
+def _clock(story: Story, time_ns: int) -> str:
+    """With the day, where there are several."""
+    day = "%d %b " if story.lasted_ns > _DAY_NS else ""
+    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):{day}%H:%M:%S}"
 
 
 def _day(time_ns: int) -> str:
