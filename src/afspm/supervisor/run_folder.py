@@ -91,7 +91,10 @@ def _new_folder(runs: Path, stamp: str) -> Path:
 
 
 def _replace(file: Path, text: str) -> None:
-    """Write so that a reader sees the old or the new text, never half of it."""
+    """Write so that a reader sees the old or the new text, never half of it; after a power cut, too."""
     new = file.with_name(f".{file.name}.{os.getpid()}")
-    new.write_text(text, encoding="utf-8")
+    with new.open("w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
     new.replace(file)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -41,3 +42,19 @@ def test_run_json_is_replaced_as_a_whole(tmp_path: Path) -> None:
     run_folder.write_run(tmp_path, {"name": "µ"})
     assert json.loads((tmp_path / "run.json").read_text(encoding="utf-8")) == {"name": "µ"}
     assert [file.name for file in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_what_a_run_is_resumed_by_is_on_the_disk_before_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there: list[bool] = []
+    real = os.fsync
+
+    def synced(descriptor: int) -> None:
+        there.append((tmp_path / "run.json").exists())
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    run_folder.write_run(tmp_path, {"name": "night"})
+    assert there == [False]
+    assert (tmp_path / "run.json").exists()
