@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import socket
+import sqlite3
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -13,7 +15,7 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load_expanded
 from afspm.record import ahead
-from afspm.record.journal import JOURNAL_FILE, open_to_read
+from afspm.record.journal import open_to_read
 from afspm.record.run import REPLAY_OF
 from afspm.runtime.connect import RUN_FILE, find_run
 from afspm.supervisor import run as running
@@ -109,10 +111,11 @@ def last_seen_ns(folder: Path) -> int:
         for values in (kept, translator):
             if isinstance(values, dict):
                 seen += [values[name] for name in ("last_ns", "seen_ns") if isinstance(values.get(name), int)]
-    if (folder / JOURNAL_FILE).is_file():
+    with suppress(FileError, sqlite3.DatabaseError):  # damaged: the recorder puts it aside, and the others know as well
         journal = open_to_read(folder)
-        seen.append(journal.execute("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ''").fetchone()[0])
-        journal.close()
+        with closing(journal):
+            newest = journal.execute("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ''")
+            seen.append(newest.fetchone()[0])
     return max(seen)
 
 

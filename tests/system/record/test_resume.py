@@ -116,6 +116,15 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
         resuming.find(tmp_path)
 
 
+@pytest.mark.parametrize("content", [None, b"", b"no journal at all", b"SQLite format 3\0 and then nothing"])
+def test_a_damaged_journal_does_not_keep_a_run_from_going_on(tmp_path: Path, content: bytes | None) -> None:
+    (tmp_path / "state").mkdir()
+    (tmp_path / "state" / "microscope.json").write_text('{"seen_ns": 17}', encoding="utf-8")
+    if content is not None:
+        (tmp_path / "journal.sqlite").write_bytes(content)
+    assert resuming.last_seen_ns(tmp_path) == 17
+
+
 def test_a_lock_is_given_back_by_who_leaves(tmp_path: Path) -> None:
     (tmp_path / run_folder.STATE_DIR).mkdir()
     with run_folder.locked(tmp_path), pytest.raises(FileError, match="still going on"):
