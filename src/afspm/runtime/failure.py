@@ -62,13 +62,13 @@ def _kept(
     frames: Iterable[traceback.FrameSummary], package: Path, *, is_foreseen: bool
 ) -> list[traceback.FrameSummary]:
     everything = list(frames)
-    first = next((i for i, frame in enumerate(everything) if not _is_ours(frame, package)), None)
+    first = next((i for i, frame in enumerate(everything) if not _is_passage(frame, package)), None)
     if first is None:
         return everything
     below = everything[first:]
     if not is_foreseen:
         return below
-    last = max(i for i, frame in enumerate(below) if not _is_passage(frame, package)) if below else 0
+    last = max(i for i, frame in enumerate(below) if not _is_passage(frame, package))
     return [frame for frame in below[: last + 1] if not _is_ours(frame, package)]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,23 @@ def test_what_we_refused_is_told_at_the_line_that_asked_for_it() -> None:
     assert text.splitlines()[0] == "too far"
     assert "made_up.py" not in text
     assert "test_failure.py" in text
+
+
+WITHIN = """
+@contextmanager
+def holding():
+    raise Refused(9, "too far", where="series")
+    yield
+
+def run():
+    with holding():
+        pass
+"""
+
+
+def test_what_a_component_of_ours_was_refused_within_a_context_is_told() -> None:
+    run = made_up(WITHIN, Refused=Refused, contextmanager=contextmanager)["run"]
+    assert told(raised(run), "series").splitlines()[0].startswith("too far")
 
 
 def test_an_error_of_ours_alone_is_told_whole() -> None:
