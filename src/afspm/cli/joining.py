@@ -120,11 +120,15 @@ def _running(where: Path) -> Path:
 @contextmanager
 def _only_if_running(folder: Path) -> Iterator[None]:
     from afspm.errors import ExperimentEnded, NoResponse
+    from afspm.record.run import REPLAY_OF
+    from afspm.runtime.following import facts_of
 
     try:
         yield
     except ExperimentEnded as error:
         say_nothing_runs(str(error))
     except NoResponse:
+        said = f"nobody answers in {folder.resolve().name}"
         resume = f"`afspm run --resume {shlex.quote(str(folder))}`"
-        say_nothing_runs(f"nobody answers in {folder.resolve().name}; if it was cut off, {resume} goes on with it")
+        is_replay = REPLAY_OF in facts_of(folder)
+        say_nothing_runs(said if is_replay else f"{said}; if it was cut off, {resume} goes on with it")
