@@ -128,7 +128,9 @@ def _only_if_running(folder: Path) -> Iterator[None]:
     except ExperimentEnded as error:
         say_nothing_runs(str(error))
     except NoResponse:
-        said = f"nobody answers in {folder.resolve().name}"
-        resume = f"`afspm run --resume {shlex.quote(str(folder))}`"
-        is_replay = REPLAY_OF in facts_of(folder)
-        say_nothing_runs(said if is_replay else f"{said}; if it was cut off, {resume} goes on with it")
+        said, facts = f"nobody answers in {folder.resolve().name}", facts_of(folder)
+        if (facts.get("guest") or {}).get("keys"):
+            said += f"; if it runs, its scheduler lacks the public key of {TERMINAL}"
+        if REPLAY_OF not in facts:
+            said += f"; if it was cut off, `afspm run --resume {shlex.quote(str(folder))}` goes on with it"
+        say_nothing_runs(said)

@@ -14,9 +14,11 @@ from afspm.cli.status import _console
 from afspm.errors import NoResponse
 
 
+@pytest.mark.parametrize("keys", ["null", '{"folder": "keys"}'])
 @pytest.mark.parametrize("command", [looking, acting])
 def test_a_run_that_was_cut_off_says_how_it_goes_on(
     command: Callable[[Path], AbstractContextManager[object]],
+    keys: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -25,7 +27,9 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on(
         raise NoResponse("nobody is there")
 
     (tmp_path / "night-1").mkdir()
-    (tmp_path / "night-1" / "run.json").write_text('{"name": "night"}', encoding="utf-8")
+    (tmp_path / "night-1" / "run.json").write_text(
+        f'{{"name": "night", "guest": {{"keys": {keys}}}}}', encoding="utf-8"
+    )
     monkeypatch.setattr("afspm.runtime.connect.connect", nobody)
     monkeypatch.setattr("afspm.runtime.following.Follower.__init__", lambda *_: None)
     monkeypatch.setattr("afspm.runtime.following.Follower.close", lambda *_: None)
@@ -35,6 +39,7 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on(
     said = capsys.readouterr().err
     assert "nobody answers in night-1" in said
     assert f"`afspm run --resume {tmp_path / 'night-1'}` goes on with it" in said
+    assert ("lacks the public key of terminal" in said) == (keys != "null")
 
 
 def test_a_run_that_has_ended_is_named_from_its_folder_too(
