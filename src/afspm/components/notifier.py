@@ -123,7 +123,7 @@ class Notifier(Component):
             waiting["tries"] += 1
             self._due_s[key] = self.clock.monotonic_s() + notices.delay_s(waiting["tries"])
             if waiting["tries"] < MOST_TRIES:
-                self.log.info("nobody told yet, it is tried again: %s", error)
+                self.log.info("nobody told by the %s yet, it is tried again: %s", way, error)
                 self.memory.save()
                 return
             self.log.error("given up telling of it: %s", error)

@@ -108,13 +108,13 @@ def _tell(notice: Notice, targets: Targets, way: Way, clock: Clock, until_s: flo
             targets.deliver(notice, way)
             return
         except ConfigError as error:
-            log.write(SUPERVISOR, logging.ERROR, f"nobody is told: {error}")
+            log.write(SUPERVISOR, logging.ERROR, f"nobody is told by the {way}: {error}")
             return
         except NotDelivered as error:
             tries += 1
             delay_s = notices.delay_s(tries)
             if clock.monotonic_s() + delay_s >= until_s:
-                log.write(SUPERVISOR, logging.ERROR, f"nobody could be told: {error}")
+                log.write(SUPERVISOR, logging.ERROR, f"nobody could be told by the {way}: {error}")
                 return
         threading.Event().wait(delay_s)
 

@@ -70,7 +70,7 @@ def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.M
     aftermath.tell(ended, targets, ("end",), ExperimentClock.real(), log)  # type: ignore[arg-type]
     assert len(count.read_text()) >= 2
     assert [level for level, _ in log.lines] == [logging.ERROR]
-    assert "nobody could be told" in log.lines[0][1]
+    assert "nobody could be told by the command" in log.lines[0][1]
 
 
 def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
