@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -15,6 +16,12 @@ from afspm.dashboard.guard import VISITOR, Guard
 KEPT = hashed("open sesame")
 
 
+def completed(doing: Coroutine[Any, Any, Any]) -> Any:
+    """What comes of it; in a thread of its own, as a browser that is tested has its loop running in this one."""
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(asyncio.run, doing).result()
+
+
 class Browser:
     """Asks an application without a network in between, and keeps its cookies."""
 
@@ -24,10 +31,10 @@ class Browser:
         self._cookies = httpx.Cookies()
 
     def get(self, path: str, **more: Any) -> httpx.Response:
-        return asyncio.run(self._ask("GET", path, **more))
+        return completed(self._ask("GET", path, **more))
 
     def post(self, path: str, **more: Any) -> httpx.Response:
-        return asyncio.run(self._ask("POST", path, **more))
+        return completed(self._ask("POST", path, **more))
 
     async def _ask(self, method: str, path: str, **more: Any) -> httpx.Response:
         transport = httpx.ASGITransport(self._app)  # type: ignore[arg-type]
@@ -52,7 +59,7 @@ class Browser:
         async def send(message: Any) -> None:
             told.append(message.get("text") or message["type"].removeprefix("websocket."))
 
-        asyncio.run(self._app(scope, receive, send))  # type: ignore[arg-type]
+        completed(self._app(scope, receive, send))  # type: ignore[arg-type]
         return told
 
 
