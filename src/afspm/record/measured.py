@@ -137,7 +137,12 @@ class MeasuredFiles:
         self._journal.execute("UPDATE scans SET channels = ? WHERE number = ?", (channels, number))
 
     def _insert_scan_packets(self, taken: ScanTaken, number: int) -> None:
+        (channels,) = self._journal.execute("SELECT channels FROM scans WHERE number = ?", (number,)).fetchone()
+        in_file = {channel for channel, _ in json.loads(channels)}
         for packet, lines in taken.lines:
+            if lines.channel not in in_file:  # it ended before this channel was published
+                insert_packet(self._journal, packet, "ScanLines", bytes(packet.payload))
+                continue
             head = without_values("ScanLines", packet.payload)
             rows = (lines.channel, lines.first_row, len(lines.values))
             insert_packet(self._journal, packet, "ScanLines", head, scan=number, rows=rows)

@@ -100,6 +100,15 @@ def test_everything_comes_out_as_it_was_published(night: Night, store: Store, tm
     assert same(list(run.packets(since_ns=given[6][0].time_ns or 0)), given[7:])
 
 
+def test_lines_of_a_channel_that_the_end_came_before_are_there(night: Night, store: Store, tmp_path: Path) -> None:
+    given = [night.state(ScopeState.SCANNING), night.lines(2), night.scans(1)[1]]
+    store.take(given)
+    store.finish()
+    run = afspm.open_run(tmp_path)
+    assert [row.channels for row in run.scans] == [(("Height Retrace", "m"),)]
+    assert same(list(run.packets()), given)
+
+
 def _fields(lines: Any) -> dict[str, Any]:
     return {name: getattr(lines, name) for name in ("region", "shape", "channel", "unit", "first_row", "began_ns")}
 
