@@ -8,6 +8,7 @@ import math
 import socket
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -45,9 +46,8 @@ class BridgeLink:
 
     def call(self, method: str, *arguments: str | int | float) -> Any:
         """Call a function of GXSM (see `Link`)."""
-        message = json.dumps([method, *arguments]).encode() + b"\n"
         try:
-            reply = _reply(self._exchange(method, message))
+            reply = _reply(self._exchange(method, _message(method, *arguments)))
         except TimeoutError as error:
             self.close()
             what = f"no answer to {method} within {self._timeout_s:g} s"
@@ -90,6 +90,11 @@ class BridgeLink:
             if size > _LONGEST or b"\n" in part[:-1]:
                 raise BadReply(f"more than one answer to {method}", where=self._where)
         return b"".join(parts)
+
+
+@lru_cache(256, typed=True)  # the same few are asked again and again, a frame by seven questions
+def _message(method: str, *arguments: str | int | float) -> bytes:
+    return json.dumps([method, *arguments]).encode() + b"\n"
 
 
 def _reply(line: bytes) -> dict[str, Any]:
