@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 from test_snippets import FILE_NAME, ROOT, snippets
 
+import afspm
+from afspm.model import ScopeState
+
 PAGE = ROOT / "docs" / "how-to" / "use-a-notebook.md"
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 DEADLINE_S = 60.0
@@ -24,6 +27,8 @@ def test_the_script_of_the_page_measures_and_ends_the_experiment(tmp_path: Path)
         try:
             assert run.stdout is not None
             assert any(" scheduler " in line and "is up" in line for line in run.stdout), "it never started"
+            with afspm.connect(tmp_path / "runs", "waiter") as scope:  # the script says what state it is in by then
+                assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)
             script = subprocess.run(
                 [sys.executable, "look.py"],
                 cwd=tmp_path,
