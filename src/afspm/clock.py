@@ -8,10 +8,19 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any, Protocol
 
 NS_PER_S = 1_000_000_000
+
+
+def iso_utc(time_ns: int | None) -> str:
+    """A time, ns since the Unix epoch, as ISO 8601 in UTC, to the microsecond; empty for none."""
+    if time_ns is None:
+        return ""
+    seconds, rest_ns = divmod(time_ns, NS_PER_S)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
 
 
 class Clock(Protocol):

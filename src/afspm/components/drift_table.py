@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from afspm.components.metadata import iso_utc
+from afspm.clock import iso_utc
 from afspm.components.records import LineFile
 from afspm.drift.record import COLUMNS as RECORD
 from afspm.drift.record import drift_at

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from afspm.components.metadata import iso_utc
+from afspm.clock import iso_utc
 from afspm.components.records import LineFile
 from afspm.runtime.component import Component
 

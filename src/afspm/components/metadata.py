@@ -7,10 +7,10 @@ import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar
 
+from afspm.clock import iso_utc
 from afspm.components.records import LineFile
 from afspm.model import ControlState, Region, Scan, ScopeState, ScopeStatus, Spectrum
 from afspm.runtime.component import Component
@@ -146,14 +146,6 @@ def _row(time_ns: int | None, what: list[str], place: list[str], of_values: list
 def _of_region(region: Region) -> list[str]:
     lengths = [_number(value) for value in (*region.center_m, *region.size_m)]
     return [*lengths, "m", _number(math.degrees(region.angle_rad))]
-
-
-def iso_utc(time_ns: int | None) -> str:
-    """A time as ISO 8601 in UTC, to the microsecond; empty for none."""
-    if time_ns is None:
-        return ""
-    seconds, rest_ns = divmod(time_ns, 1_000_000_000)
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
 
 
 def _number(value: float) -> str:

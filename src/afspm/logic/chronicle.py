@@ -61,23 +61,13 @@ class Chronicle:
             heard_s: when, in real monotonic time, it was heard.
             note: what there is to say of the answer beside its reason.
         """
-        if request.kind in _UNWRITTEN:
-            return
-        if len(self._gathered) >= self._most:
-            self._left_out += 1
-            return
-        if self.due_s is None:
-            self.due_s = self._now_s + PERIOD_S
-        self._gathered.append((self._now_ns, who, request, response, self._now_s - heard_s, note))
+        if request.kind not in _UNWRITTEN:
+            self._add_request((self._now_ns, who, request, response, self._now_s - heard_s, note))
 
     def unreadable(self, who: str, response: Response) -> None:
         """Somebody asked for what could not be read."""
         reason = response.reason[:LONGEST]
-        entry = JournalEntry(self._now_ns, REQUEST, who, "what can't be read", response.code, reason, 0.0)
-        if len(self._gathered) >= self._most:
-            self._left_out += 1
-        else:
-            self._add(entry)
+        self._add_request(JournalEntry(self._now_ns, REQUEST, who, "what can't be read", response.code, reason, 0.0))
 
     def began(self, control: Control, *, again: bool) -> None:
         """The scheduler was started."""
@@ -114,7 +104,14 @@ class Chronicle:
     def _say(self, who: str, what: str, reason: str = "") -> None:
         self._add(JournalEntry(self._now_ns, CONTROL, who, what, None, reason))
 
-    def _add(self, entry: JournalEntry) -> None:
+    def _add_request(self, entry: _Answered | JournalEntry) -> None:
+        """Of requests there may be any number."""
+        if len(self._gathered) >= self._most:
+            self._left_out += 1
+        else:
+            self._add(entry)
+
+    def _add(self, entry: _Answered | JournalEntry) -> None:
         if self.due_s is None:
             self.due_s = self._now_s + PERIOD_S
         self._gathered.append(entry)

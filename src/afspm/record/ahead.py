@@ -11,13 +11,13 @@ time of it, whether it is cached; envelope; payload; a newline. What a kill has 
 from __future__ import annotations
 
 import contextlib
-import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
 from afspm.model import Packet
+from afspm.record.whole import replace
 
 RECORDED_FILE = "recorded"
 """In the state folder: the time, in ns, up to which everything is in the record. It is there if there is a record."""
@@ -159,9 +159,7 @@ def expect_record(state_dir: Path) -> None:
 
 def say_recorded(file: Path, time_ns: int) -> None:
     """Everything up to that time is in the record, and on disk. Raises OSError."""
-    aside = file.with_name(f".{file.name}.{os.getpid()}")
-    aside.write_text(f"{time_ns}\n", encoding="ascii")
-    aside.replace(file)
+    replace(file, [f"{time_ns}\n".encode("ascii")], synced=False)
 
 
 def written_ahead(folder: Path, since_ns: int = -1) -> Iterator[Written]:

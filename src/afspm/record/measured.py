@@ -8,13 +8,13 @@ import os
 import sqlite3
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from afspm import wire
+from afspm.clock import iso_utc
 from afspm.model import Packet, ProblemNames, Scan, ScopeState
-from afspm.record import circumstances, nexus
+from afspm.record import circumstances, nexus, whole
 from afspm.record.circumstances import Stood
 from afspm.record.gathering import ScanTaken, SpectrumTaken, Taken
 from afspm.record.nexus import Circumstances
@@ -235,17 +235,7 @@ def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
 
 def write_synced(path: Path, data: bytes) -> None:
     """Write a file so that it is there as a whole or not at all, after a power cut too. Raises OSError."""
-    part = path.with_name(path.name + PART)
-    path.parent.mkdir(exist_ok=True)
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
-    part.replace(path)
+    whole.replace(path, [data], aside=path.with_name(path.name + PART))
     if sys.platform != "win32":  # there is no folder to wait for there
         descriptor = os.open(path.parent, os.O_RDONLY)
         try:
@@ -255,5 +245,5 @@ def write_synced(path: Path, data: bytes) -> None:
 
 
 def _stamp(time_ns: int) -> str:
-    seconds, rest_ns = divmod(time_ns, 1_000_000_000)
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y%m%dT%H%M%S}.{rest_ns // 1000:06d}Z"
+    """As it may stand in the name of a file."""
+    return iso_utc(time_ns).replace("-", "").replace(":", "")

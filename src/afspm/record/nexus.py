@@ -17,7 +17,6 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.clock import iso_utc
 from afspm.files import hdf5
 from afspm.files.nexus import ABOUT, DEFINITION, VENDOR, about_of
 from afspm.model import Scan, Spectrum
@@ -130,9 +130,9 @@ def _encoded(about: dict[str, Any], circumstances: Circumstances, fill: Any) -> 
         entry.attrs["default"] = "data"
         entry["definition"] = DEFINITION
         entry["title"] = str(about.get("experiment", ""))
-        entry["end_time"] = iso(circumstances.time_ns)
+        entry["end_time"] = iso_utc(circumstances.time_ns)
         if circumstances.began_ns is not None:
-            entry["start_time"] = iso(circumstances.began_ns)
+            entry["start_time"] = iso_utc(circumstances.began_ns)
         if about.get("simulated"):
             entry["experiment_description"] = "SIMULATED"
         program = entry.create_dataset("program_name", data="afspm")
@@ -205,12 +205,6 @@ def afspm_version() -> str:
     from importlib.metadata import version
 
     return version("afspm")
-
-
-def iso(time_ns: int) -> str:
-    """A time as ISO 8601 in UTC, to the microsecond."""
-    seconds, rest_ns = divmod(time_ns, 1_000_000_000)
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
 
 
 def _plain(value: Any) -> Any:

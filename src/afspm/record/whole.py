@@ -19,27 +19,36 @@ PERIOD_S = 1.0
 """Real time between two generations that are made sure to be on the disk."""
 
 
-def write_whole(path: Path, parts: Iterable[bytes], *, synced: bool = True) -> None:
+def replace(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True, aside: Path | None = None) -> None:
     """Write a file so that it is there completely or as it was before, whenever the process is killed.
 
     Args:
         synced: the same of a power cut; that waits for the disk.
+        aside: where it is written before it has its name; None: under a hidden name of this process beside it.
 
     Raises:
-        FileError: it can't be written.
+        OSError: it can't be written.
     """
-    new = path.with_name(f".{path.name}.{os.getpid()}")
+    aside = aside or path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with new.open("wb") as file:
+        with aside.open("wb") as file:
             file.writelines(parts)
             if synced:
                 file.flush()
                 os.fsync(file.fileno())
-        new.replace(path)
-    except OSError as error:
+        aside.replace(path)
+    except OSError:
         with contextlib.suppress(OSError):
-            new.unlink()
+            aside.unlink()
+        raise
+
+
+def write_whole(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:
+    """`replace`, for whoever tells people of it. Raises FileError: it can't be written."""
+    try:
+        replace(path, parts, synced=synced)
+    except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(path)) from error
 
 

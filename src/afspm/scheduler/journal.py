@@ -16,6 +16,7 @@ from pathlib import Path
 from afspm.clock import Clock
 from afspm.model import Packet
 from afspm.record.ahead import FOLDER_SUFFIX, RECORDED_FILE, Ahead, written_ahead
+from afspm.record.whole import replace
 
 _PERIOD_S = 0.05
 _TIDY_S = 2.0  # where all is written, and only what is no longer cached is still to be deleted
@@ -51,7 +52,6 @@ class Journal:
         self._closing = False
         self._failing = False
         self._complain_at_s = 0.0
-        self._has_folder = False
         self._thread: threading.Thread | None = None
 
     def load(self) -> list[Entry]:
@@ -108,9 +108,6 @@ class Journal:
             return
         self._is_due_in(_TIDY_S)  # for what it takes the place of
         try:
-            if not self._has_folder:
-                self._folder.mkdir(parents=True, exist_ok=True)
-                self._has_folder = True
             _store(self._folder / _name(packet.time_ns), packet, None)
             self._written.add(packet.time_ns)
         except OSError as error:
@@ -166,7 +163,6 @@ class Journal:
         folder = self._folder
         if folder is None:
             return
-        folder.mkdir(parents=True, exist_ok=True)
         times = {packet.time_ns for packet, _ in wanted if packet.time_ns is not None}
         newest_ns = max(times, default=0)
         for packet, source_ns in wanted:
@@ -191,11 +187,7 @@ def _store(file: Path, packet: Packet, source_ns: int | None) -> None:
         "source_ns": source_ns,
         "bytes": len(packet.payload),
     }
-    aside = file.with_suffix(".new")
-    with aside.open("wb") as stream:
-        stream.write(json.dumps(about).encode() + b"\n")
-        stream.write(packet.payload)
-    aside.replace(file)
+    replace(file, [json.dumps(about).encode() + b"\n", packet.payload], synced=False)
 
 
 def _read(file: Path) -> Entry | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from afspm.errors import FileError
+from afspm.record.whole import replace
 from afspm.runtime.connect import LATEST_FILE, RUN_FILE
 
 EXPERIMENT_FILE = "experiment.toml"
@@ -92,9 +92,4 @@ def _new_folder(runs: Path, stamp: str) -> Path:
 
 def _replace(file: Path, text: str) -> None:
     """Write so that a reader sees the old or the new text, never half of it; after a power cut, too."""
-    new = file.with_name(f".{file.name}.{os.getpid()}")
-    with new.open("w", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    new.replace(file)
+    replace(file, [text.encode()])

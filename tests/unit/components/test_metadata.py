@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from runtime_lab import REGION, Lab, Nothing, context_of, run
 
-from afspm.components.metadata import COLUMNS, Metadata, iso_utc
+from afspm.clock import iso_utc
+from afspm.components.metadata import COLUMNS, Metadata
 from afspm.components.records import LineFile
 from afspm.logic import arbitration as a
 from afspm.model import ControlMode, Problem, ScopeState, Spectrum

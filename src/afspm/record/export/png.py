@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from afspm.clock import iso_utc
 from afspm.model import Scan, Spectrum
 from afspm.record.export.exporting import plain, stem
-from afspm.record.nexus import iso
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
@@ -24,7 +24,7 @@ _DPI = 150
 
 def write(run: Run, row: ScanRow | SpectrumRow, folder: Path) -> Iterator[Path]:
     """A picture for each channel of a scan, or for a spectrum. Needs matplotlib."""
-    time = f"{iso(row.time_ns)[:19].replace('T', ' ')} UTC"
+    time = f"{iso_utc(row.time_ns)[:19].replace('T', ' ')} UTC"
     if isinstance(row, ScanRow):
         for channel, scan in run.scan(row).items():
             title = _title(run, f"{channel}, {time}", row.interrupted)

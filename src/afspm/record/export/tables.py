@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from afspm.clock import iso_utc
 from afspm.record.export.exporting import stem
 from afspm.record.measured import write_synced
-from afspm.record.nexus import iso
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow, Table
 
@@ -49,7 +49,7 @@ def _named(column: str) -> str:
 def _told(column: str, values: list[Any]) -> list[Any]:
     """Times as ISO 8601 in UTC, what is not known as nothing."""
     if column.endswith("_ns"):
-        return ["" if value is None else iso(value) for value in values]
+        return ["" if value is None else iso_utc(value) for value in values]
     return ["" if value is None else value for value in values]
 
 

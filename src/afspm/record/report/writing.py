@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from pathlib import Path
 
 from afspm.errors import FileError
 from afspm.record.report import page, pictures, story
 from afspm.record.run import open_run
+from afspm.record.whole import replace
 
 REPORT_FILE = "report.html"
 
@@ -28,13 +27,9 @@ def write(folder: str | Path) -> Path:
         told = story.read(run)
         shown = pictures.smalls(run, told.scans)
         target = run.folder / REPORT_FILE
-        aside = target.with_name(f".{target.name}.{os.getpid()}")
         try:
             pictures.draw(run, told, shown)
-            aside.write_text(page.html(told, shown, pictures.figures(run.folder)), encoding="utf-8")
-            aside.replace(target)
+            replace(target, [page.html(told, shown, pictures.figures(run.folder)).encode()], synced=False)
         except OSError as error:
-            with suppress(OSError):
-                aside.unlink(missing_ok=True)
             raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
     return target

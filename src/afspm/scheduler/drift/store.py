@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from afspm.errors import FileError
+from afspm.record.whole import write_whole
 
 _JSON = "json"
 _ARRAY = "array"
@@ -34,14 +36,9 @@ class Store:
             return
         arrays: dict[str, np.ndarray[Any, Any]] = {}
         text = json.dumps(_without_arrays(state, arrays))
-        aside = self.path.with_suffix(".new")
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with aside.open("wb") as file:
-                np.savez(file, **{_JSON: np.frombuffer(text.encode(), np.uint8)}, **arrays)  # type: ignore[arg-type]
-            aside.replace(self.path)
-        except OSError as error:
-            raise FileError(f"can't be written: {error}", where=str(self.path)) from error
+        file = io.BytesIO()
+        np.savez(file, **{_JSON: np.frombuffer(text.encode(), np.uint8)}, **arrays)  # type: ignore[arg-type]
+        write_whole(self.path, [file.getbuffer()], synced=False)
 
     def load(self) -> dict[str, Any] | None:
         """What was saved last; None if nothing was.
