@@ -7,6 +7,7 @@ request timeouts and whatever else is about processes stays in real time: `monot
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
@@ -77,7 +78,10 @@ class ExperimentClock:
         return cls(origin_s, origin_s if start_s is None else start_s, speed)
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> ExperimentClock:
+    def from_dict(cls, values: Mapping[str, Any]) -> ExperimentClock:
+        """The clock that `as_dict` told of; of nothing, the one on the wall."""
+        if not values:
+            return cls.real()
         return cls(float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
 
     def as_dict(self) -> dict[str, float]:

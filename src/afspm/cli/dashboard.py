@@ -71,8 +71,8 @@ def _print_password() -> None:
 def _running_here(where: Path) -> Path | None:
     """The folder of the run that is meant; None: the file is of one that was started elsewhere."""
     from afspm.errors import FileError
+    from afspm.record.facts import read_facts
     from afspm.runtime.connect import ENDED, find_run
-    from afspm.runtime.following import facts_of
 
     try:
         folder = find_run(where)
@@ -80,7 +80,7 @@ def _running_here(where: Path) -> Path | None:
         if where.suffix == ".toml" and where.is_file():
             return None
         raise
-    if not facts_of(folder).get(ENDED):
+    if not read_facts(folder).get(ENDED):
         return folder
     if where.suffix == ".toml":
         return None
@@ -95,10 +95,10 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     from afspm.dashboard import Dashboard
     from afspm.dashboard.joining import join, url_in
     from afspm.experiment.known import DASHBOARD
+    from afspm.record.facts import read_facts
     from afspm.runtime.exit_codes import ExitCode
-    from afspm.runtime.following import facts_of
 
-    url = url_in(facts_of(folder).get("processes"), folder, DASHBOARD)
+    url = url_in(read_facts(folder).get("processes"), folder, DASHBOARD)
     if url is not None:
         typer.echo(f"this run has a dashboard already: {url}")
         return 0

@@ -72,11 +72,11 @@ def acting(where: Path) -> Iterator[Scope]:
 def about(follower: Follower, *, fancy: bool = True) -> About:
     """What is known of the run besides what it publishes."""
     from afspm.cli.telling import About
-    from afspm.runtime.following import facts_of
+    from afspm.record.facts import read_facts
 
     clock = follower.launch.clock
     return About(
-        name=str(facts_of(follower.folder).get("name", follower.folder.name)),
+        name=str(read_facts(follower.folder).get("name", follower.folder.name)),
         folder=str(follower.folder),
         simulated=follower.launch.simulated,
         began_ns=round(float(clock["start_s"]) * 1e9) if clock else None,
@@ -103,15 +103,15 @@ def say_nothing_runs(why: str) -> None:
 def _running(where: Path) -> Path:
     """The folder of the run that is meant, as far as it is not known to have ended."""
     from afspm.errors import FileError
+    from afspm.record.facts import read_facts
     from afspm.runtime.connect import ENDED, find_run
-    from afspm.runtime.following import facts_of
 
     try:
         folder = find_run(where)
     except FileError as error:
         say_nothing_runs(str(error))
         raise  # not reached
-    ended = facts_of(folder).get(ENDED)
+    ended = read_facts(folder).get(ENDED)
     if ended:
         say_nothing_runs(f"{folder.resolve().name} has ended ({ended})")
     return folder
@@ -120,15 +120,15 @@ def _running(where: Path) -> Path:
 @contextmanager
 def _only_if_running(folder: Path) -> Iterator[None]:
     from afspm.errors import ExperimentEnded, NoResponse
+    from afspm.record.facts import read_facts
     from afspm.record.run import REPLAY_OF
-    from afspm.runtime.following import facts_of
 
     try:
         yield
     except ExperimentEnded as error:
         say_nothing_runs(str(error))
     except NoResponse:
-        said, facts = f"nobody answers in {folder.resolve().name}", facts_of(folder)
+        said, facts = f"nobody answers in {folder.resolve().name}", read_facts(folder)
         if (facts.get("guest") or {}).get("keys"):
             said += f"; if it runs, its scheduler lacks the public key of {TERMINAL}"
         if REPLAY_OF not in facts:

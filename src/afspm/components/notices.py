@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from afspm.errors import AfspmError, ConfigError
-from afspm.runtime.connect import RUN_FILE
 
 END: Final = "end"
 UNSOLVED: Final = "unsolved-problem"
@@ -114,15 +113,6 @@ def address(webhook: str, environment: Mapping[str, str] = os.environ) -> str:
     if not valid:
         raise ConfigError("it is not an address", where=where, hint='as in "https://chat.example.org/hooks/night"')
     return webhook
-
-
-def facts_of(run_dir: Path) -> tuple[str, str]:
-    """(name of the experiment, its folder) of a run, as far as run.json says."""
-    try:
-        name = json.loads((run_dir / RUN_FILE).read_text(encoding="utf-8"))["name"]
-    except (OSError, ValueError, KeyError, TypeError):
-        name = run_dir.name
-    return str(name), str(run_dir)
 
 
 def _run(command: Sequence[str], notice: Notice, folder: str) -> None:

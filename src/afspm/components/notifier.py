@@ -18,6 +18,7 @@ from afspm.components.notices import (
 )
 from afspm.errors import ConfigError
 from afspm.model import ControlState, ProcessCondition, ProcessStates
+from afspm.record.facts import name_in
 from afspm.runtime.component import Component
 from afspm.units import Duration
 
@@ -102,8 +103,8 @@ class Notifier(Component):
         if what not in self.on or key in self.memory["told"]:
             return
         self.log.warning("%s", text)
-        name, run = notices.facts_of(Path(self.run_dir))
-        notice = Notice(what, name, run, self.clock.now_ns(), text, self.simulated)
+        run = Path(self.run_dir)
+        notice = Notice(what, name_in(run, run.name), str(run), self.clock.now_ns(), text, self.simulated)
         new = [{"notice": dict(vars(notice)), "way": way, "tries": 0} for way in self.targets.ways]
         self.memory["waiting"] = [*self.memory["waiting"], *new][-MOST_WAITING:]
         self.memory["told"] = [*self.memory["told"], key]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import tomllib
@@ -10,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from afspm.model import Frame
+from afspm.record.facts import EXPERIMENT_FILE, name_in
 from afspm.runtime.component import Component
-from afspm.runtime.connect import RUN_FILE
 from afspm.runtime.exit_codes import ExitCode
 from afspm.transport.port import CaughtUp, Killed, PacketReceived, ParentGone
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from afspm.record.store import About
     from afspm.runtime.process import Context
 
-EXPERIMENT_FILE = "experiment.toml"
 REST_S = 0.5
 """Real: for what is said of the end after it."""
 
@@ -91,22 +89,13 @@ def _about(context: Context, run_dir: Path, *, scans: bool) -> About:
     launch = context.launch
     frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
     facts: dict[str, Any] = {
-        "experiment": _name(run_dir / RUN_FILE),
+        "experiment": name_in(run_dir),
         "run": run_dir.resolve().name,
         "simulated": launch.simulated,
         "seeds": _seeds(run_dir / EXPERIMENT_FILE),
         "frame": frame.value,
     }
     return About(facts, context.problems, frame, measured=scans)
-
-
-def _name(file: Path) -> str:
-    """Of the experiment, as the facts of the run have it; empty if it is not known."""
-    try:
-        facts = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return ""
-    return str(facts.get("name", "")) if isinstance(facts, dict) else ""
 
 
 def _seeds(file: Path) -> dict[str, Any]:

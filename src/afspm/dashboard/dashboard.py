@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,8 @@ from afspm.dashboard.allowed import allowed_region
 from afspm.dashboard.record import Archive
 from afspm.dashboard.server import USUAL_PORT, PageServer, listening
 from afspm.dashboard.watch import Watch
-from afspm.errors import ConfigError, FileError
+from afspm.errors import ConfigError
+from afspm.record.facts import name_in
 from afspm.runtime.component import Component
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Dashboard(Component):
             self._steering,
             access,
             Archive(folder),
-            title=_title(self.run_dir),
+            title=name_in(self.run_dir, "afspm"),
             limits=allowed_region(self.run_dir),
             simulated=self.simulated,
             host=self._host,
@@ -115,12 +115,3 @@ class Dashboard(Component):
             self.log.warning(
                 "the dashboard is not encrypted, and others can reach it: set certificate and certificate_key"
             )
-
-
-def _title(run_dir: Path) -> str:
-    """The name of the experiment."""
-    try:
-        name = json.loads((run_dir / "run.json").read_text(encoding="utf-8")).get("name")
-    except (OSError, ValueError, FileError, AttributeError):
-        name = None
-    return str(name) if name else "afspm"

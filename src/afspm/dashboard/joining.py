@@ -33,7 +33,7 @@ def join(folder: Path, dashboard: Dashboard, name: str) -> int:
     launch = guest_of(folder, name)
     register_all(launch.messages)
     launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / "state"))
-    clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
+    clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
     context = Context(
         launch,

@@ -26,13 +26,13 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record import journal
+from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, known_facts
 from afspm.record.packets import packets, without_reading_files
 from afspm.record.tables import ControlRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
     from afspm.record.overview import DriftPoint, Overview
 
-RUN_FILE, EXPERIMENT_FILE, LATEST_FILE = "run.json", "experiment.toml", "latest"
 REPLAY_OF = "replay_of"
 """In run.json of a replay: the folder of the run that it publishes again."""
 
@@ -211,7 +211,7 @@ class Run:
     @property
     def facts(self) -> dict[str, Any]:
         """run.json: clock, addresses, how it ended. Empty if it can't be read."""
-        return _facts(self.folder)
+        return known_facts(self.folder)
 
     @property
     def name(self) -> str:
@@ -295,16 +295,8 @@ def _folder(path: Path) -> Path:
     latest = path / LATEST_FILE
     if not (path / journal.JOURNAL_FILE).is_file() and latest.is_file():
         path = path / latest.read_text(encoding="utf-8").strip()
-    replayed = None if (path / journal.JOURNAL_FILE).is_file() else _facts(path).get(REPLAY_OF)
+    replayed = None if (path / journal.JOURNAL_FILE).is_file() else known_facts(path).get(REPLAY_OF)
     return Path(replayed) if isinstance(replayed, str) else path
-
-
-def _facts(folder: Path) -> dict[str, Any]:
-    try:
-        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return facts if isinstance(facts, dict) else {}
 
 
 def _scan_row(row: Any) -> ScanRow:

@@ -13,14 +13,13 @@ from typing import Any
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, ExperimentEnded, FileError, NoResponse
 from afspm.model import Frame, ProblemNames
+from afspm.record.facts import LATEST_FILE, RUN_FILE, read_facts
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
 from afspm.runtime.messages import register_all
 from afspm.runtime.scope import Scope
 from afspm.transport.launching import open_port
 
-RUN_FILE = "run.json"
-LATEST_FILE = "latest"
 GUEST = "guest"
 ENDED = "ended"
 """What run.json says once a run is over: how it ended, in words."""
@@ -47,7 +46,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     folder = find_run(Path(where))
     launch = guest_of(folder, name)
     register_all(launch.messages)
-    clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
+    clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
     link = Link(
         port,
@@ -144,10 +143,4 @@ def _name_in(file: Path) -> str | None:
 
 
 def _facts(folder: Path) -> dict[str, Any] | None:
-    try:
-        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise FileError(f"can't be read: {error}", where=str(folder / RUN_FILE)) from error
-    return facts if isinstance(facts, dict) else None
+    return read_facts(folder) if (folder / RUN_FILE).exists() else None

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from afspm import wire
 from afspm.clock import Clock, ExperimentClock
-from afspm.errors import ConfigError, ExperimentEnded, NoResponse, WireError
+from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import Packet, ProblemNames
 from afspm.record.overview import Overview
-from afspm.runtime.connect import RUN_FILE, guest_of
+from afspm.runtime.connect import guest_of
 from afspm.runtime.launch import Launch
 from afspm.runtime.link import Link
 from afspm.runtime.messages import register_all
@@ -54,7 +51,7 @@ class Follower:
         sockets = dataclasses.replace(guest.sockets, control=None)
         self.launch: Launch = dataclasses.replace(guest, sockets=sockets, envelopes=envelopes)
         self.folder = folder
-        self.clock: Clock = ExperimentClock.from_dict(dict(guest.clock)) if guest.clock else ExperimentClock.real()
+        self.clock: Clock = ExperimentClock.from_dict(guest.clock)
         self.overview = Overview(ProblemNames(guest.problems))
         self.ended = False
         self.heard_s: float | None = None
@@ -114,16 +111,3 @@ class Follower:
         except WireError:
             return  # of no interest here; those whom it concerns say so
         self.overview.take(message, thing, packet.time_ns, packet.envelope)
-
-
-def facts_of(folder: Path) -> Mapping[str, Any]:
-    """What run.json says of the run in a folder.
-
-    Raises:
-        ConfigError: it can't be read.
-    """
-    try:
-        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"can't be read: {error}", where=str(folder / RUN_FILE)) from error
-    return facts if isinstance(facts, dict) else {}

@@ -65,7 +65,7 @@ def main() -> int:
 
 
 def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
-    clock = ExperimentClock.from_dict(dict(launch.clock)) if launch.clock else ExperimentClock.real()
+    clock = ExperimentClock.from_dict(launch.clock)
     activity = Activity(clock)
     with _beating(launch, activity, logger), _telling(launch, clock):
         with activity.step():  # importing may take its time

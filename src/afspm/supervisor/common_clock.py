@@ -54,7 +54,7 @@ def _clock(response: Response, asked_s: float, answered_s: float, where: str) ->
     try:
         told = json.loads(response.payload)
         now_s = int(told.pop("now_ns")) / NS_PER_S
-        clock = ExperimentClock.from_dict(told) if told else ExperimentClock.real()
+        clock = ExperimentClock.from_dict(told)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise WireError(f"the scheduler's time can't be read: {error!r}", where=where) from error
     real_s = (asked_s + answered_s) / 2

@@ -16,6 +16,7 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment.wiring import is_address
 from afspm.model import Frame, Packet
+from afspm.record.facts import EXPERIMENT_FILE
 from afspm.record.run import REPLAY_OF, Run, open_run
 from afspm.runtime.connect import ENDED, GUEST
 from afspm.runtime.launch import Launch, Sockets
@@ -147,7 +148,7 @@ def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish
         run_dir=str(folder),
         state_dir=str(folder / run_folder.STATE_DIR),
     )
-    source = run.folder / run_folder.EXPERIMENT_FILE
+    source = run.folder / EXPERIMENT_FILE
     if source.is_file():
         run_folder.write_experiment(folder, source.read_text(encoding="utf-8"))
     facts: dict[str, Any] = {

@@ -15,9 +15,10 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load_expanded
 from afspm.record import ahead
+from afspm.record.facts import EXPERIMENT_FILE, read_facts
 from afspm.record.journal import open_to_read
 from afspm.record.run import REPLAY_OF
-from afspm.runtime.connect import RUN_FILE, find_run
+from afspm.runtime.connect import find_run
 from afspm.supervisor import run as running
 from afspm.supervisor import run_folder
 from afspm.supervisor.ending import Why
@@ -50,12 +51,12 @@ def find(where: Path) -> Resumable:
         ConfigError: it has ended.
     """
     folder = find_run(where).resolve()
-    facts = _facts(folder)
+    facts = read_facts(folder)
     if REPLAY_OF in facts:
         raise ConfigError("this is a replay, and not a run", where=str(folder), hint=f"it is of {facts[REPLAY_OF]}")
     if facts.get(HOW) in _OVER:
         raise ConfigError("this run has ended as it should", where=str(folder), hint="`afspm run FILE` begins another")
-    file = folder / run_folder.EXPERIMENT_FILE
+    file = folder / EXPERIMENT_FILE
     if not file.is_file() or not (folder / run_folder.STATE_DIR).is_dir():
         raise FileError("this is not the folder of a run", where=str(folder), hint="it lacks its experiment or state")
     homes = [Path(home) for home in facts.get(HOMES, [])] or [folder]
@@ -75,16 +76,6 @@ def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -
         clock = _clock(experiment, facts, folder)
         names = list(facts.get("processes", ()))
         return running.go(experiment, options, clock, folder, found.name, terminal, names)
-
-
-def _facts(folder: Path) -> dict[str, Any]:
-    try:
-        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FileError(f"can't be read: {error}", where=str(folder / RUN_FILE)) from error
-    if not isinstance(facts, dict):
-        raise FileError("is not what a run leaves", where=str(folder / RUN_FILE))
-    return facts
 
 
 def _clock(experiment: Experiment, facts: dict[str, Any], folder: Path) -> ExperimentClock:

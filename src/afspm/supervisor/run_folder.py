@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import IO, Any
 
 from afspm.errors import FileError
+from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, RUN_FILE
 from afspm.record.whole import replace
-from afspm.runtime.connect import LATEST_FILE, RUN_FILE
 
-EXPERIMENT_FILE = "experiment.toml"
 LOG_FILE = "log.txt"
 STATE_DIR = "state"
 LOCK_FILE = "running"

@@ -1,0 +1,44 @@
+"""run.json: what a run says of itself, to whoever joins it, resumes it or looks at it afterwards."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.errors import FileError
+
+RUN_FILE: Final = "run.json"
+EXPERIMENT_FILE: Final = "experiment.toml"
+"""Beside it: the experiment as it was expanded."""
+LATEST_FILE: Final = "latest"
+"""In the folder of all runs: the name of the newest."""
+
+
+def read_facts(folder: Path) -> dict[str, Any]:
+    """What run.json in the folder of a run says.
+
+    Raises:
+        FileError: it is not there, can't be read, or is something else.
+    """
+    file = folder / RUN_FILE
+    try:
+        facts = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileError(f"can't be read: {error}", where=str(file)) from error
+    if not isinstance(facts, dict):
+        raise FileError("is not what a run leaves", where=str(file))
+    return facts
+
+
+def known_facts(folder: Path) -> dict[str, Any]:
+    """The same; empty where nothing can be read."""
+    try:
+        return read_facts(folder)
+    except FileError:
+        return {}
+
+
+def name_in(folder: Path, otherwise: str = "") -> str:
+    """The name of the experiment that left a folder; `otherwise` if it is not known."""
+    return str(known_facts(folder).get("name") or otherwise)
