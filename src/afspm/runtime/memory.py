@@ -58,7 +58,7 @@ class Memory(MutableMapping[str, Any]):
             if self._generations is not None:
                 self._generations.save(text.encode())
             elif self._path is not None:
-                write_whole(self._path, [text.encode()])
+                write_whole(self._path, [text.encode(), b"\n"])
 
     def __getitem__(self, key: str) -> Any:
         return self._values[key]

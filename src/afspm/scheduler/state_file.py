@@ -1,4 +1,4 @@
-"""What the scheduler must not forget when it is killed: a small JSON file that is replaced as a whole."""
+"""What the scheduler must not forget when it is killed: a small file of JSON lines, of which the last holds."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class StateFile:
         return state
 
     def save(self, state: dict[str, Any]) -> None:
-        """Write it aside and rename: whoever reads finds the old state or the new one.
+        """Write it down; when this returns it outlives a kill.
 
         A disk that is full must not end the experiment: it is said, and the experiment goes on.
         """

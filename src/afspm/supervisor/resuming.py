@@ -18,6 +18,7 @@ from afspm.record import ahead
 from afspm.record.facts import EXPERIMENT_FILE, read_facts
 from afspm.record.journal import open_to_read
 from afspm.record.run import REPLAY_OF
+from afspm.record.whole import load
 from afspm.runtime.connect import find_run
 from afspm.supervisor import run as running
 from afspm.supervisor import run_folder
@@ -95,8 +96,8 @@ def last_seen_ns(folder: Path) -> int:
         seen += [one.packet.time_ns or 0 for one in ahead.written_ahead(written)]
     for file in state.glob("*.json"):
         try:
-            kept = json.loads(file.read_bytes())
-        except (OSError, ValueError):
+            kept, _ = load(file, json.loads)
+        except FileError:
             continue
         translator = kept.get("translator", {}) if isinstance(kept, dict) else {}
         for values in (kept, translator):

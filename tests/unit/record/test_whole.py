@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -42,7 +44,64 @@ def test_what_was_closed_is_there_twice(tmp_path: Path) -> None:
         kept.save(b"%d" % n)
     kept.close()
     kept.close()
-    assert (path.read_bytes(), former(path).read_bytes()) == (b"49", b"49")
+    assert (path.read_bytes().splitlines()[-1], former(path).read_bytes()) == (b"49", b"49\n")
+
+
+def test_a_file_that_has_grown_long_is_begun_anew(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = Generations(path, longest=10)
+    for n in range(10, 50):
+        kept.save(b"%d" % n)
+        assert load(path, number) == (n, "")
+        assert path.stat().st_size <= 10
+    kept.close()
+
+
+def test_where_a_kill_left_a_part_of_a_generation_that_before_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = Generations(path, period_s=100.0)
+    for text in (b"{}", b'{"a": 1}', b'{"a": 2}'):
+        kept.save(text)
+    kept.close()
+    path.write_bytes(path.read_bytes()[:-4])
+    value, damage = load(path, json.loads)
+    assert value == {"a": 1}
+    assert damage
+
+
+def test_a_file_that_is_removed_meanwhile_is_there_again_with_the_next_generation(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = Generations(path)
+    kept.save(b"1")
+    path.unlink()
+    kept.save(b"2")
+    kept.close()
+    assert load(path, number) == (2, "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
+def test_on_a_full_disk_what_was_saved_before_is_still_the_last(tmp_path: Path) -> None:
+    script = """
+import resource, signal, sys
+from pathlib import Path
+from afspm.errors import FileError
+from afspm.record.whole import Generations, load
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+path = Path(sys.argv[1])
+kept = Generations(path)
+saved = failed = 0
+while failed < 3:
+    try:
+        kept.save(b"%d" % (10**20 + saved))
+        saved += 1
+    except FileError:
+        failed += 1
+    assert load(path, int) == (10**20 + saved - 1, "")
+print(saved)
+"""
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "x")], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.stderr) == ("90", "")
 
 
 def test_while_it_is_saved_the_generation_before_is_made_sure_of_by_itself(tmp_path: Path) -> None:

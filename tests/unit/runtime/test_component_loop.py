@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -333,7 +334,7 @@ def test_everything_promised_is_there_at_the_start(tmp_path: Path) -> None:
     assert looks.found["name"] == "looks"
     assert looks.found["run_dir"] == Path("/runs/x")
     assert looks.found["clock"].now_s() == EPOCH_S
-    assert (tmp_path / "looks.json").read_text() == '{"n": 1}'
+    assert json.loads((tmp_path / "looks.json").read_text()) == {"n": 1}
 
 
 PROMISED = {"scope", "clock", "log", "name", "memory", "run_dir"}
