@@ -28,6 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from afspm.clock import ExperimentClock
+from afspm.runtime.memory import Memory
 
 SAMPLE = Path(__file__).parents[1] / "experiments" / "tip_repair" / "experiment.toml"
 OVER = """
@@ -227,7 +228,7 @@ def found_wrong(folder: Path) -> Iterator[str]:
     if saved != listed:
         yield f"saved and not in the table: {dict(saved - listed)}; the other way round: {dict(listed - saved)}"
     yield from _wrong_with_series(folder, [row for row in rows if row["channel"] == "Height"])
-    control = json.loads((folder / "state" / "scheduler.json").read_text(encoding="utf-8"))["control"]
+    control = Memory(folder / "state" / "scheduler.json")["control"]
     if control.get("problems") or control.get("flags"):
         yield f"problems are left: {control}"
     if not (folder / "night.png").is_file():
@@ -236,7 +237,7 @@ def found_wrong(folder: Path) -> Iterator[str]:
 
 
 def _wrong_with_series(folder: Path, heights: list[dict[str, str]]) -> Iterator[str]:
-    state = json.loads((folder / "state" / "series.json").read_text(encoding="utf-8"))
+    state = Memory(folder / "state" / "series.json")
     if state.get("done") != SCANS:
         yield f"the series has {state.get('done')} of {SCANS} scans"
     surely = sum(row["in_control"] == "series" for row in heights)

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from afspm.errors import ConfigError
+from afspm.runtime.memory import Memory
 from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators import Options, Outcome, Report, bench, run
 from afspm.testing.translators.registry import all_checks
@@ -71,8 +72,7 @@ def file(tmp_path: Path) -> Path:
 
 def values(report: Report) -> dict[str, Any]:
     """What is in force at the simulated controller, as it keeps it."""
-    kept = json.loads((Path(report.folder) / "state" / "microscope.json").read_text(encoding="utf-8"))
-    found: dict[str, Any] = kept["microscope"]["values"]
+    found: dict[str, Any] = Memory(Path(report.folder) / "state" / "microscope.json")["microscope"]["values"]
     return found
 
 
@@ -206,7 +206,7 @@ def test_ctrl_c_in_the_middle_of_a_scan_puts_everything_back(file: Path) -> None
     written = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert written["unrestored"] == []
     assert written["passed"] is False
-    kept = json.loads((folder / "state" / "microscope.json").read_text(encoding="utf-8"))["microscope"]
+    kept = Memory(folder / "state" / "microscope.json")["microscope"]
     assert kept["values"]["scan-size-x"] == pytest.approx(1000.0)
     assert kept["doing"] is None
 
