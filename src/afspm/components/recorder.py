@@ -12,6 +12,7 @@ from afspm.model import Frame
 from afspm.record.facts import EXPERIMENT_FILE, name_in
 from afspm.runtime.component import Component
 from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.priority import step_back
 from afspm.transport.port import CaughtUp, Killed, PacketReceived, ParentGone
 
 if TYPE_CHECKING:
@@ -25,9 +26,10 @@ REST_S = 0.5
 class Recorder(Component):
     """Writes `journal.sqlite`, and every scan and spectrum as an HDF5 file, into the folder of the run.
 
-    It only listens. Whatever is killed, also everything at once, nothing that was published is missing in the record
-    of a run that is resumed, and nothing is there twice. A disk that is full is told; the experiment goes on, and what
-    was missed is recorded once there is room, as far as it is still kept then.
+    It only listens, and lets all others have the processor first. Whatever is killed, also everything at once, nothing
+    that was published is missing in the record of a run that is resumed, and nothing is there twice. A disk that is
+    full is told; the experiment goes on, and what was missed is recorded once there is room, as far as it is still
+    kept then.
 
     Args:
         scans: whether scans and spectra are kept; else only the journal is.
@@ -43,6 +45,7 @@ class Recorder(Component):
     def run_process(self, context: Context) -> int:
         from afspm.components.recording import Writer
 
+        step_back()
         launch = context.launch
         run_dir = Path(launch.run_dir or ".")
         context.activity.longest_step_s = self.longest_step_s

@@ -75,7 +75,7 @@ def test_another_life_goes_on_in_another_file(noting: Noting, folder: Path, reco
     assert [written.packet.time_ns for written in written_ahead(folder)] == [1, 2]
 
 
-def test_what_is_recorded_is_deleted_a_file_at_a_time(
+def test_what_is_recorded_is_given_up_a_file_at_a_time(
     noting: Noting, folder: Path, recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ahead, "SEGMENT_BYTES", 100)
@@ -90,6 +90,57 @@ def test_what_is_recorded_is_deleted_a_file_at_a_time(
     assert times[-7:] == [6, 7, 8, 9, 10, 11, 12]
     assert times[0] is not None
     assert times[0] > 2, times
+
+
+def test_files_of_which_all_is_recorded_are_written_over(
+    noting: Noting, folder: Path, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ahead, "SEGMENT_BYTES", 300)
+    noted = noting()
+    for time_ns in range(1, 60):
+        noted.note(packet(time_ns, 40), None, cached=True)
+        if time_ns > 4:
+            say_recorded(recorded, time_ns - 4)
+    assert len(list(folder.iterdir())) <= 4
+    times = [written.packet.time_ns or 0 for written in written_ahead(folder)]
+    assert times == list(range(times[0], 60)), "what was in the files before is not found again"
+    assert times[0] <= 56
+
+
+def test_another_life_does_not_take_what_was_written_over_for_new(
+    noting: Noting, folder: Path, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ahead, "SEGMENT_BYTES", 300)
+    noted = noting()
+    for time_ns in range(1, 13):
+        noted.note(packet(time_ns, 40), None, cached=True)
+        say_recorded(recorded, time_ns)
+    noted.close(ended=False)
+    other = noting()
+    for time_ns in range(13, 17):
+        other.note(packet(time_ns, 30), None, cached=True)
+    assert [written.packet.time_ns for written in written_ahead(folder, 12)] == [13, 14, 15, 16]
+    assert not [
+        w
+        for w in written_ahead(folder)
+        if w.packet.payload != packet(w.packet.time_ns or 0, len(w.packet.payload)).payload
+    ]
+
+
+@pytest.mark.parametrize("size", [40, 100_000], ids=("small", "large"))
+def test_what_a_power_cut_left_half_new_and_half_old_was_not_kept(
+    noting: Noting, folder: Path, recorded: Path, size: int
+) -> None:
+    noted = noting()
+    for time_ns in (1, 2):
+        noted.note(packet(time_ns, size), None, cached=True)
+    (segment,) = folder.iterdir()
+    whole = segment.read_bytes()
+    for at in range(len(whole) // 2, len(whole), max(1, size // 50)):
+        segment.write_bytes(whole[:at] + bytes([whole[at] ^ 0x10]) + whole[at + 1 :])
+        assert [written.packet.time_ns for written in written_ahead(folder)] == [1], at
+    segment.write_bytes(whole)
+    assert [written.packet.time_ns for written in written_ahead(folder)] == [1, 2]
 
 
 def test_no_more_than_a_bound_waits_and_it_is_said(
