@@ -21,11 +21,16 @@ PORTS = FreePorts()
 
 
 class Roles(ExitStack):
-    """Starts processes, and ends them when the block is left."""
+    """Starts processes, and ends them when the block is left.
+
+    Attributes:
+        run_folder: of the scheduler that was started last; if it is recorded, its record is there.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.processes: list[subprocess.Popen[Any]] = []
+        self.run_folder = Path()
 
     def start(self, role: str, **arguments: Any) -> str:
         """A process of `benchmarks.roles`; returns the line that it prints when it is ready."""
@@ -46,6 +51,7 @@ class Roles(ExitStack):
             recorded: there is a recorder, too, as in every experiment.
         """
         folder = self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
+        self.run_folder = Path(folder)
         publish, serve = PORTS.address(), PORTS.address()
         if recorded:
             expect_record(Path(folder))
