@@ -9,11 +9,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import Enum
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from afspm.errors import InvalidValue
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
 
 XY = tuple[float, float]
 
@@ -79,33 +83,35 @@ class Region:
 
     def corners_m(self) -> NDArray[np.float64]:
         """The four corners as turned, shape (4, 2), counter-clockwise from that of smallest x and y."""
+        import numpy as np
+
         half = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * np.asarray(self.size_m)
-        corners: NDArray[np.float64] = self._turn(half) + np.asarray(self.center_m)
-        return corners
+        return np.stack(self._in_space(half[:, 0], half[:, 1]), axis=-1)
 
     def contains(self, xy_m: XY) -> bool:
         """Whether a point, in the same frame, lies inside or on the border."""
-        offset = np.subtract(xy_m, self.center_m)
-        u, v = replace(self, angle_rad=-self.angle_rad)._turn(offset[None, :])[0]
-        return bool(abs(u) <= self.size_m[0] / 2 and abs(v) <= self.size_m[1] / 2)
+        x, y = xy_m[0] - self.center_m[0], xy_m[1] - self.center_m[1]
+        cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        return bool(abs(cos * x + sin * y) <= self.size_m[0] / 2 and abs(cos * y - sin * x) <= self.size_m[1] / 2)
 
     def pixels_m(self, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """x and y of every pixel of an array of `shape` (ny, nx), each an array of that shape, in m."""
+        import numpy as np
+
         ny, nx = shape
         u = np.linspace(-0.5, 0.5, nx) if nx > 1 else np.zeros(1)
         v = np.linspace(-0.5, 0.5, ny) if ny > 1 else np.zeros(1)
-        offsets = np.stack(np.meshgrid(u * self.size_m[0], v * self.size_m[1]), axis=-1)
-        turned = self._turn(offsets)
-        return turned[..., 0] + self.center_m[0], turned[..., 1] + self.center_m[1]
+        u_m, v_m = np.meshgrid(u * self.size_m[0], v * self.size_m[1])
+        return self._in_space(u_m, v_m)
 
     def moved_to(self, center_m: XY) -> Region:
         """The same size and angle about another centre."""
         return replace(self, center_m=center_m)
 
-    def _turn(self, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _in_space(self, u_m: Floats, v_m: Floats) -> tuple[Floats, Floats]:
+        """x and y of places that lie so far from the centre along the sides."""
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
-        turned: NDArray[np.float64] = offsets @ np.array([[cos, sin], [-sin, cos]])
-        return turned
+        return cos * u_m - sin * v_m + self.center_m[0], sin * u_m + cos * v_m + self.center_m[1]
 
 
 @dataclass(frozen=True)

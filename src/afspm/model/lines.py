@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from afspm.errors import InvalidValue
 from afspm.model.geometry import Region
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,8 @@ class ScanLines:
         Args:
             picture: [y, x] with the lines before, which is changed; None: these are the first.
         """
+        import numpy as np
+
         picture = np.full(self.shape, np.nan) if picture is None else picture
         picture[self.first_row : self.first_row + len(self.values)] = self.values
         return picture

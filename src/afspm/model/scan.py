@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from afspm.errors import InvalidValue
 from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:
+    import numpy as np
     import xarray
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -141,6 +140,7 @@ class Scan:
 
         The coordinates x and y are those of the unrotated rectangle; `angle_rad` is in the attributes.
         """
+        import numpy as np
         import xarray
 
         (left, low), (width, height) = self.region.top_left_m, self.region.size_m

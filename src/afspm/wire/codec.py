@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from google.protobuf.message import Message
 
 from afspm import model
@@ -99,7 +98,7 @@ def _decode_scan(payload: Buffer) -> model.Scan:
         region,
         message.channel,
         message.params.data.units,
-        values.reshape(shape.y, shape.x) if values.size else np.empty((0, 0)),
+        values.reshape(shape.y, shape.x) if values.size else values.reshape(0, 0),
         convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
         message.filename,
     )

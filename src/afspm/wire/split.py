@@ -6,10 +6,13 @@ as it is, and the rest of the message, small, to the Protocol Buffers library.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from afspm.errors import WireError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 Chunks = list[memoryview]
 
@@ -65,6 +68,8 @@ def doubles(chunks: list[memoryview]) -> NDArray[np.float64]:
     Raises:
         WireError: the length is no multiple of eight bytes.
     """
+    import numpy as np
+
     if not chunks:
         return np.empty(0)
     data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
@@ -75,6 +80,8 @@ def doubles(chunks: list[memoryview]) -> NDArray[np.float64]:
 
 def packed(values: NDArray[np.float64], field: int) -> tuple[bytes, memoryview]:
     """An array as the field number `field`: its tag and length, and its values as bytes (a view where possible)."""
+    import numpy as np
+
     data = np.ascontiguousarray(values, "<f8").reshape(-1).data.cast("B")
     return bytes([field << 3 | _LENGTH]) + as_varint(len(data)), data
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from afspm.wire.codec import Buffer
 from afspm.wire.generated.scan_pb2 import Scan2d
 from afspm.wire.messages import parse
 from afspm.wire.split import nested, packed, split
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _VALUES = {"Scan2d": 4, "ScanLines": 4}
 _DATA_OF_SPECTRUM, _VALUES_OF_DATA = 4, 5
