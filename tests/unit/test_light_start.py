@@ -1,0 +1,28 @@
+"""Whoever passes scans on without looking into them starts without numpy, which is half of the time to start."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "afspm.scheduler",
+        "afspm.supervisor.run",
+        "afspm.supervisor.reporter",
+        "afspm.runtime.host",
+        "afspm.runtime.connect",
+        "afspm.components.planned_scans",
+        "afspm.components.metadata",
+        "afspm.components.notifier",
+        "afspm.cli.app",
+        "afspm.cli.status",
+    ],
+)
+def test_numpy_is_loaded_by_those_who_reckon_with_values(module: str) -> None:
+    script = f"import sys, {module}; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
