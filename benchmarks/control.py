@@ -40,6 +40,14 @@ class Client:
         """The median of many."""
         return _median_us(self.act)
 
+    def round_trips_us(self, seconds: float) -> list[float]:
+        """One after the other for so long."""
+        began, took = perf_counter(), []
+        while (now := perf_counter()) < began + seconds:
+            self.act()
+            took.append((perf_counter() - now) * 1e6)
+        return took
+
     def _ask(self, kind: int, subject: Any) -> None:
         self._asked += 1
         identity = f"Client/benchmark/{self._asked}"

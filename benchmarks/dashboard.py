@@ -7,17 +7,24 @@ import shutil
 import statistics
 import subprocess
 import sys
+import threading
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+from urllib.error import URLError
 
+from benchmarks.control import Client
+from benchmarks.processes import roles
 from benchmarks.rows import Row, measurement
 from benchmarks.stage import Stage, picture
 
 SIDE, TIMES = 512, 12
 VIEWERS, COUNTED_S = 20, 8.0
+ALTERNATIONS, SETTLING_S, MEASURED_S = 7, 1.0, 3.0
+WITHIN_S = 30.0
 MS_PER_NS = 1e-6
 
 
@@ -40,6 +47,38 @@ def dashboard() -> Iterator[Row]:
             share = (cpu_s(stage.process.pid) - busy_s) / (perf_counter() - begin_s)
         yield Row(f"the same while {VIEWERS} look on", "ms", statistics.median(late_ms), None, 150.0)
         yield Row(f"dashboard with {VIEWERS} viewers, a scan a second", "cores", share, None, 0.5)
+
+
+@measurement
+def looked_at() -> Iterator[Row]:
+    """What the experiment notices of many who look on: a scan a second is published, and all of it recorded."""
+    with roles() as processes:
+        publish, serve = processes.scheduler(*processes.start("translator", scan_every_s=1.0).split(), recorded=True)
+        url = processes.dashboard(publish, serve)
+        _wait_for_page(url)
+        client = Client(processes, serve)
+        looked_at, alone = [], []
+        for _ in range(ALTERNATIONS):
+            with viewers(url, VIEWERS):
+                client.round_trips_us(SETTLING_S)
+                looked_at.append(client.round_trips_us(MEASURED_S))
+            client.round_trips_us(SETTLING_S)
+            alone.append(client.round_trips_us(MEASURED_S))
+    name = f"control round trip while {VIEWERS} look at the dashboard"
+    for said, of in (("", statistics.median), (", on average", statistics.fmean)):
+        ours, bare = (statistics.median(of(took) for took in each) for each in (looked_at, alone))
+        yield Row(name + said, "µs", ours, bare, 1.05)
+
+
+def _wait_for_page(url: str) -> None:
+    deadline = perf_counter() + WITHIN_S
+    while perf_counter() < deadline:
+        try:
+            with urllib.request.urlopen(url, timeout=WITHIN_S):
+                return
+        except URLError:
+            threading.Event().wait(0.05)
+    raise TimeoutError("the dashboard does not answer")
 
 
 def latency_ms(page: Any, stage: Stage, seed: int, side: int = SIDE) -> float:

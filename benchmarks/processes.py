@@ -70,6 +70,22 @@ class Roles(ExitStack):
         self._host(launch)
         return publish, serve
 
+    def dashboard(self, publish: str, serve: str) -> str:
+        """The real dashboard of a scheduler; returns the address of its page, where it answers in a moment."""
+        port = int(PORTS.address().rpartition(":")[2])
+        launch = Launch(
+            "dashboard",
+            "afspm.dashboard.dashboard.Dashboard",
+            {"port": port},
+            sockets=Sockets(subscribe=(publish,), control=serve),
+            envelopes=("",),
+            state_dir=self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)),
+            log_level="ERROR",
+            simulated=True,
+        )
+        self._host(launch)
+        return f"http://127.0.0.1:{port}"
+
     def microscope(self, **settings: Any) -> str:
         """The real translator of a simulated microscope; returns the address where it is asked."""
         return self.translator("afspm.microscopes.simulator.Simulator", **settings)[1]

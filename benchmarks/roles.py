@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from afspm.transport.network import Network
 from afspm.transport.port import PacketReceived, RequestReceived
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
+from benchmarks.codec import scan
 
 ANY = "tcp://127.0.0.1:0"
 MARK = "FeedbackAnalysis"
@@ -52,12 +55,17 @@ def bare_rep(back: str) -> None:
         socket.send_multipart([b"\0", b"", b"", request_id])
 
 
-def translator() -> None:
-    """Answers every request with a success, having read it."""
-    port = ZmqServerPort(Network(), ExperimentClock.real(), serve=ANY, publish=ANY)
+def translator(scan_every_s: float | None = None) -> None:
+    """Answers every request with a success, having read it; publishes a scan of 512² now and then."""
+    clock = ExperimentClock.real()
+    port = ZmqServerPort(Network(), clock, serve=ANY, publish=ANY)
     ready(str(port.publish_address), port.serve_address)
+    next_s = math.inf if scan_every_s is None else clock.monotonic_s()
     while True:
-        for received in port.poll(None):
+        if scan_every_s is not None and clock.monotonic_s() >= next_s:
+            next_s += scan_every_s
+            port.publish("Scan2d", wire.encode(replace(scan(512), time_ns=clock.now_ns()))[1])
+        for received in port.poll(None if next_s == math.inf else max(0.0, next_s - clock.monotonic_s())):
             if isinstance(received, RequestReceived):
                 try:
                     response = Response(0, id=wire.decode_request(received.frames).id)

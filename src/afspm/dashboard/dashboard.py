@@ -14,6 +14,7 @@ from afspm.dashboard.watch import Watch
 from afspm.errors import ConfigError
 from afspm.record.facts import name_in
 from afspm.runtime.component import Component
+from afspm.runtime.priority import step_back
 
 if TYPE_CHECKING:
     from afspm.runtime.process import Context
@@ -22,7 +23,8 @@ TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
 
 
 class Dashboard(Component):
-    """Serves one page. It only subscribes, and asks through the scheduler in the names of persons.
+    """Serves one page. It only subscribes, and asks through the scheduler in the names of persons; all others have the
+    processor first.
 
     Args:
         host: the address to listen at. At any other than this computer's own a password or token is needed.
@@ -56,6 +58,7 @@ class Dashboard(Component):
         self._server: PageServer | None = None
 
     def run_process(self, context: Context) -> int:
+        step_back()
         self._context = context
         return super().run_process(context)
 
