@@ -18,8 +18,9 @@ import afspm
 from afspm import wire
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record import journal
+from afspm.record.journal import SCHEDULER
 from afspm.record.measured import write_synced
-from afspm.record.store import SCHEDULER, About, Store
+from afspm.record.store import About, Store
 from benchmarks.codec import scan
 from benchmarks.control import Client
 from benchmarks.processes import roles

@@ -17,8 +17,8 @@ from afspm.clock import Clock
 from afspm.errors import FileError
 from afspm.model import Packet
 from afspm.record import ahead
-from afspm.record.journal import JOURNAL_FILE
-from afspm.record.store import SCHEDULER, About, Store
+from afspm.record.journal import JOURNAL_FILE, SCHEDULER
+from afspm.record.store import About, Store
 
 MOST_BYTES = 256 << 20
 """So much waits to be written at most; beyond it all is dropped, and taken from what others keep once there is room."""

@@ -12,6 +12,8 @@ from afspm.errors import FileError
 
 JOURNAL_FILE = "journal.sqlite"
 FORMAT = "afspm record 1"
+SCHEDULER = ""
+"""The source of what the scheduler publishes; that of others is their address."""
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;

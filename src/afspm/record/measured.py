@@ -17,12 +17,11 @@ from afspm.model import Packet, ProblemNames, Scan, ScopeState
 from afspm.record import circumstances, nexus, whole
 from afspm.record.circumstances import Stood
 from afspm.record.gathering import ScanTaken, SpectrumTaken, Taken
+from afspm.record.journal import SCHEDULER
 from afspm.record.nexus import Circumstances
 from afspm.wire.values import without_values
 
 SCANS, SPECTRA = "scans", "spectra"
-SCHEDULER = ""
-"""The source of what the scheduler publishes; that of others is their address."""
 SUFFIX = ".h5"
 _log = logging.getLogger("afspm.record")
 PART = ".part"

@@ -7,16 +7,17 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from afspm import wire
 from afspm.errors import FileError, WireError
 from afspm.model import Frame, Packet, Scan, Spectrum
-from afspm.record.measured import SCHEDULER
+from afspm.record.journal import SCHEDULER
 from afspm.wire.values import shape_of_scan, with_values
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _AT_ONCE = 500
 _FILES_KEPT = 4
@@ -75,6 +76,8 @@ def _rows(journal: sqlite3.Connection, since_ns: int, messages: Sequence[str] | 
 
 
 def _shaped(scan: Scan, payload: bytes) -> Scan:
+    import numpy as np
+
     return replace(scan, values=np.broadcast_to(np.nan, shape_of_scan(payload)))
 
 

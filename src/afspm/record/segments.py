@@ -5,8 +5,8 @@ told from what is new by the number of the file, which is new each time, and wha
 by a sum.
 
 A packet is: "AFp2", the number of the file, the lengths of envelope and payload, its time, the translator's time of it
-(-1: none), whether it is cached, the sum of all that; envelope; payload. The sum is that of 64-bit words, which takes
-a hundredth of what it takes to send them.
+(-1: none), whether it is cached, the sum of all that; envelope; payload. The sum of a large payload is that of its
+64-bit words, which takes a hundredth of what it takes to send them.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
 
 from afspm.model import Packet
 
@@ -134,6 +132,10 @@ def _head(written: Written, number: int) -> bytes:
 
 
 def _sum(payload: bytes | memoryview) -> int:
+    if len(payload) <= _SMALL:
+        return zlib.crc32(payload)
+    import numpy as np  # not before there are scans: without it a scheduler starts in half the time
+
     words, rest = divmod(len(payload), _WORD)
     end = int.from_bytes(payload[len(payload) - rest :], "little")
-    return int(np.add.reduce(np.frombuffer(payload, "<u8", words), dtype=np.uint64)) + end if words else end
+    return int(np.add.reduce(np.frombuffer(payload, "<u8", words), dtype=np.uint64)) + end

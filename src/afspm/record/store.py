@@ -32,10 +32,9 @@ from afspm.model import (
 )
 from afspm.record import circumstances, journal
 from afspm.record.gathering import Gathering, Taken
-from afspm.record.measured import SCHEDULER, MeasuredFiles, insert_packet
+from afspm.record.journal import SCHEDULER
+from afspm.record.measured import MeasuredFiles, insert_packet
 from afspm.wire.values import without_values
-
-__all__ = ["SCHEDULER", "About", "Store"]
 
 _log = logging.getLogger("afspm.record")
 _ALL_OF_THEM = (OSError, sqlite3.OperationalError)

@@ -7,14 +7,12 @@ from dataclasses import dataclass, fields
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
-import numpy as np
-from numpy.typing import NDArray
-
 from afspm.model import ControlState, Frame, ProcessCondition, Region
 from afspm.model.geometry import XY
 
 if TYPE_CHECKING:
     import xarray
+    from numpy.typing import NDArray
 
 T = TypeVar("T")
 
@@ -135,6 +133,8 @@ class Table(Sequence[T], Generic[T]):
 
     def to_numpy(self) -> NDArray[Any]:
         """A structured array: times as datetime64[ns], numbers that are not known as NaN or -1."""
+        import numpy as np
+
         columns = {name: _array(name, values) for name, values in self.columns().items()}
         made = np.empty(len(self), [(name, values.dtype) for name, values in columns.items()])
         for name, values in columns.items():
@@ -194,6 +194,8 @@ def _parts(value: Any, count: int) -> tuple[Any, ...]:
 
 
 def _array(name: str, values: list[Any]) -> NDArray[Any]:
+    import numpy as np
+
     if name.endswith("_ns"):
         return np.array(["NaT" if value is None else value for value in values], "datetime64[ns]")
     known = [value for value in values if value is not None]

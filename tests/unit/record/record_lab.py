@@ -19,7 +19,8 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
-from afspm.record.store import SCHEDULER, About
+from afspm.record.journal import SCHEDULER
+from afspm.record.store import About
 
 START_NS = 1_773_518_400_000_000_000
 REGION = Region((1e-6, -2e-6), (1e-6, 0.5e-6), 0.25)

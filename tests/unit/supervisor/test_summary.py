@@ -7,7 +7,8 @@ import numpy as np
 
 from afspm import wire
 from afspm.model import Packet, Region, Scan, ScopeState, ScopeStatus, Spectrum
-from afspm.record.store import SCHEDULER, About, Store
+from afspm.record.journal import SCHEDULER
+from afspm.record.store import About, Store
 from afspm.supervisor.ending import Why
 from afspm.supervisor.summary import lines
 from afspm.supervisor.supervisor import Outcome, Report
