@@ -27,6 +27,9 @@ def test_a_killed_dashboard_is_back_at_the_same_address_and_so_is_the_page(
     page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
     page.wait_for_selector("nav.who:has-text('Ada')")  # who has signed in stays so
     page.wait_for_selector("text=is in control")
+    # out of the record: it was not there to see that
+    lane = ".lane:has(b:text-is('dashboard'))"
+    page.wait_for_selector(f"{lane} .process-alive ~ .process-starting ~ .process-alive", state="attached")
 
 
 def test_data_that_are_old_are_said_to_be(night: Night, opened: Opened) -> None:

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any
 from afspm.clock import NS_PER_S
 from afspm.model import JournalEntry, LogLine, ProcessCondition, ProcessState, Region, ScopeState
 from afspm.record.lanes import Span
+from afspm.record.overview import OLD_S, OVER, Overview
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.text import Text
 
-    from afspm.record.overview import Overview
-
 BAR = 24
-OLD_S = 6.0  # a supervisor says how its processes are every 2 s
 WELL = (ProcessCondition.ALIVE, ProcessCondition.BUSY)
 LEVELS = {"WARNING": "yellow", "ERROR": "bold red", "CRITICAL": "bold red"}
 
@@ -191,24 +189,19 @@ def _progress(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
             yield line.append("longer than expected" if left_ns == 0 else _left(left_ns, about))
 
 
-def unheard_of_ns(seen: Overview, name: str, speed: float) -> int | None:
-    """For how long nobody has said how a process is, while others are told of: its computer is gone. None: not so."""
-    silent_ns = seen.newest_ns - seen.processes_told_ns[name]
-    return silent_ns if silent_ns > OLD_S * speed * NS_PER_S else None
-
-
 def _processes(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
     """Those that are well in one line; each of the others in its own."""
     states = seen.processes.values()
-    unheard = {name: ns for name in seen.processes if (ns := unheard_of_ns(seen, name, about.speed)) is not None}
+    running = [state.name for state in states if state.condition not in OVER]
+    unheard = {name: ns for name in running if (ns := seen.unheard_ns(name, about.speed)) is not None}
     well = [state for state in states if state.condition in WELL and state.name not in unheard]
     if well:
         yield _label("processes").append(", ".join(map(_well, well)))
     for state in states:
-        if state.condition in WELL and state.name in unheard:
+        if state.name in unheard:
             line = _label("process").append(f"{state.name} ").append("not heard of", "bold red")
             yield line.append(f" for {lasting(unheard[state.name])}: whoever started it is gone, or can't be reached")
-        if state.condition in WELL:
+        if state.name in unheard or state.condition in WELL:
             continue
         is_bad = state.condition in (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
         condition = state.condition.name.lower().replace("_", " ")
@@ -297,7 +290,7 @@ def _progress_json(done: int, of: int, left_ns: int | None) -> dict[str, Any]:
 
 def _process_json(state: ProcessState, seen: Overview, about: About) -> dict[str, Any]:
     return {
-        "heard_of": unheard_of_ns(seen, state.name, about.speed) is None,
+        "heard_of": seen.unheard_ns(state.name, about.speed) is None,
         "name": state.name,
         "role": state.role,
         "condition": state.condition.name,

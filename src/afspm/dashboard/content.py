@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 from afspm.dashboard.curves import drift_html
 from afspm.dashboard.sample_map import MapContent, map_html
-from afspm.dashboard.time_line import time_line_html
+from afspm.dashboard.time_line import NOT_HEARD_OF, time_line_html
 from afspm.dashboard.watch import OLD_AFTER_S, Watch
 from afspm.dashboard.words import NS_PER_S, clock, colour_class, date_and_clock, duration, escape, position
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
-from afspm.record.overview import Overview
+from afspm.record.overview import OVER, Overview
 
 ANEW_S = 0.4  # at most that often, however much is published
 SLOWLY_S = 2.0  # what takes longer to make
@@ -27,6 +27,7 @@ class Content:
     Attributes:
         trouble: why it should not be trusted; empty: it may be.
         problems: the flagged ones, (number, name, who flagged it).
+        unheard: for how long, in ns, nobody has told of a process while others are told of.
     """
 
     status: str = ""
@@ -39,6 +40,7 @@ class Content:
     channels: tuple[str, ...] = ()
     problems: tuple[tuple[int, str, str], ...] = ()
     processes: tuple[ProcessState, ...] = ()
+    unheard: Mapping[str, int] = field(default_factory=dict)
     log: tuple[LogLine, ...] = ()
     spectra: int = 0
     is_manual: bool = False
@@ -97,6 +99,7 @@ class Contents:
                 channels=watch.frames.channels,
                 problems=_problems(overview),
                 processes=tuple(overview.processes.values()),
+                unheard=unheard(watch, overview),
                 log=tuple(overview.log),
                 spectra=len(overview.spectra),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
@@ -119,12 +122,21 @@ class Contents:
         return _Slow(
             map_html(content),
             map_html(content, whole=False),
-            time_line_html(overview, self._now_ns()),
+            time_line_html(overview, self._now_ns(), unheard(watch, overview)),
             drift_html(overview.drift),
         )
 
     def _now_ns(self) -> int:
         return self._watch.overview.newest_ns if self._watch.ended else self._watch.clock.now_ns()
+
+
+def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
+    """For how long nobody has told of a process, in ns, where others are told of: its computer is gone."""
+    if watch.ended:
+        return {}
+    speed = 1.0 / watch.clock.real_s(1.0)
+    running = [state.name for state in overview.processes.values() if state.condition not in OVER]
+    return {name: ns for name in running if (ns := overview.unheard_ns(name, speed)) is not None}
 
 
 def trouble(watch: Watch) -> str:
@@ -233,11 +245,18 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
     return f'<ul class="log">{rows}</ul>'
 
 
-def process_words(state: ProcessState, now_ns: int) -> tuple[str, str, str]:
-    """(condition, since when or busy for how long, restarts) of a process, in words."""
+def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[str, str, str]:
+    """(condition, since when or busy for how long, restarts) of a process, in words.
+
+    Args:
+        unheard_ns: for how long nobody has told of it, if others are told of.
+    """
     condition = state.condition.name.lower().replace("_", " ")
     since = f"since {clock(state.since_ns)}"
-    if state.step_age_s >= 1.0:
+    if unheard_ns is not None:
+        gone = f"for {duration(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
+        condition, since = NOT_HEARD_OF, gone
+    elif state.step_age_s >= 1.0:
         since = f"on its step for {duration(state.step_age_s)}"
     restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"
     if state.last_exit and state.starts > 1:

@@ -71,14 +71,15 @@ class Dashboard(Component):
         secret = secret_in(state_dir / f"{self.name}.secret" if state_dir else None)
         access = Access(self._host, self._password_hash, ExperimentClock.real().now_s, secret)
         bound = listening(self._host, self._port or None, self._usual_ports())
-        self._watch = Watch(self.clock, self._context.problems)
+        archive = Archive(self.run_dir if launch.run_dir else None)
+        problems = self._context.problems
+        self._watch = Watch(self.clock, problems, archive.past(problems))
         self._steering = Steering(launch, self.clock, self._watch)
-        folder = self.run_dir if launch.run_dir else None
         app, self._farewell = application(
             self._watch,
             self._steering,
             access,
-            Archive(folder),
+            archive,
             title=name_in(self.run_dir, "afspm"),
             limits=allowed_region(self.run_dir),
             simulated=self.simulated,

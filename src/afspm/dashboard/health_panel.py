@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from nicegui import ui
 
 from afspm.dashboard.content import process_words
 from afspm.dashboard.steering_panel import SteeringPanel
+from afspm.dashboard.time_line import NOT_HEARD_OF
 from afspm.model import ProcessCondition, ProcessState
 
 _BAD = {ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP}
@@ -22,15 +23,15 @@ class HealthPanel:
         self._nothing = ui.html("Nothing has been heard of processes yet.", sanitize=False).classes("nothing")
         self._list = ui.element("div").classes("processes").props('role="table" aria-label="Processes"')
 
-    def show(self, processes: Sequence[ProcessState], now_ns: int) -> None:
-        """Bring the rows up to date."""
+    def show(self, processes: Sequence[ProcessState], unheard: Mapping[str, int]) -> None:
+        """Bring the rows up to date; `unheard` as in `Content`."""
         self._nothing.set_visibility(not processes)
         for state in processes:
             row = self._rows.get(state.name)
             if row is None:
                 with self._list:
                     row = self._rows[state.name] = _Row(state.name, self._steering)
-            row.show(state, now_ns)
+            row.show(state, unheard.get(state.name))
 
 
 class _Row:
@@ -46,12 +47,12 @@ class _Row:
         self._steering = steering
         self._style = ""
 
-    def show(self, state: ProcessState, now_ns: int) -> None:
-        condition, since, restarts = process_words(state, now_ns)
+    def show(self, state: ProcessState, unheard_ns: int | None) -> None:
+        condition, since, restarts = process_words(state, unheard_ns)
         self._condition.set_text(condition)
         self._since.set_text(since)
         self._restarts.set_text(restarts)
-        style = "bad" if state.condition in _BAD else condition.replace(" ", "-")
+        style = "bad" if state.condition in _BAD or condition == NOT_HEARD_OF else condition.replace(" ", "-")
         if style != self._style:
             self._dot.classes(remove=f"is-{self._style}", add=f"is-{style}")
             self._style = style

@@ -129,7 +129,7 @@ class Page:
         self._time_line.set_content(content.time_line)
         self._drift.set_content(content.drift)
         self._refusals.set_content(content.refusals)
-        self._health.show(content.processes, self._services.watch.clock.now_ns())
+        self._health.show(content.processes, content.unheard)
         self._log.show(content.log, tuple(process.name for process in content.processes))
         self._steering.show(content)
         self._draw_spectrum()

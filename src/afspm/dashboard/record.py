@@ -1,4 +1,4 @@
-"""Scans that are not in memory any more, out of the record of the run."""
+"""What was before this dashboard was started, and scans that are not in memory any more: out of the run's record."""
 
 from __future__ import annotations
 
@@ -9,10 +9,19 @@ from pathlib import Path
 
 from afspm.dashboard.frames import Frame, Key
 from afspm.errors import AfspmError
-from afspm.model import Scan
+from afspm.model import ProblemNames, Scan
+from afspm.record.journal import JOURNAL_FILE
+from afspm.record.overview import Overview
+from afspm.record.run import open_run
 from afspm.record.tables import ScanRow
 
 KEPT = 6
+PAST = (
+    "ProcessStates", "JournalEntries", "ControlState", "ScopeStateMsg", "ScanParameters2d", "Scan2d", "Spec1d",
+    "DriftMapping",
+)  # fmt: skip
+"""Messages with which an `Overview` has the time line, the map, drift and refusals. Of others the scheduler has kept
+enough for whoever comes late."""
 _SAME_SCAN_NS = 1_000_000_000  # channels of one scan may be stamped one after the other
 
 
@@ -28,6 +37,17 @@ class Archive:
         self._log = logging.getLogger("afspm.dashboard")
         self._lock = threading.Lock()
         self._read: OrderedDict[Key, Frame] = OrderedDict()
+
+    def past(self, problems: ProblemNames) -> Overview | None:
+        """What the run has come to so far, without what was said; None if there is no record of it yet."""
+        if self._folder is None or not (self._folder / JOURNAL_FILE).is_file():  # a replay has only that of another run
+            return None
+        try:
+            with open_run(self._folder) as run:
+                return run.overview(PAST, problems)
+        except (AfspmError, ImportError) as error:
+            self._log.debug("the past can't be read: %s", error)
+            return None
 
     def frame(self, time_ns: int, channel: str) -> Frame | None:
         """A finished channel by its time; None if it is not in the record, or there is none."""
@@ -50,14 +70,12 @@ class Archive:
             return frame
 
     def _find(self, folder: Path, time_ns: int, channel: str) -> Frame | None:
-        from afspm.record.run import open_run
-
-        run = open_run(folder)
-        near = [row for row in run.scans if abs(row.time_ns - time_ns) <= _SAME_SCAN_NS and _has(row, channel)]
-        if not near:
-            return None
-        row = min(near, key=lambda one: abs(one.time_ns - time_ns))
-        return _frame(run.scan(row)[channel], time_ns)
+        with open_run(folder) as run:
+            near = [row for row in run.scans if abs(row.time_ns - time_ns) <= _SAME_SCAN_NS and _has(row, channel)]
+            if not near:
+                return None
+            row = min(near, key=lambda one: abs(one.time_ns - time_ns))
+            return _frame(run.scan(row)[channel], time_ns)
 
 
 def _has(row: ScanRow, channel: str) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from afspm.dashboard.words import NS_PER_S, clock, colour_class, duration, escape
-from afspm.record.overview import Overview, Span
+from afspm.record.overview import Lane, Overview, Span
 
+NOT_HEARD_OF = "not heard of"
 COLUMNS = 720  # stretches narrower than this part of the run are put together
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 
@@ -21,7 +23,7 @@ class Row:
     style: Callable[[str], str]
 
 
-def rows_of(overview: Overview) -> list[Row]:
+def rows_of(overview: Overview, unheard: Mapping[str, int]) -> list[Row]:
     """Control, mode, scope state, each problem, each process."""
     rows = [
         Row("control", overview.controls.spans, colour_class),
@@ -32,13 +34,22 @@ def rows_of(overview: Overview) -> list[Row]:
         if lane.spans:
             rows.append(Row(overview.problems.name(number), lane.spans, lambda label: "problem"))
     for name, lane in overview.process_lanes.items():
-        rows.append(Row(name, lane.spans, lambda label: f"process-{label.replace(' ', '-')}"))
+        spans = _as_last_told(lane, overview.processes_told_ns[name]) if name in unheard else lane.spans
+        rows.append(Row(name, spans, lambda label: f"process-{label.replace(' ', '-')}"))
     return rows
 
 
-def time_line_html(overview: Overview, now_ns: int) -> str:
-    """The rows over the whole run until `now_ns`, experiment time."""
-    rows = [(row, tuple(row.spans)) for row in rows_of(overview)]
+def _as_last_told(lane: Lane, told_ns: int) -> Iterator[Span]:
+    """What was so until it was told of last; since then nobody knows."""
+    for span in lane.spans:
+        yield replace(span, end_ns=max(told_ns, span.start_ns)) if span.end_ns is None else span
+    if lane.now is not None:
+        yield Span(NOT_HEARD_OF, told_ns)
+
+
+def time_line_html(overview: Overview, now_ns: int, unheard: Mapping[str, int] = MappingProxyType({})) -> str:
+    """The rows over the whole run until `now_ns`, experiment time; `unheard` of processes as in `Content`."""
+    rows = [(row, tuple(row.spans)) for row in rows_of(overview, unheard)]
     starts = [spans[0].start_ns for _, spans in rows if spans]
     if not starts:
         return '<p class="nothing">Nothing has been heard yet.</p>'

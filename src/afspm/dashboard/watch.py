@@ -24,12 +24,13 @@ class Watch:
 
     Args:
         clock: of the experiment.
+        past: what was so before; None: nothing is known of that.
     """
 
-    def __init__(self, clock: Clock, problems: ProblemNames | None = None) -> None:
+    def __init__(self, clock: Clock, problems: ProblemNames | None = None, past: Overview | None = None) -> None:
         self.clock = clock
         self.problems = problems or ProblemNames()
-        self.overview = Overview(self.problems)
+        self.overview = past or Overview(self.problems)
         self.frames = FrameStore()
         self.spectra = SpectrumStore()
         self.tip_to_sample: Array | None = None

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from afspm.clock import NS_PER_S
 from afspm.drift.record import drift_at
 from afspm.model import (
     ControlMode,
@@ -44,6 +45,9 @@ MOST_LINES = 2_000
 MOST_ENTRIES = 5_000
 MOST_MEASURED = 100_000
 SOON_NS = 1_000_000_000
+OLD_S = 6.0  # real; a supervisor says how its processes are every 2 s
+OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
+"""Of a process of which nothing more is to be heard."""
 COMPARED = 5  # scans before, by which it is told how long one takes
 NOBODY = None
 
@@ -191,6 +195,15 @@ class Overview:
             return None
         took_ns = [scan.took_ns for scan in reversed(self._done) if scan.resembles(self.running)][:COMPARED]
         return self.running.progress(now_ns, round(median(took_ns)) if took_ns else None)
+
+    def unheard_ns(self, name: str, speed: float) -> int | None:
+        """For how long nobody has said how a process is, while others are told of: its computer is gone. None: not so.
+
+        Args:
+            speed: experiment seconds in a real second.
+        """
+        silent_ns = self.newest_ns - self.processes_told_ns.get(name, self.newest_ns)
+        return silent_ns if silent_ns > OLD_S * speed * NS_PER_S else None
 
     def take(self, message: str, thing: Any, time_ns: int, envelope: str = "") -> None:
         """Take in what was published.

@@ -189,11 +189,16 @@ class Run:
         """
         yield from packets(self._journal, self.folder, since_ns, messages, tell)
 
-    def overview(self, messages: Sequence[str] | None = None) -> Overview:
-        """What it came to, as the dashboard shows it. Files of scans are not read for it."""
+    def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:
+        """What it came to, as the dashboard shows it. Files of scans are not read for it.
+
+        Args:
+            messages: names of those that it is made from; None: all.
+            problems: where they are known better than from the record.
+        """
         from afspm.record.overview import Overview
 
-        overview = Overview(self.problem_names)
+        overview = Overview(problems or self.problem_names)
         for packet, message, thing in without_reading_files(self._journal, self.frame, messages):
             overview.take(message, thing, packet.time_ns or 0, packet.envelope)
         return overview
@@ -236,7 +241,7 @@ class Run:
     @property
     def problem_names(self) -> ProblemNames:
         """The problems of the experiment."""
-        return ProblemNames(self._note("problems") or {})
+        return ProblemNames((self.facts.get("guest") or {}).get("problems") or {})
 
     def close(self) -> None:
         """Read nothing more. Safe to repeat."""

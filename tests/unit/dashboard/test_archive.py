@@ -1,24 +1,36 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.dashboard.record import Archive
 from afspm.dashboard.watch import Watch
 from afspm.model import (
+    ControlMode,
+    ControlState,
     JournalEntries,
     JournalEntry,
     LogLine,
     LogLines,
+    Packet,
+    ProblemNames,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
     Region,
     Scan,
     ScanLines,
     ScopeState,
     ScopeStatus,
 )
+from afspm.record.journal import SCHEDULER
+from afspm.record.run import REPLAY_OF
+from afspm.record.store import About, Store
 
 S = 1_000_000_000
 
@@ -26,6 +38,47 @@ S = 1_000_000_000
 def test_where_nothing_is_recorded_nothing_is_found(tmp_path: Path) -> None:
     assert Archive(None).frame(S, "Height") is None
     assert Archive(tmp_path).frame(S, "Height") is None
+
+
+def test_the_past_is_what_was_recorded(tmp_path: Path) -> None:
+    store = Store(tmp_path, About())
+    region = Region((0.0, 0.0), (1e-6, 1e-6))
+    things: list[tuple[str, object]] = [
+        ("ControlState", ControlState(ControlMode.AUTOMATED, "series")),
+        ("ScopeStateMsg", ScopeStatus(ScopeState.SCANNING)),
+        ("ProcessStates", ProcessStates(3 * S, "here", (ProcessState("series", "c", ProcessCondition.ALIVE, 3 * S),))),
+        ("Scan2d_1000.0_Height", Scan(region, "Height", "m", np.zeros((4, 4)), 4 * S)),
+        ("ScopeStateMsg", ScopeStatus(ScopeState.FREE)),
+        ("ProcessStates", ProcessStates(6 * S, "here", (ProcessState("series", "c", ProcessCondition.ENDED, 6 * S),))),
+    ]
+    store.take((Packet(name, wire.encode(thing)[1], at * S), SCHEDULER) for at, (name, thing) in enumerate(things, 1))
+    past = Archive(tmp_path).past(ProblemNames({"drop-on-the-table": 9}))
+    store.close()
+    assert past is not None
+    assert [(span.label, span.start_ns // S) for span in past.process_lanes["series"].spans] == [
+        ("alive", 3), ("ended", 6),
+    ]  # fmt: skip
+    assert [span.label for span in past.states.spans] == ["scanning", "free"]
+    assert [(scan.channel, scan.holder) for scan in past.scans] == [("Height", "series")]
+    assert past.problems["drop-on-the-table"] == 9
+    watch = Watch(ExperimentClock.real(), past=past)
+    watch.take("ScopeStateMsg", ScopeStatus(ScopeState.FREE), 5 * S)  # which the scheduler has kept
+    watch.take("ControlState", ControlState(ControlMode.AUTOMATED, None), 8 * S)
+    assert [(span.label, span.start_ns // S) for span in watch.overview.states.spans] == [("scanning", 2), ("free", 5)]
+    assert watch.overview.controls.now is None
+
+
+def test_of_a_run_without_a_record_and_of_a_replay_no_past_is_known(tmp_path: Path) -> None:
+    recorded, replay = tmp_path / "recorded", tmp_path / "replay"
+    for folder in (recorded, replay):
+        folder.mkdir()
+    Store(recorded, About()).close()
+    (replay / "run.json").write_text(json.dumps({REPLAY_OF: str(recorded)}))
+    assert Archive(recorded).past(ProblemNames()) is not None
+    assert Archive(replay).past(ProblemNames()) is None
+    assert Archive(None).past(ProblemNames()) is None
+    (recorded / "journal.sqlite").write_bytes(b"no journal at all" * 100)
+    assert Archive(recorded).past(ProblemNames()) is None
 
 
 def test_a_watch_rings_when_something_has_changed_and_tells_how_long_it_is_silent() -> None:

@@ -9,11 +9,13 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from afspm.dashboard.content import log_html, process_words, refusals_html
+from afspm.clock import ExperimentClock
+from afspm.dashboard.content import log_html, process_words, refusals_html, unheard
 from afspm.dashboard.curves import drift_html, spectrum_html
 from afspm.dashboard.plots import Axis, Curve, plot, round_ticks, thinned
 from afspm.dashboard.sample_map import MapContent, map_html, places_of
 from afspm.dashboard.time_line import COLUMNS, stretches, time_line_html
+from afspm.dashboard.watch import Watch
 from afspm.dashboard.words import duration, position, quantity, scale
 from afspm.model import (
     ControlMode,
@@ -23,6 +25,7 @@ from afspm.model import (
     LogLine,
     ProcessCondition,
     ProcessState,
+    ProcessStates,
     Region,
     ScopeState,
     ScopeStatus,
@@ -197,10 +200,45 @@ def test_refusals_come_with_who_what_and_why() -> None:
 
 def test_a_process_is_told_of_in_words() -> None:
     busy = ProcessState("series", "component", ProcessCondition.BUSY, S, 12.4, 3, 7, "killed: frozen")
-    condition, since, restarts = process_words(busy, 100 * S)
+    condition, since, restarts = process_words(busy)
     assert (condition, since, restarts) == ("busy", "on its step for 12 s", "restarted 2 times (last: killed: frozen)")
     fine = ProcessState("series", "component", ProcessCondition.ALIVE, S)
-    assert process_words(fine, 100 * S)[2] == ""
+    assert process_words(fine)[2] == ""
+
+
+ELSEWHERE = 600
+
+
+def gone() -> Overview:
+    """Two computers, one of which is not heard of from 30 s on."""
+    overview = Overview()
+    for time_s in range(1, ELSEWHERE, 2):
+        for name, computer in (("scheduler", "here"), ("series", "there")):
+            if computer == "there" and time_s > 30:
+                continue
+            state = ProcessState(name, "component", ProcessCondition.ALIVE, S)
+            done = ProcessState(f"done_{computer}", "component", ProcessCondition.ENDED, S)
+            told = ProcessStates(time_s * S, computer, (state, done))
+            overview.take("ProcessStates", told, time_s * S, f"ProcessStates_{computer}")
+    return overview
+
+
+def test_processes_of_a_computer_that_is_gone_are_not_told_of_as_alive() -> None:
+    watch = Watch(ExperimentClock.real(), past=gone())
+    silent = unheard(watch, watch.overview)
+    assert silent == {"series": (ELSEWHERE - 1 - 29) * S}, "and what has ended there has ended"
+    state = watch.overview.processes["series"]
+    assert process_words(state, silent["series"])[:2] == (
+        "not heard of", "for 9 min 30 s: whoever started it is gone, or can't be reached",
+    )  # fmt: skip
+    html = time_line_html(watch.overview, ELSEWHERE * S, silent)
+    assert html.count("process-not-heard-of") == 1
+    assert "process-not-heard-of" not in time_line_html(gone(), ELSEWHERE * S)
+
+
+def test_a_simulated_night_passes_faster_and_nobody_is_gone_for_that() -> None:
+    watch = Watch(ExperimentClock.starting_now(speed=600.0), past=gone())
+    assert unheard(watch, watch.overview) == {}
 
 
 # --- curves ---
