@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import tempfile
+import weakref
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -88,7 +90,7 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
         except sqlite3.OperationalError as error:
             if "unable to open" not in str(error) and "readonly" not in str(error):
                 raise
-            return _checked(f"{_copy(path).as_uri()}?mode=ro", path)  # what is beside it can't be made there
+            return _checked_copy(path)  # what is beside it can't be made there
     except sqlite3.DatabaseError as error:
         raise damaged(path, error) from error
 
@@ -106,8 +108,35 @@ def check_format(connection: sqlite3.Connection, path: Path) -> None:
         raise FileError(f"is no journal of this version: {said}", where=str(path), hint="a newer afspm may read it")
 
 
-def _checked(uri: str, path: Path) -> sqlite3.Connection:
-    connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=30.0)
+class _OfCopy(sqlite3.Connection):
+    """Takes the copy away that it reads, when it is closed or forgotten."""
+
+    remove: Callable[[], object] = staticmethod(lambda: None)
+
+    def close(self) -> None:
+        super().close()
+        self.remove()
+
+
+def _checked_copy(path: Path) -> sqlite3.Connection:
+    folder = Path(tempfile.mkdtemp(prefix="afspm-record-"))
+    try:
+        for suffix in ("", "-wal"):
+            with suppress(FileNotFoundError):
+                shutil.copy(f"{path}{suffix}", folder / f"{path.name}{suffix}")
+        connection = _checked(f"{(folder / path.name).as_uri()}?mode=ro", path, _OfCopy)
+        assert isinstance(connection, _OfCopy)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    connection.remove = weakref.finalize(connection, shutil.rmtree, folder, ignore_errors=True)
+    return connection
+
+
+def _checked(uri: str, path: Path, kind: type[sqlite3.Connection] = sqlite3.Connection) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        uri, uri=True, isolation_level=None, check_same_thread=False, timeout=30.0, factory=kind
+    )
     try:
         connection.execute("PRAGMA query_only = 1")
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
@@ -120,11 +149,3 @@ def _checked(uri: str, path: Path) -> sqlite3.Connection:
         connection.close()
         raise
     return connection
-
-
-def _copy(path: Path) -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="afspm-record-"))
-    for suffix in ("", "-wal"):
-        with suppress(FileNotFoundError):
-            shutil.copy(f"{path}{suffix}", folder / f"{path.name}{suffix}")
-    return folder / path.name

@@ -9,7 +9,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
-from afspm.errors import WireError
+from afspm.errors import TransportError, WireError
 from afspm.model import CLOCK_REQUEST, TELL_REQUEST, ControlResponse, Packet, Response
 from afspm.transport.complaints import Complaints
 from afspm.transport.history import Published
@@ -30,6 +30,9 @@ class Replayer:
     Args:
         packets: oldest first.
         clock: shows the time of the recorded run.
+
+    Raises:
+        TransportError: an address can't be used.
     """
 
     def __init__(
@@ -46,25 +49,42 @@ class Replayer:
         self._network = Network.from_launch("replay", None)
         self._published = Published(clock)
         self._wake_up: WakeUp[None] = WakeUp()
-        self._publisher = Publisher(self._network, publish, self._published)
-        self._router = Router(self._network, serve, complaints)
+        try:
+            self._publisher = Publisher(self._network, publish, self._published)
+            self._router = Router(self._network, serve, complaints)
+        except TransportError:
+            self.close()
+            raise
         self._poller = poller(self._wake_up)
         self._poller.register(self._publisher.socket, self._publisher.serve, self._publisher)
         self._poller.register(self._router.socket, self._answer, self._router)
         self._poller.register(self._router.monitor.socket, self._router.follow, None)
         self._next = next(self._packets, None)
-        self._ended = False
+        self._ended = self._stopping = False
         self.count = 0
         """How many packets have been published."""
 
     def run(self, *, stay: bool = False) -> None:
-        """Until all is published; then everybody is told that the experiment has ended, unless we stay."""
-        while self._next is not None or stay:
+        """Until all is published, or `stop`; then everybody is told that the experiment has ended.
+
+        Args:
+            stay: also when all is published.
+        """
+        while not self._stopping and (self._next is not None or stay):
             self._serve(self._due_in_s())
             self._publish_due()
-        self.end()
+        self._end()
 
-    def end(self) -> None:
+    def stop(self) -> None:
+        """`run` is to return. From any thread, or a signal handler."""
+        self._stopping = True
+        self._wake_up.post()
+
+    def wakeup_fileno(self) -> int:
+        """What may be written to so that `run` looks whether it is to stop."""
+        return self._wake_up.writer_fileno()
+
+    def _end(self) -> None:
         """Tell everybody that it is over, also those who come in this moment."""
         self._ended = True
         self._publisher.serve()
@@ -98,7 +118,10 @@ class Replayer:
 
     def _serve(self, within_s: float) -> None:
         timeout = None if within_s == math.inf else milliseconds(within_s)
-        for drain in self._poller.wait(timeout)[0]:
+        drains, woken = self._poller.wait(timeout)
+        if woken:
+            self._wake_up.take()
+        for drain in drains:
             drain()
         if self._ended and self._publisher.serve():
             self._publisher.kill()

@@ -6,6 +6,7 @@ import json
 import logging
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -22,7 +23,7 @@ from afspm.runtime.connect import ENDED, GUEST
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.messages import register_all
 from afspm.scheduler.replayer import Replayer
-from afspm.supervisor import run_folder
+from afspm.supervisor import run_folder, signals
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import now
 from afspm.transport.complaints import Complaints
@@ -76,26 +77,19 @@ def replay(where: Path, options: Options, tell: Callable[[str], None]) -> int:
             raise ConfigError("there is nothing to replay", where=str(run.folder))
         clock = _clock(run, options.speed, first)
         publish, serve = _addresses(run, options)
-        folder = _folder(run, options.runs, guest, clock, publish, serve)
-        told = f"replay of {run.folder.name} at {clock.speed:g} experiment seconds a second, in {folder}"
-        tell(f"{told}\npublished at {publish}, requests are refused at {serve}; Ctrl-C ends it")
-        return _published(chain([first], packets), clock, folder, options, publish, serve)
-
-
-def _published(
-    packets: Iterator[Packet], clock: ExperimentClock, folder: Path, options: Options, publish: str, serve: str
-) -> int:
-    complaints = Complaints(logging.getLogger("afspm.replay"), clock)
-    replayer = Replayer(packets, clock, complaints, publish=publish, serve=serve)
-    try:
-        replayer.run(stay=options.stay)
-    except KeyboardInterrupt:
-        replayer.end()
-    finally:
-        replayer.close()
-        facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        run_folder.write_run(folder, {**facts, ENDED: "the replay is over"})
-    return replayer.count
+        complaints = Complaints(logging.getLogger("afspm.replay"), clock)
+        replayer = Replayer(chain([first], packets), clock, complaints, publish=publish, serve=serve)
+        try:
+            with (
+                signals.told(lambda _: replayer.stop(), replayer.wakeup_fileno()),
+                _folder(run, options.runs, guest, clock, publish, serve) as folder,
+            ):
+                told = f"replay of {run.folder.name} at {clock.speed:g} experiment seconds a second, in {folder}"
+                tell(f"{told}\npublished at {publish}, requests are refused at {serve}; Ctrl-C ends it")
+                replayer.run(stay=options.stay)
+        finally:
+            replayer.close()
+        return replayer.count
 
 
 def _check(only: Sequence[str]) -> None:
@@ -137,8 +131,9 @@ def _guest(run: Run) -> Launch:
     return replace(guest, keys=None, simulated=run.simulated, sample_coordinates=run.frame is Frame.SAMPLE)
 
 
-def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish: str, serve: str) -> Path:
-    """A run folder, by which the replay is found."""
+@contextmanager
+def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish: str, serve: str) -> Iterator[Path]:
+    """A run folder, by which the replay is found; when the block is left it says that it is over."""
     folder = run_folder.create(runs, f"replay-{run.folder.name}", now())
     sockets = Sockets(subscribe=(publish,), control=serve)
     joined = replace(
@@ -159,4 +154,7 @@ def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish
         GUEST: json.loads(joined.to_json()),
     }
     run_folder.write_run(folder, facts)
-    return folder
+    try:
+        yield folder
+    finally:
+        run_folder.write_run(folder, {**facts, ENDED: "the replay is over"})

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,9 +15,10 @@ import pytest
 
 import afspm
 from afspm import wire
-from afspm.errors import ConfigError, RequestError
+from afspm.errors import ConfigError, RequestError, TransportError
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.store import About, Store
+from afspm.runtime.following import Follower
 from afspm.supervisor import replaying, resuming
 
 START_NS = 1_773_518_400_000_000_000
@@ -97,6 +100,31 @@ def test_it_ends_as_an_experiment_does_with_its_folder_saying_so(recorded: Path,
     assert afspm.open_run(tmp_path / "runs").folder == recorded, "the newest is a replay: what it replays is meant"
     with pytest.raises(ConfigError, match="this is a replay"):
         resuming.find(folder)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there a program can't send these")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+def test_one_that_is_stopped_says_so_in_its_folder_and_to_who_listens(
+    replay: subprocess.Popen[str], tmp_path: Path, number: signal.Signals
+) -> None:
+    (folder,) = (tmp_path / "runs").glob("replay-*")
+    with Follower(folder) as follower:
+        follower.catch_up()
+        replay.send_signal(number)
+        assert replay.wait(20.0) == 0
+        assert json.loads((folder / "run.json").read_text(encoding="utf-8"))["ended"] == "the replay is over"
+        until_s = follower.clock.monotonic_s() + 20.0
+        while not follower.ended:
+            assert follower.clock.monotonic_s() < until_s
+            follower.pump(1.0)
+
+
+def test_an_address_that_is_taken_leaves_no_folder(recorded: Path, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        options = replaying.Options(publish=f"tcp://127.0.0.1:{taken.getsockname()[1]}", runs=tmp_path / "runs")
+        with pytest.raises(TransportError):
+            replaying.replay(recorded, options, lambda _: None)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_what_cannot_be_replayed_is_told(recorded: Path, tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import sqlite3
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +34,38 @@ def test_a_killed_run_is_read_from_what_it_left(night: Night, store: Store, tmp_
     for file in tmp_path.glob(f"{JOURNAL_FILE}*"):  # with all that was not yet put into the main file
         (left / file.name).write_bytes(file.read_bytes())
     assert len(afspm.open_run(left).scans) == 1
+
+
+def test_the_copy_of_a_journal_on_a_disk_that_is_only_read_goes_when_it_is_closed_or_forgotten(
+    night: Night, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store.take(night.whole_scan(1))
+    copies = tmp_path / "copies"
+    copies.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(copies))
+    opened = sqlite3.connect
+
+    def connect(name: Any, **settings: Any) -> Any:
+        if "copies" not in str(name):
+            raise sqlite3.OperationalError("unable to open database file")
+        return opened(name, **settings)
+
+    monkeypatch.setattr(sqlite3, "connect", connect)
+    with afspm.open_run(tmp_path) as run:
+        assert len(run.scans) == 1
+        assert len(list(copies.iterdir())) == 1
+    assert not list(copies.iterdir())
+    run = afspm.open_run(tmp_path)
+    assert len(run.scans) == 1
+    del run
+    gc.collect()
+    assert not list(copies.iterdir())
+    damaged = tmp_path / "damaged"
+    damaged.mkdir()
+    (damaged / JOURNAL_FILE).write_bytes(b"no journal at all" * 100)
+    with pytest.raises(FileError, match="damaged"):
+        afspm.open_run(damaged)
+    assert not list(copies.iterdir())
 
 
 def test_reading_changes_nothing(night: Night, tmp_path: Path) -> None:
