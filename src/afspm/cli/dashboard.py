@@ -9,6 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from afspm.experiment import Experiment
+    from afspm.supervisor.resuming import Resumable
 
 RUNS = Path("runs")
 NAME_OF_CLASS = "Dashboard"
@@ -52,13 +53,26 @@ def dashboard(
 
 def with_dashboard(files: list[Path]) -> Experiment:
     """The experiment, with a dashboard if its file has none."""
-    from afspm import dashboard
     from afspm.experiment import load
 
     experiment = load(*files)
-    if NAME_OF_CLASS in {path.rpartition(".")[2] for path in experiment.resolved.class_paths.values()}:
-        return experiment
-    return load(*files, Path(dashboard.__file__).with_name("assets") / "dashboard.toml")
+    return experiment if _has_dashboard(experiment) else load(*files, _overlay())
+
+
+def resumed_with_dashboard(found: Resumable) -> Resumable:
+    """The run that is to go on, with a dashboard if it has none."""
+    return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
+
+
+def _has_dashboard(experiment: Experiment) -> bool:
+    return NAME_OF_CLASS in {path.rpartition(".")[2] for path in experiment.resolved.class_paths.values()}
+
+
+def _overlay() -> Path:
+    """The file that is laid over an experiment to give it a dashboard."""
+    from afspm import dashboard
+
+    return Path(dashboard.__file__).with_name("assets") / "dashboard.toml"
 
 
 def _print_password() -> None:

@@ -65,7 +65,7 @@ def run(
     import logging
     import sys
 
-    from afspm.cli.dashboard import with_dashboard
+    from afspm.cli.dashboard import resumed_with_dashboard, with_dashboard
     from afspm.experiment import load
     from afspm.supervisor import resuming
     from afspm.supervisor import run as running
@@ -79,9 +79,12 @@ def run(
         log_level=logging.DEBUG if verbose else logging.INFO,
     )
     if resume is not None:
-        if files or only or without or speed or dry_run or dashboard:
-            raise typer.BadParameter("a run is resumed as it was begun: give nothing else", param_hint="--resume")
+        if files or only or without or speed or dry_run:
+            said = "a run is resumed as it was begun: give nothing else, but --dashboard"
+            raise typer.BadParameter(said, param_hint="--resume")
         found = resuming.find(resume)
+        if dashboard:
+            found = resumed_with_dashboard(found)
         _check(found.experiment)
         raise typer.Exit(resuming.resume(found, options, terminal=sys.stdout).outcome.exit_code)
     if not files:

@@ -178,14 +178,14 @@ class Experiment:
         return to_toml(self)
 
 
-def load_expanded(path: Path, homes: Sequence[Path]) -> Experiment:
-    """Read the experiment file of a run, as it was expanded.
+def load_expanded(path: Path, homes: Sequence[Path], *overlays: Path) -> Experiment:
+    """Read the experiment file of a run, as it was expanded, and lay others over it.
 
     Args:
         homes: the folders of the files that it was made of (`Experiment.folders`).
     """
     found = Findings()
-    return Experiment(documents.read([path], found, homes), found)
+    return Experiment(documents.read([path, *overlays], found, homes), found)
 
 
 def load(path: str | Path, *overlays: str | Path) -> Experiment:

@@ -36,12 +36,32 @@ STEP_NS = 1_000_000
 
 @dataclass(frozen=True)
 class Resumable:
-    """A run that can go on."""
+    """A run that can go on.
+
+    Attributes:
+        homes: the folders of the files that the experiment was made of.
+        added: names of components that it did not have so far.
+    """
 
     folder: Path
     name: str
     experiment: Experiment
     facts: dict[str, Any]
+    homes: tuple[Path, ...]
+    added: tuple[str, ...] = ()
+
+    def with_overlay(self, file: Path) -> Resumable:
+        """The same run, which goes on with what the file adds."""
+        experiment = load_expanded(self.folder / EXPERIMENT_FILE, self.homes, file)
+        before = self.experiment.component_names
+        added = [name for name in experiment.component_names if name not in before]
+        return replace(self, experiment=experiment, added=(*self.added, *added))
+
+    def options(self, options: Options) -> Options:
+        """With the processes that it had on this computer, and those that were added now."""
+        names = self.experiment.component_names  # without what was added in an earlier life
+        only, without = ([name for name in self.facts.get(which, ()) if name in names] for which in (ONLY, WITHOUT))
+        return replace(options, only=(*only, *self.added) if only else (), without=tuple(without))
 
 
 def find(where: Path) -> Resumable:
@@ -60,8 +80,8 @@ def find(where: Path) -> Resumable:
     file = folder / EXPERIMENT_FILE
     if not file.is_file() or not (folder / run_folder.STATE_DIR).is_dir():
         raise FileError("this is not the folder of a run", where=str(folder), hint="it lacks its experiment or state")
-    homes = [Path(home) for home in facts.get(HOMES, [])] or [folder]
-    return Resumable(folder, str(facts.get("name", folder.name)), load_expanded(file, homes), facts)
+    homes = tuple(map(Path, facts.get(HOMES, []))) or (folder,)
+    return Resumable(folder, str(facts.get("name", folder.name)), load_expanded(file, homes), facts, homes)
 
 
 def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -> Run:
@@ -71,11 +91,11 @@ def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -
     """
     experiment, folder, facts = found.experiment, found.folder, found.facts
     experiment.require_valid()
-    options = replace(options, only=facts.get(ONLY, ()), without=facts.get(WITHOUT, ()))
+    options = found.options(options)
     with run_folder.locked(folder):
         _wait_until_gone(facts, folder)
         clock = _clock(experiment, facts, folder)
-        names = list(facts.get("processes", ()))
+        names = [*facts.get("processes", ()), *found.added]
         return running.go(experiment, options, clock, folder, found.name, terminal, names)
 
 

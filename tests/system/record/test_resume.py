@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from afspm.cli.dashboard import resumed_with_dashboard
 from afspm.clock import NS_PER_S
 from afspm.errors import ConfigError, FileError
 from afspm.supervisor import resuming, run_folder
@@ -103,6 +104,36 @@ def test_a_stopped_run_goes_on_where_it_was_and_an_ended_one_does_not(tmp_path: 
     assert (run / "log.txt").read_text(encoding="utf-8").count("processes, into") == 2
     with pytest.raises(ConfigError, match="has ended"):
         resuming.find(run)
+
+
+def test_a_killed_run_goes_on_with_a_dashboard_that_it_had_not(tmp_path: Path) -> None:
+    (tmp_path / "night.toml").write_text(EXPERIMENT, encoding="utf-8")
+    waiting = COMPONENT.replace("self.scope.end_experiment()", "self.scope.sleep(60.0)")
+    (tmp_path / "short.py").write_text(waiting, encoding="utf-8")
+    first = afspm_run(tmp_path, "night.toml")
+    run = Path(output_until(first, "processes, into").strip().rpartition(", into ")[2])
+    output_until(first, "is in control")
+    first.kill()
+    first.wait()
+    assert first.stdout is not None
+    first.stdout.close()
+    again = afspm_run(tmp_path, "--resume", "runs", "--dashboard")
+    output_until(again, "the dashboard is at http://127.0.0.1:")
+    facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    assert set(facts["processes"]) == {"microscope", "scheduler", "short", "recorder", "dashboard"}
+    again.terminate()
+    again.communicate(timeout=60.0)
+
+
+def test_a_run_that_has_a_dashboard_is_resumed_with_that_one(tmp_path: Path) -> None:
+    own = EXPERIMENT + '\n[page]\ncomponent = true\nclass = "Dashboard"\n'
+    (tmp_path / "experiment.toml").write_text(own, encoding="utf-8")
+    (tmp_path / "short.py").write_text(COMPONENT, encoding="utf-8")
+    (tmp_path / "run.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "state").mkdir()
+    found = resuming.find(tmp_path)
+    assert resumed_with_dashboard(found) == found
+    assert found.added == ()
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:

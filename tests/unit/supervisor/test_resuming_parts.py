@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
+from afspm.supervisor.resuming import Resumable
 from afspm.supervisor.run import ONLY, WITHOUT, Options, dry_run, to_resume
 
 PARTS = """
@@ -63,3 +66,22 @@ def test_a_part_is_resumed_with_what_it_had(options: Options, tmp_path: Path) ->
         starts = dry_run(expanded, again)
         assert sorted(start.launch.name for start in starts) == sorted(names)
         facts = to_resume(expanded, starts, again)
+
+
+def test_what_was_added_when_it_was_resumed_is_there_in_that_life(tmp_path: Path) -> None:
+    overlay = tmp_path / "overlay.toml"
+    overlay.write_text('[dashboard]\ncomponent = true\nclass = "Dashboard"\n', encoding="utf-8")
+    file, part = tmp_path / "experiment.toml", Options(only=("microscope", "scheduler"))
+    file.write_text(PARTS, encoding="utf-8")
+    experiment = load(file)
+    starts = dry_run(experiment, part)
+    before = {start.launch.name for start in starts}
+    facts: dict[str, Any] = to_resume(experiment, starts, part)
+    plain = Resumable(tmp_path, "night", load_expanded(file, [tmp_path]), facts, (tmp_path,))
+    added = plain.with_overlay(overlay)
+    starts = dry_run(added.experiment, added.options(Options()))
+    assert {start.launch.name for start in starts} == {*before, "dashboard"}
+    # and in the next life not, without being missed
+    facts = to_resume(added.experiment, starts, added.options(Options()))
+    again = replace(plain, facts=facts)
+    assert {start.launch.name for start in dry_run(again.experiment, again.options(Options()))} == before
