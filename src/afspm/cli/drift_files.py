@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from afspm.clock import NS_PER_S
 from afspm.components.simulated_truth import true_drift
 from afspm.drift.estimators import estimator
 from afspm.drift.offline import against_first, followed
@@ -25,6 +26,7 @@ from afspm.drift.stack import corrected
 from afspm.drift.trackers import tracker
 from afspm.errors import AfspmError, FileError, InvalidValue
 from afspm.files import FORMATS, FileContent, read
+from afspm.model.words import day_and_time
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.measured import SUFFIX as RECORDED
 from afspm.study.recorded import Series, series
@@ -65,8 +67,8 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     found = series(contents, channel)
     for told in found.left_out:
         aside.print(f"left out: {told}", markup=False, soft_wrap=True)
-    begun = datetime.fromtimestamp(found.scans[0].mid_s, UTC)
-    console.print(f"{len(found.scans)} scans of {found.channel} from {begun:%Y-%m-%d %H:%M} UTC on", markup=False)
+    begun = day_and_time(round(found.scans[0].mid_s * NS_PER_S), UTC, seconds=False)
+    console.print(f"{len(found.scans)} scans of {found.channel} from {begun} on", markup=False)
     analysis = analysed(found.scans, by, following, jobs, aside)
     console.print(as_table(analysis.record))
     for path in written(found, analysis, truth_m(found, paths), output, aside):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from afspm.clock import NS_PER_S
 from afspm.model import JournalEntry, LogLine, ProcessCondition, ProcessState, Region, ScopeState
+from afspm.model.words import area, day_and_time, lasting, time_of_day
 from afspm.record.lanes import Span
 from afspm.record.overview import OLD_S, OVER, Overview
 
@@ -39,18 +40,6 @@ class About:
     fancy: bool = True
 
 
-def lasting(ns: int) -> str:
-    """A duration for people: "45 s", "3 min 20 s", "2 h 05 min", "3 d 4 h"."""
-    seconds = max(0, round(ns / NS_PER_S))
-    if seconds < 60:
-        return f"{seconds} s"
-    minutes, seconds = divmod(seconds, 60)
-    if minutes < 60:
-        return f"{minutes} min {seconds:02} s" if minutes < 10 else f"{minutes} min"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02} min" if hours < 48 else f"{hours // 24} d {hours % 24} h"
-
-
 def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
     """A part of a whole (0 to 1) as a bar."""
     full = min(width, max(0, round(part * width)))
@@ -64,7 +53,7 @@ def screen(seen: Overview, about: About, now_ns: int, *, silent_s: float = 0.0, 
 
     lines = [_head(seen, about, now_ns)]
     if silent_s > OLD_S:
-        told = f"no news for {silent_s:.0f} s: the scheduler is being started again, or can't be reached"
+        told = f"no news for {lasting(silent_s)}: the scheduler is being started again, or can't be reached"
         lines.append(Text(told, "bold yellow"))
     lines += [_control(seen, now_ns), *_problems(seen, now_ns), _scanning(seen, about, now_ns)]
     lines += [
@@ -96,16 +85,16 @@ def _head(seen: Overview, about: About, now_ns: int) -> Text:
     line = Text.assemble((about.name, "bold"))
     if about.simulated:
         line.append("  SIMULATED", "bold red")
-    line.append(f"  {datetime.fromtimestamp(now_ns / NS_PER_S).astimezone():%Y-%m-%d %H:%M:%S}")
+    line.append(f"  {day_and_time(now_ns)}")
     if about.began_ns is not None:
-        line.append(f", running for {lasting(now_ns - about.began_ns)}")
+        line.append(f", running for {lasting((now_ns - about.began_ns) / NS_PER_S)}")
     if about.speed != 1.0:
         line.append(f", {about.speed:g} x real time")
     return line
 
 
 def _since(since_ns: int | None, now_ns: int) -> str:
-    return "" if since_ns is None else f" for {lasting(now_ns - since_ns)}"
+    return "" if since_ns is None else f" for {lasting((now_ns - since_ns) / NS_PER_S)}"
 
 
 def _control(seen: Overview, now_ns: int) -> Text:
@@ -161,9 +150,8 @@ def _size(seen: Overview) -> str:
     parameters = seen.scan_parameters
     if parameters is None or not isinstance(parameters.region, Region):
         return ""
-    width_nm, height_nm = (size_m * 1e9 for size_m in parameters.region.size_m)
     pixels = f", {parameters.shape[1]} x {parameters.shape[0]}" if isinstance(parameters.shape, tuple) else ""
-    return f"{width_nm:g} x {height_nm:g} nm{pixels}"
+    return f"{area(parameters.region.size_m)}{pixels}"
 
 
 def _bar(part: float, about: About) -> str:
@@ -173,8 +161,8 @@ def _bar(part: float, about: About) -> str:
 def _left(left_ns: int | None, about: About) -> str:
     if left_ns is None:
         return ""
-    real = f" ({lasting(round(left_ns / about.speed))} real)" if about.speed != 1.0 else ""
-    return f"{lasting(left_ns)} left{real}"
+    real = f" ({lasting((round(left_ns / about.speed)) / NS_PER_S)} real)" if about.speed != 1.0 else ""
+    return f"{lasting(left_ns / NS_PER_S)} left{real}"
 
 
 def _progress(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
@@ -200,7 +188,9 @@ def _processes(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
     for state in states:
         if state.name in unheard:
             line = _label("process").append(f"{state.name} ").append("not heard of", "bold red")
-            yield line.append(f" for {lasting(unheard[state.name])}: whoever started it is gone, or can't be reached")
+            yield line.append(
+                f" for {lasting(unheard[state.name] / NS_PER_S)}: whoever started it is gone, or can't be reached"
+            )
         if state.name in unheard or state.condition in WELL:
             continue
         is_bad = state.condition in (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
@@ -213,14 +203,14 @@ def _processes(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
 def _lately(state: ProcessState, now_ns: int) -> str:
     """Since when it is so; of what is over, when that was."""
     if state.condition is ProcessCondition.ENDED and state.since_ns is not None:
-        return f" {lasting(now_ns - state.since_ns)} ago"
+        return f" {lasting((now_ns - state.since_ns) / NS_PER_S)} ago"
     return _since(state.since_ns, now_ns)
 
 
 def _well(state: ProcessState) -> str:
     told = []
     if state.condition is ProcessCondition.BUSY and state.step_age_s >= 1.0:
-        told.append(f"busy for {state.step_age_s:.0f} s")
+        told.append(f"busy for {lasting(state.step_age_s)}")
     if state.starts > 1:
         told.append(f"started {state.starts} times")
     return f"{state.name} ({', '.join(told)})" if told else state.name
@@ -234,7 +224,7 @@ def _refusals(seen: Overview, most: int = 3) -> Iterator[Text]:
         last[key] = (last.pop(key, (0, 0))[0] + 1, entry.time_ns)
     for (who, what, reason), (count, time_ns) in list(last.items())[-most:]:
         again = f" ({count} times)" if count > 1 else ""
-        line = _label("refused").append(f"{_clock(time_ns)} {who}: {what}{again}")
+        line = _label("refused").append(f"{time_of_day(time_ns)} {who}: {what}{again}")
         yield line.append(f": {reason}" if reason else "", "yellow")
 
 
@@ -247,12 +237,8 @@ def log_line(line: LogLine) -> Text:
     """What a process said, coloured by how bad it is."""
     from rich.text import Text
 
-    text = Text.assemble((f"{_clock(line.time_ns)} ", "dim"), (f"{line.name} ", "cyan"))
+    text = Text.assemble((f"{time_of_day(line.time_ns)} ", "dim"), (f"{line.name} ", "cyan"))
     return text.append(line.text, LEVELS.get(line.level, ""))
-
-
-def _clock(time_ns: int) -> str:
-    return f"{datetime.fromtimestamp(time_ns / NS_PER_S).astimezone():%H:%M:%S}"
 
 
 def as_json(seen: Overview, about: About, now_ns: int) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from afspm.components.notices import (
 )
 from afspm.errors import ConfigError
 from afspm.model import ControlState, ProcessCondition, ProcessStates
+from afspm.model.words import lasting
 from afspm.record.facts import name_in
 from afspm.runtime.component import Component
 from afspm.units import Duration
@@ -88,8 +89,8 @@ class Notifier(Component):
         now_ns = self.clock.now_ns()
         for number, since_ns in self.memory["flagged"].items():
             if now_ns - since_ns >= self.unsolved_after * 1e9:
-                name, minutes = self.scope.problems.name(int(number)), (now_ns - since_ns) / 60e9
-                text = f"{name} has been flagged for {minutes:.0f} min, and nobody has solved it"
+                name, since = self.scope.problems.name(int(number)), lasting((now_ns - since_ns) * 1e-9)
+                text = f"{name} has been flagged for {since}, and nobody has solved it"
                 self._tell(UNSOLVED, f"{number} {since_ns}", text)
         self._deliver_what_is_due()
 

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+from afspm.clock import NS_PER_S
 from afspm.components.plan import XY, Rhythm, ScanPlan, Step, grid_centers, rounds_within, squares
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region, names
+from afspm.model.words import day_and_time
 from afspm.runtime.component import Component
 from afspm.units import Angle, Duration, Length
 
@@ -243,4 +245,4 @@ def _plan(regions: tuple[Region, ...], pixels: Sequence[int], rounds: int | None
 
 
 def _told(time: datetime | None) -> str:
-    return "" if time is None else f"at {time.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
+    return "" if time is None else f"at {day_and_time(round(time.timestamp() * NS_PER_S), UTC)}"

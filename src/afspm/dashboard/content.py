@@ -10,8 +10,9 @@ from afspm.dashboard.curves import drift_html
 from afspm.dashboard.sample_map import MapContent, map_html
 from afspm.dashboard.time_line import NOT_HEARD_OF, time_line_html
 from afspm.dashboard.watch import OLD_AFTER_S, Watch
-from afspm.dashboard.words import NS_PER_S, clock, colour_class, date_and_clock, duration, escape, position
+from afspm.dashboard.words import NS_PER_S, colour_class, date_and_clock, escape, position
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
+from afspm.model.words import lasting, time_of_day
 from afspm.record.overview import OVER, Overview
 
 ANEW_S = 0.4  # at most that often, however much is published
@@ -147,7 +148,7 @@ def trouble(watch: Watch) -> str:
         return "Nothing has been heard of the experiment yet."
     silent_s = watch.silent_s()
     if silent_s > OLD_AFTER_S:
-        return f"No word from the experiment for {duration(silent_s)}: what is shown is that old."
+        return f"No word from the experiment for {lasting(silent_s)}: what is shown is that old."
     return ""
 
 
@@ -158,7 +159,7 @@ def status_html(watch: Watch, overview: Overview) -> str:
         return '<span class="chip">waiting for the scheduler</span>'
     since_ns = overview.control_since_ns
     now_ns = overview.newest_ns if watch.ended else watch.clock.now_ns()
-    since = "" if since_ns is None else f" since {clock(since_ns)} ({duration((now_ns - since_ns) / NS_PER_S)})"
+    since = "" if since_ns is None else f" since {time_of_day(since_ns)} ({lasting((now_ns - since_ns) / NS_PER_S)})"
     mode = control.mode.name
     parts = [f'<span class="chip mode-{mode.lower()}" data-part="mode">{mode}</span>']
     if control.holder:
@@ -182,7 +183,7 @@ def _microscope(overview: Overview, now_ns: int) -> list[str]:
     state = status.state.name.lower().replace("_", " ") if status else "not heard of"
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
-    far = "" if done is None else f" {100 * done[0]:.0f} %, {duration(done[1] / NS_PER_S)} left"
+    far = "" if done is None else f" {100 * done[0]:.0f} %, {lasting(done[1] / NS_PER_S)} left"
     found = [
         f'<span class="chip state-{state.replace(" ", "-")}" data-part="state">microscope {state}{paused}{far}</span>'
     ]
@@ -211,7 +212,7 @@ def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
     if not newest:
         return '<p class="nothing">Nothing has been refused.</p>'
     rows = "".join(
-        f'<li><time>{clock(one.time_ns)}</time> <b class="{colour_class(one.who)}">{escape(one.who)}</b> '
+        f'<li><time>{time_of_day(one.time_ns)}</time> <b class="{colour_class(one.who)}">{escape(one.who)}</b> '
         f"{escape(one.what)}<q>{escape(one.reason) or 'no reason was given'}</q></li>"
         for one in newest
     )
@@ -237,7 +238,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
     if not wanted:
         return '<p class="nothing">No such line.</p>'
     rows = "".join(
-        f'<li class="level-{escape(line.level.lower())}"><time>{clock(line.time_ns)}</time>'
+        f'<li class="level-{escape(line.level.lower())}"><time>{time_of_day(line.time_ns)}</time>'
         f'<b class="{colour_class(line.name)}">{escape(line.name)}</b><i>{escape(line.level)}</i>'
         f"<span>{escape(line.text)}</span></li>"
         for line in wanted[: -MOST_LINES - 1 : -1]
@@ -252,12 +253,12 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
         unheard_ns: for how long nobody has told of it, if others are told of.
     """
     condition = state.condition.name.lower().replace("_", " ")
-    since = f"since {clock(state.since_ns)}"
+    since = f"since {time_of_day(state.since_ns)}"
     if unheard_ns is not None:
-        gone = f"for {duration(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
+        gone = f"for {lasting(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
         condition, since = NOT_HEARD_OF, gone
     elif state.step_age_s >= 1.0:
-        since = f"on its step for {duration(state.step_age_s)}"
+        since = f"on its step for {lasting(state.step_age_s)}"
     restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"
     if state.last_exit and state.starts > 1:
         restarts += f" (last: {state.last_exit})"

@@ -9,8 +9,9 @@ import numpy as np
 
 from afspm.dashboard.plots import Array, Axis, Curve, plot
 from afspm.dashboard.time_line import time_ticks
-from afspm.dashboard.words import NS_PER_S, clock, escape, position, quantity
+from afspm.dashboard.words import NS_PER_S, escape, position, quantity
 from afspm.model import Spectrum
+from afspm.model.words import time_of_day
 from afspm.record.overview import DriftPoint
 
 BEFORE = 6  # spectra that are shown faintly behind the newest
@@ -35,7 +36,7 @@ def drift_html(points: Sequence[DriftPoint]) -> str:
         either = np.concatenate([xy[guessed & ~lost, 0], xy[guessed & ~lost, 1]])
         curves.append(Curve(np.tile(seconds[guessed & ~lost], 2), either, "curve-c", "predicted only", dots=True))
     times = Axis(
-        "", text=lambda s: clock(round(s * NS_PER_S), seconds=False), ticks=time_ticks(seconds[0], seconds[-1])
+        "", text=lambda s: time_of_day(round(s * NS_PER_S), seconds=False), ticks=time_ticks(seconds[0], seconds[-1])
     )
     return _drift_words(points[-1]) + plot(curves, times, Axis("drift of the sample", "m"), "Drift against time")
 
@@ -59,12 +60,12 @@ def spectrum_html(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> str
         return '<p class="nothing">No spectrum has been taken.</p>'
     time_ns, last = spectra[-1]
     if len(last.names) < 2 or not len(last.values):
-        return f'<p class="nothing">A spectrum at {clock(time_ns)} that has no curve.</p>'
+        return f'<p class="nothing">A spectrum at {time_of_day(time_ns)} that has no curve.</p>'
     variable = variable if variable in last.names[1:] else last.names[1]
     unit = last.units[last.names.index(variable)]
     before = [s for _, s in spectra[:-1] if s.names == last.names and s.units == last.units][-BEFORE:]
     curves = [Curve(s.values[:, 0], s[variable], "curve-old") for s in before]
     curves.append(Curve(last.values[:, 0], last[variable], "curve-a"))
     where = "" if last.position_m is None else f" at {position(last.position_m)}"
-    words = f"<p>{escape(last.kind or 'Spectrum')}{where}, {clock(time_ns)}</p>"
+    words = f"<p>{escape(last.kind or 'Spectrum')}{where}, {time_of_day(time_ns)}</p>"
     return words + plot(curves, Axis(last.names[0], last.units[0]), Axis(variable, unit), f"Spectrum: {variable}")

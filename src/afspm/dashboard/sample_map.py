@@ -9,8 +9,9 @@ import numpy as np
 
 from afspm.dashboard.levelling import Array
 from afspm.dashboard.plots import round_ticks
-from afspm.dashboard.words import clock, escape, quantity, scale
+from afspm.dashboard.words import area, escape, scale
 from afspm.model import Region
+from afspm.model.words import time_of_day
 from afspm.record.overview import ScanTaken, SpectrumTaken
 
 MOST_PLACES = 1500
@@ -150,11 +151,10 @@ def _polygon(frame: _Frame, corners_m: Array, style: str, inside: str = "", data
 
 
 def _scan(frame: _Frame, one: ScanTaken, count: int, shown: tuple[int, str] | None) -> str:
-    width, height = (quantity(size, "m", 3) for size in one.region.size_m)
     often = f", {count} scans" if count > 1 else ""
     cut = ", interrupted" if one.interrupted else ""
     who = f" by {one.holder}" if one.holder else ""
-    title = f"{width} × {height} at {clock(one.time_ns)}{who}{often}{cut}"
+    title = f"{area(one.region.size_m)} at {time_of_day(one.time_ns)}{who}{often}{cut}"
     style = "scan" + (" cut" if one.interrupted else "") + (" shown" if shown and shown[0] == one.time_ns else "")
     data = f' data-time="{one.time_ns}" data-channel="{escape(one.channel)}"'
     return _polygon(frame, one.region.corners_m(), style, f"<title>{escape(title)}</title>", data)
@@ -163,7 +163,7 @@ def _scan(frame: _Frame, one: ScanTaken, count: int, shown: tuple[int, str] | No
 def _spectrum(frame: _Frame, one: SpectrumTaken) -> str:
     assert one.position_m is not None
     x, y = frame.at(one.position_m)
-    title = escape(f"{one.kind or 'spectrum'} at {clock(one.time_ns)}")
+    title = escape(f"{one.kind or 'spectrum'} at {time_of_day(one.time_ns)}")
     return f'<path class="spectrum" d="M{x:.2f} {y:.2f}h0" data-spectrum="{one.time_ns}"><title>{title}</title></path>'
 
 

@@ -14,8 +14,9 @@ from afspm.dashboard.acts import Acts, Outcome
 from afspm.dashboard.content import Content
 from afspm.dashboard.steering import Act, Steering
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import clock, escape, position, quantity
+from afspm.dashboard.words import area, escape, position
 from afspm.model import ControlMode, Region, names
+from afspm.model.words import time_of_day
 
 PARAMETERS = tuple(names.BASE_PARAMETERS)
 
@@ -150,10 +151,7 @@ class SteeringPanel:
         region = Region((float(place["x"]), float(place["y"])), size, float(place["angle"]))
         shape = _shape(int(place["rows"]), int(place["columns"]), size)
         angle = f", turned by {math.degrees(region.angle_rad):.3g}°" if region.angle_rad else ""
-        what = (
-            f"{quantity(size[0], 'm', 3)} × {quantity(size[1], 'm', 3)} at {position(region.center_m)}{angle}, "
-            f"{shape[1]} × {shape[0]} px"
-        )
+        what = f"{area(size)} at {position(region.center_m)}{angle}, {shape[1]} × {shape[0]} px"
         if await _asked("Scan here?", what, "Scan"):
             self._do(lambda a: a.scan(region, shape))
 
@@ -179,7 +177,7 @@ class SteeringPanel:
 
     def _say(self, outcome: Outcome) -> None:
         style = "done" if outcome.ok else "refused"
-        time = clock(self._watch.clock.now_ns())
+        time = time_of_day(self._watch.clock.now_ns())
         self._outcomes.set_content(f'<p class="{style}"><time>{time}</time> {escape(outcome.text)}</p>')
         if outcome.ok:
             ui.notify(outcome.text, type="positive", position="bottom-right", timeout=4000)

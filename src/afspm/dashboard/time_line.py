@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from afspm.dashboard.words import NS_PER_S, clock, colour_class, duration, escape
+from afspm.dashboard.words import NS_PER_S, colour_class, escape
+from afspm.model.words import lasting, time_of_day
 from afspm.record.overview import Lane, Overview, Span
 
 NOT_HEARD_OF = "not heard of"
@@ -58,7 +59,7 @@ def time_line_html(overview: Overview, now_ns: int, unheard: Mapping[str, int] =
     body = "".join(_row(row, spans, begin_ns, now_ns) for row, spans in rows)
     ticks = "".join(
         f'<span class="tick-x" style="left:{_percent(s * NS_PER_S, begin_ns, now_ns):.2f}%">'
-        f"{clock(round(s * NS_PER_S), seconds=False)}</span>"
+        f"{time_of_day(round(s * NS_PER_S), seconds=False)}</span>"
         for s in time_ticks(begin_ns / NS_PER_S, now_ns / NS_PER_S)
     )
     return f'<div class="lanes">{body}<div class="lane-axis"><b></b><div>{ticks}</div></div></div>'
@@ -119,8 +120,8 @@ def _row(row: Row, spans: Sequence[Span], begin_ns: int, now_ns: int) -> str:
 def _cell(row: Row, one: _Stretch, begin_ns: int, now_ns: int) -> str:
     start_ns = begin_ns + one.begin * (now_ns - begin_ns) // COLUMNS
     by = f", by {one.by}" if one.by else ""
-    often = f", {one.count} times about here" if one.count > 1 else f" for {duration(one.lasted_ns / NS_PER_S)}"
-    title = f"{one.label.replace('_', ' ')}{by} from {clock(start_ns)}{often}"
+    often = f", {one.count} times about here" if one.count > 1 else f" for {lasting(one.lasted_ns / NS_PER_S)}"
+    title = f"{one.label.replace('_', ' ')}{by} from {time_of_day(start_ns)}{often}"
     left, width = 100 * one.begin / COLUMNS, 100 * (one.end - one.begin) / COLUMNS
     word = f"<i>{escape(one.label.replace('_', ' '))}</i>" if width > 7 else ""
     return (

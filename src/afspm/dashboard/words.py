@@ -6,6 +6,8 @@ import html
 import math
 from datetime import datetime
 
+from afspm.model import words
+
 NS_PER_S = 1_000_000_000
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
              (1e-12, "p"), (1e-15, "f"))  # fmt: skip
@@ -32,31 +34,17 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
 
 def position(xy_m: tuple[float, float]) -> str:
     """ "(1.2, −0.5) µm"."""
-    factor, unit = scale(max(abs(xy_m[0]), abs(xy_m[1])) or 1e-9, "m")
-    x, y = (f"{v * factor:.4g}".replace("-", "−") for v in xy_m)
-    return f"({x}, {y}) {unit}"
+    return words.typeset(words.place(xy_m))
 
 
-def duration(seconds: float) -> str:
-    """ "8 s", "12 min 05 s", "3 h 20 min"."""
-    whole = max(0, round(seconds))
-    minutes, rest = divmod(whole, 60)
-    if not minutes:
-        return f"{whole} s"
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min"
-
-
-def clock(time_ns: int, *, seconds: bool = True) -> str:
-    """The time of day where the dashboard runs."""
-    return _local(time_ns).strftime("%H:%M:%S" if seconds else "%H:%M")
+def area(size_m: tuple[float, float]) -> str:
+    """ "2 × 1 µm"."""
+    return words.typeset(words.area(size_m))
 
 
 def date_and_clock(time_ns: int) -> str:
     """Day and time, with the zone."""
-    return _local(time_ns).strftime("%d %b %H:%M:%S %Z")
+    return f"{words.day_and_time(time_ns)} {_local(time_ns):%Z}"
 
 
 def escape(text: str) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from afspm.logic.events import Codec, RequestIn
 from afspm.model import LogLines, ProcessStates, Progress, Told, component_of
+from afspm.model.words import lasting
 
 SUPERVISOR = "supervisor"
 """Whose key it takes, where there are keys, to speak of processes; each supervisor adds ":" and what tells it apart."""
@@ -83,7 +84,7 @@ class Telling:
             return f"no supervisor has a process {process!r}; known: {', '.join(known) or 'none'}"
         newest = max(having.values(), key=lambda one: now_s if one.told_s is None else one.told_s)
         if newest.told_s is not None and now_s - newest.told_s > SILENT_S:
-            return f"the supervisor of {process} has not been heard of for {now_s - newest.told_s:.0f} s"
+            return f"the supervisor of {process} has not been heard of for {lasting(now_s - newest.told_s)}"
         if process not in newest.orders:
             newest.orders.append(process)
         return ""

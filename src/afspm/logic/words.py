@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from afspm.logic.arbitration import Ask, Control, Event, Row, Rules
@@ -23,6 +23,7 @@ from afspm.model import (
     ShapeChange,
     request_name,
 )
+from afspm.model.words import area, lengths, place
 
 
 def is_routine(before: Control, after: Control, ask: Ask, holder_told: str | None) -> bool:
@@ -57,25 +58,6 @@ def asked(request: Request, problems: ProblemNames) -> str:
     return request_name(request.kind) if words is None else words(request.subject, problems)
 
 
-def lengths(values_m: Sequence[float], joined: str = ", ") -> str:
-    """Lengths in the unit that suits the largest of them.
-
-    >>> lengths([5e-7, 2.5e-7], " x ")
-    '500 x 250 nm'
-    """
-    largest_m = max(map(abs, values_m))
-    unit_m, unit = next(((size, name) for size, name in _LENGTHS if largest_m >= 0.99 * size), (1e-9, "nm"))
-    return joined.join(f"{value_m / unit_m:.5g}" for value_m in values_m) + f" {unit}"
-
-
-_LENGTHS = ((1e-3, "mm"), (1e-6, "um"), (1e-9, "nm"), (1e-12, "pm"))
-
-
-def _place(xy_m: tuple[float, float]) -> str:
-    *numbers, unit = lengths(xy_m).rsplit(" ", 1)
-    return f"({numbers[0]}) {unit}"
-
-
 def _control(problem: Any, problems: ProblemNames) -> str:
     return f"asks for control to solve {problems.name(int(problem))}" if problem else "asks for control"
 
@@ -94,7 +76,7 @@ def _scan_parameters(subject: Any, problems: ProblemNames) -> str:
     region, shape = subject.region, subject.shape
     parts = []
     if isinstance(region, Region):
-        parts.append(f"{lengths(region.size_m, ' x ')} at {_place(region.center_m)}")
+        parts.append(f"{area(region.size_m)} at {place(region.center_m)}")
         if region.angle_rad:
             parts.append(f"turned by {math.degrees(region.angle_rad):.5g} deg")
     elif isinstance(region, RegionChange):
@@ -120,7 +102,7 @@ def _feedback(subject: Any, problems: ProblemNames) -> str:
 
 def _position(subject: Any, problems: ProblemNames) -> str:
     if isinstance(subject, ProbePosition):
-        return f"probe position: {_place(subject.xy_m)}"
+        return f"probe position: {place(subject.xy_m)}"
     if isinstance(subject, PositionChange):
         given = {"x": subject.x_m, "y": subject.y_m}
         parts = [f"{name} = {lengths([value_m])}" for name, value_m in given.items() if value_m is not None]

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import ProblemNames, names
+from afspm.model.words import from_to, time_of_day
 from afspm.record.night_record import BAD, Mark, NightRecord, Shot, Span
 
 if TYPE_CHECKING:
@@ -104,11 +105,9 @@ def _figure(height_in: float) -> Figure:
 
 
 def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, simulated: bool) -> None:
-    begin, end = _utc(record.start_ns), _utc(record.end_ns)
-    until = f"{end:%H:%M}" if begin.date() == end.date() else f"{end:%Y-%m-%d %H:%M}"
     what = f"{title}   " if title else ""
     y = 1 - 0.17 / height_in
-    about = f"{what}{begin:%Y-%m-%d %H:%M} to {until} UTC, {record.scans} scans"
+    about = f"{what}{from_to(record.start_ns, record.end_ns, UTC)}, {record.scans} scans"
     figure.text(0.03, y, about, size=7, va="center")
     is_judged = any(mark.of_ns is not None for mark in record.marks)
     legend = "bar: who was in control, as in b" + ("; framed: the tip was judged bad" if is_judged else "")
@@ -139,7 +138,7 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
     ax.set_axis_off()
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
-        label = f"{_utc(shot.time_ns):%H:%M}"
+        label = time_of_day(shot.time_ns, UTC, seconds=False)
         ax.text(x + 2, y + 2, label, size=4.5, color="white", va="top", bbox=_LABEL)
 
 

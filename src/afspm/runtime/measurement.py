@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC
 from typing import Any
 
 from afspm import wire
 from afspm.errors import NoResponse, WireError
 from afspm.logic.sessions import KEYED
 from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
+from afspm.model.words import day_and_time
 from afspm.runtime.asking import NOT_IN_CONTROL, Asker
 from afspm.runtime.cycle import Cycle, Outcome
 from afspm.runtime.holding import Holding
@@ -243,8 +244,7 @@ class Measuring:
         return False
 
     def _note(self, progress: _Progress, why: str) -> None:
-        when = datetime.fromtimestamp(self._link.clock.now_s(), UTC)
-        progress.interruptions.append(f"{when:%Y-%m-%d %H:%M:%S} UTC: {why}")
+        progress.interruptions.append(f"{day_and_time(self._link.clock.now_ns(), UTC)}: {why}")
         self._link.log.warning("%s interrupted: %s; it will be taken again", progress.plan.what, why)
 
     def _listener(self, cycle: Cycle, message: str) -> Callable[[Packet, bool], None]:

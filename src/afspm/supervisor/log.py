@@ -8,11 +8,11 @@ import re
 import sys
 import zlib
 from collections.abc import Callable, Iterable
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TextIO
 
-from afspm.clock import Clock, ExperimentClock
+from afspm.clock import NS_PER_S, Clock, ExperimentClock
+from afspm.model.words import day_and_time, time_of_day
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -77,22 +77,22 @@ class RunLog:
 
     def write(self, name: str, level: int, text: str) -> None:
         """One line of the process `name`; `level` is that of `logging`."""
-        wall = datetime.fromtimestamp(self._wall.now_s()).astimezone()
+        wall_ns = self._wall.now_ns()
         with contextlib.suppress(OSError, ValueError):  # a full disk must not end the run from here
-            stamp = f"{wall:%Y-%m-%d %H:%M:%S}.{wall.microsecond // 1000:03d}{self._experiment_time()}"
+            stamp = f"{day_and_time(wall_ns)}.{wall_ns // 1_000_000 % 1000:03d}{self._experiment_time()}"
             self._file.write(f"{stamp} {logging.getLevelName(level):8} {name:{self._widest}} {text}\n")
             self._file.flush()
         self.listener(name, level, text)
         if level >= self._level:
             with contextlib.suppress(OSError, ValueError):
-                self._show(f"{wall:%H:%M:%S}", f"{name:{self._widest}}", level, text)
+                self._show(time_of_day(wall_ns), f"{name:{self._widest}}", level, text)
 
     def _experiment_time(self) -> str:
         """The time in the experiment, where it is another than the one on the wall."""
-        now_s = self._clock.now_s()
-        if abs(now_s - self._wall.now_s()) < 1.0:
+        now_ns = self._clock.now_ns()
+        if abs(now_ns - self._wall.now_ns()) < NS_PER_S:
             return ""
-        return f" [{datetime.fromtimestamp(now_s).astimezone():%Y-%m-%d %H:%M:%S}]"
+        return f" [{day_and_time(now_ns)}]"
 
     def close(self) -> None:
         """Close the file."""

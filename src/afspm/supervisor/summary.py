@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
+from afspm.model.words import lasting
 from afspm.record.run import open_run
 from afspm.supervisor.ending import Why
 
@@ -19,7 +20,7 @@ TABLE = "metadata.csv"  # of the component Metadata
 
 def lines(outcome: Outcome, folder: Path) -> list[str]:
     """The summary: why it ended, what ran, what had to be restarted or was given up, where everything is."""
-    told = [f"{outcome.text}, after {_duration(outcome.duration_s)}"]
+    told = [f"{outcome.text}, after {lasting(outcome.duration_s)}"]
     told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
         if (restarts := report.starts - 1 - report.ordered) > 0:
@@ -64,11 +65,3 @@ def _measured(scans: int, spectra: int) -> str:
 
 def _times(count: int) -> str:
     return {1: "once", 2: "twice"}.get(count, f"{count} times")
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    minutes, rest_s = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest_s} s"

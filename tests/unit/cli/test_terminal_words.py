@@ -67,7 +67,7 @@ def shown(overview: Overview, about: About = ABOUT, width: int = 140, silent_s: 
         "tip-shape-changed for 37 s, flagged by judge",
         "scanning for 50 s",
         "50 % 50 s left (1 s real)",
-        "1000 x 1000 nm, 64 x 128",
+        "1 x 1 um, 64 x 128",
         "series: 1 of 5",
         "7 min 20 s left",
         "series (busy for 12 s)",
@@ -145,11 +145,3 @@ def test_json_says_the_same(night: Overview) -> None:
     assert [one["condition"] for one in told["processes"]] == ["BUSY", "GIVEN_UP", "ENDED"]
     assert told["refusals"][0]["reason"] == "at most 1e-5 m/s"
     assert told["log"][0]["text"] == "lost the tip [/x]"
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0, "0 s"), (59.4, "59 s"), (200, "3 min 20 s"), (1200, "20 min"), (7500, "2 h 05 min"), (3 * 86400, "3 d 0 h")],
-)
-def test_durations_are_for_people(seconds: float, words: str) -> None:
-    assert telling.lasting(round(seconds * S)) == words

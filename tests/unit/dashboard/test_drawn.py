@@ -16,7 +16,7 @@ from afspm.dashboard.plots import Axis, Curve, plot, round_ticks, thinned
 from afspm.dashboard.sample_map import MapContent, map_html, places_of
 from afspm.dashboard.time_line import COLUMNS, stretches, time_line_html
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import duration, position, quantity, scale
+from afspm.dashboard.words import position, quantity, scale
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -317,13 +317,6 @@ def test_quantities_read_well(value: float | None, unit: str, text: str) -> None
 def test_the_prefix_and_the_factor_belong_together() -> None:
     factor, unit = scale(3e-7, "m")
     assert (3e-7 * factor, unit) == (pytest.approx(300.0), "nm")
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.2, "0 s"), (59.6, "1 min 00 s"), (8, "8 s"), (725, "12 min 05 s"), (12_000, "3 h 20 min")]
-)
-def test_durations_read_well(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
 
 
 def test_positions_read_well() -> None:

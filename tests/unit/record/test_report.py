@@ -147,7 +147,7 @@ def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
     [
         "SIMULATED",
         "3 scans, 1 interrupted, tip-shape-changed flagged once, 1 restart",
-        "60 min (60 s real); all is done",
+        "1 h 00 min (1 min 00 s real); all is done",
         "2 × pulse",
         "<b>interrupted</b>",
         "prefers-color-scheme:dark",
@@ -234,8 +234,8 @@ def test_times_of_more_than_a_day_have_the_day(tmp_path: Path) -> None:
     store.flush()
     store.close()
     text = write(tmp_path).read_text(encoding="utf-8")
-    assert "1 · 14 Nov 22:13:20" in text
-    assert "2 · 16 Nov 04:13:20" in text
+    assert "1 · 2023-11-14 22:13:20" in text
+    assert "2 · 2023-11-16 04:13:20" in text
 
 
 def test_time_is_shared_out(run: Path) -> None:

@@ -23,7 +23,7 @@ REPORTS = (
 def test_it_says_what_ran_what_was_restarted_and_what_was_given_up(tmp_path: Path) -> None:
     told = lines(Outcome(Why.EXPERIMENT_ENDED, "the experiment has ended", REPORTS, 3725.0), tmp_path)
     assert told == [
-        "the experiment has ended, after 1 h 2 min",
+        "the experiment has ended, after 1 h 02 min",
         "ran: scheduler, series, hopeless",
         "series was restarted twice",
         "hopeless was restarted once",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Iterator, Sequence
-from datetime import UTC, datetime
+from datetime import UTC
 from html import escape
 from pathlib import Path
 
+from afspm.clock import NS_PER_S
+from afspm.model.words import area, day, from_to, lasting, time_of_day, typeset
 from afspm.record.lanes import Lane
 from afspm.record.report import time_line
 from afspm.record.report.pictures import Small
@@ -22,7 +24,7 @@ _LEGEND = (
 
 def html(story: Story, shown: Sequence[Small], figures: Sequence[Path]) -> str:
     """The whole page."""
-    title = f"{escape(story.name)}, {_day(story.start_ns)}"
+    title = f"{escape(story.name)}, {day(story.start_ns, UTC)}"
     badge = '<span class="badge">SIMULATED</span>' if story.simulated else ""
     body = [
         f"<header><h1>{escape(story.name)}{badge}</h1><p>{escape(_when(story))}</p></header>",
@@ -47,21 +49,10 @@ def html(story: Story, shown: Sequence[Small], figures: Sequence[Path]) -> str:
     )
 
 
-def lasting(ns: int) -> str:
-    """A duration: "45 s", "12 min", "7 h 45 min"."""
-    seconds = round(ns / 1e9)
-    if seconds < 120:
-        return f"{seconds} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02} min"
-
-
 def _when(story: Story) -> str:
-    begin, end = (datetime.fromtimestamp(ns / 1e9, UTC) for ns in (story.start_ns, story.end_ns))
-    until = f"{end:%H:%M}" if begin.date() == end.date() else f"{end:%Y-%m-%d %H:%M}"
-    told = f"{begin:%Y-%m-%d %H:%M} to {until} UTC, {lasting(story.lasted_ns)}"
+    told = f"{from_to(story.start_ns, story.end_ns, UTC)}, {lasting(story.lasted_ns / NS_PER_S)}"
     if story.speed != 1.0:
-        told += f" ({lasting(round(story.lasted_ns / story.speed))} real)"
+        told += f" ({lasting(story.lasted_ns / NS_PER_S / story.speed)} real)"
     return f"{told}; {story.ended or 'it goes on, or was killed'}"
 
 
@@ -102,7 +93,7 @@ def _share_table(story: Story, heading: str, lane: Lane, styles: dict[str, str])
         words = label if styles else states_in_words(label)
         bar = '<svg class="share" viewBox="0 0 100 10" preserveAspectRatio="none">'
         bar += f'<rect class="{style}" width="{part:.2f}" height="10"/></svg>'
-        rows.append([escape(words), bar, lasting(ns), f"{part:.0f} %"])
+        rows.append([escape(words), bar, lasting(ns / NS_PER_S), f"{part:.0f} %"])
     return _table([heading, "", "", ""], rows) if rows else ""
 
 
@@ -117,7 +108,7 @@ def _problems(story: Story) -> str:
                 escape(span.by or "not known"),
                 escape(", ".join(story.repairs(span)) or "nobody"),
                 escape(", ".join(story.done_meanwhile(span))),
-                lasting(end_ns - span.start_ns),
+                lasting((end_ns - span.start_ns) / NS_PER_S),
                 "<b>not solved</b>" if span.end_ns is None else _clock(story, end_ns),
             ]
         )
@@ -145,7 +136,7 @@ def _thumb(small: Small, story: Story, styles: dict[str, str]) -> str:
         if small.picture is not None
         else '<div class="none">no values</div>'
     )
-    size = f"{width * 1e9:.4g} × {height * 1e9:.4g} nm" if row.region else ""
+    size = typeset(area(row.region.size_m)) if row.region else ""
     is_bad = row.interrupted or bool(row.problems)
     mark = " <b>interrupted</b>" if row.interrupted else ""
     style = styles.get(row.holder or "", "state")
@@ -215,9 +206,5 @@ def _data(png: bytes) -> str:
 
 def _clock(story: Story, time_ns: int) -> str:
     """With the day, where there are several."""
-    day = "%d %b " if story.lasted_ns > _DAY_NS else ""
-    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):{day}%H:%M:%S}"
-
-
-def _day(time_ns: int) -> str:
-    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d}"
+    several = story.lasted_ns > _DAY_NS
+    return f"{day(time_ns, UTC)} {time_of_day(time_ns, UTC)}" if several else time_of_day(time_ns, UTC)

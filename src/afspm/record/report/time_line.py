@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC
 from html import escape
 
+from afspm.model.words import day_and_time, time_of_day
 from afspm.record.lanes import Span
 from afspm.record.report.story import Story, in_trouble, states_in_words
 
@@ -75,7 +76,7 @@ def _rows(story: Story) -> Iterator[Row]:
 def _bars(story: Story, row: Row, y: float) -> Iterator[str]:
     for span in _merged(row.spans, story):
         x0, x1 = (_x(story, time_ns) for time_ns in (span.start_ns, _end(span, story)))
-        until = f"{_moment(span.start_ns)} to {_moment(_end(span, story))}"
+        until = f"{day_and_time(span.start_ns, UTC)} to {day_and_time(_end(span, story), UTC)}"
         title = f"{span.label}{f', by {span.by}' if span.by else ''}: {until}"
         yield (
             f'<rect x="{x0:.2f}" y="{y:.1f}" width="{max(x1 - x0, LEAST):.2f}" height="{BAR}" class="{row.style}">'
@@ -105,8 +106,9 @@ def _axis(story: Story, bottom: float) -> Iterator[str]:
         at_ns = story.start_ns + round(number * step_h * HOUR_NS)
         x = _x(story, at_ns)
         yield f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="{bottom}" class="tick"/>'
+        told = time_of_day(at_ns, UTC, seconds=False)
         anchor = "end" if x > WIDTH - 20 else "start" if number == 0 else "middle"
-        yield f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="{anchor}">{_moment(at_ns, short=True)}</text>'
+        yield f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="{anchor}">{told}</text>'
 
 
 def _x(story: Story, time_ns: int) -> float:
@@ -116,7 +118,3 @@ def _x(story: Story, time_ns: int) -> float:
 
 def _end(span: Span, story: Story) -> int:
     return story.end_ns if span.end_ns is None else span.end_ns
-
-
-def _moment(time_ns: int, *, short: bool = False) -> str:
-    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):{'%H:%M' if short else '%Y-%m-%d %H:%M:%S'}}"
