@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+from contextlib import ExitStack
+from pathlib import Path
 
-from ui_lab import Night, Opened
+from ui_lab import AFSPM, EXPERIMENT, Night, Opened
 
 from afspm.model import ProcessCondition
 
@@ -45,6 +48,28 @@ def test_data_that_are_old_are_said_to_be(night: Night, opened: Opened) -> None:
         for pid in reversed(frozen):
             os.kill(pid, signal.SIGCONT)
     page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
+
+
+def test_a_page_that_has_joined_a_run_says_that_it_was_cut_off(opened: Opened, tmp_path: Path) -> None:
+    file = tmp_path / "experiment.toml"
+    file.write_text(EXPERIMENT.partition("[dashboard]")[0].format(speed=60.0, lines=2.0), encoding="utf-8")
+    with ExitStack() as started:
+
+        def start(*words: object) -> subprocess.Popen[str]:
+            command = (*AFSPM, *map(str, words))
+            process = started.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path))
+            started.callback(process.terminate)
+            return process
+
+        def last_word(process: subprocess.Popen[str], wanted: str) -> str:
+            assert process.stdout is not None
+            return next(line for line in process.stdout if wanted in line).split()[-1]
+
+        run = start("run", file)
+        folder = last_word(run, "processes, into")
+        page = opened(last_word(start("dashboard", folder, "--port", 0), "the dashboard is at"))
+        run.kill()
+        page.wait_for_selector(f"#trouble:has-text('It was cut off; `afspm run --resume {folder}`')", timeout=40_000)
 
 
 def test_the_end_is_asked_for_twice_and_then_told(night: Night, opened: Opened, keep: object) -> None:

@@ -85,8 +85,8 @@ def _print_password() -> None:
 def _running_here(where: Path) -> Path | None:
     """The folder of the run that is meant; None: the file is of one that was started elsewhere."""
     from afspm.errors import FileError
-    from afspm.record.facts import read_facts
-    from afspm.runtime.connect import ENDED, find_run
+    from afspm.record.facts import ENDED, read_facts
+    from afspm.runtime.connect import find_run
 
     try:
         folder = find_run(where)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import getpass
-import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -103,8 +102,8 @@ def say_nothing_runs(why: str) -> None:
 def _running(where: Path) -> Path:
     """The folder of the run that is meant, as far as it is not known to have ended."""
     from afspm.errors import FileError
-    from afspm.record.facts import read_facts
-    from afspm.runtime.connect import ENDED, find_run
+    from afspm.record.facts import ENDED, read_facts
+    from afspm.runtime.connect import find_run
 
     try:
         folder = find_run(where)
@@ -120,17 +119,17 @@ def _running(where: Path) -> Path:
 @contextmanager
 def _only_if_running(folder: Path) -> Iterator[None]:
     from afspm.errors import ExperimentEnded, NoResponse
-    from afspm.record.facts import read_facts
-    from afspm.record.run import REPLAY_OF
+    from afspm.record.facts import known_facts
+    from afspm.record.going_on import cut_off
 
     try:
         yield
     except ExperimentEnded as error:
         say_nothing_runs(str(error))
     except NoResponse:
-        said, facts = f"nobody answers in {folder.resolve().name}", read_facts(folder)
-        if (facts.get("guest") or {}).get("keys"):
-            said += f"; if it runs, its scheduler lacks the public key of {TERMINAL}"
-        if REPLAY_OF not in facts:
-            said += f"; if it was cut off, `afspm run --resume {shlex.quote(str(folder))}` goes on with it"
+        if told := cut_off(folder):
+            say_nothing_runs(f"nobody answers in {folder.resolve().name}; {told}")
+        said = f"nobody answers in {folder.resolve().name}, though somebody runs it"
+        if (known_facts(folder).get("guest") or {}).get("keys"):
+            said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
         say_nothing_runs(said)

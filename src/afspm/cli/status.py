@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.joining import Where, about, can_show_blocks, looking
+from afspm.cli.joining import Where, about, can_show_blocks, looking, say_nothing_runs
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from afspm.runtime.following import Follower
 
 REFRESH_S = 0.25
+LOOK_S = 2.0
+"""So often it is looked whether it still goes on, where nothing is said."""
 UNBROKEN = 10_000  # columns: what programs and files get has a line for a line
 RUNS = Path("runs")
 
@@ -44,7 +46,7 @@ def status(
 def watch(where: Where = RUNS) -> None:
     """Watch a running experiment until it ends, or Ctrl-C; the experiment does not notice.
 
-    Where the output is no terminal, a line is written whenever something changes.
+    Where the output is no terminal, a line is written whenever something changes. Ends with 3 if the run is cut off.
     """
     console = _console()
     with looking(where, lines=True) as follower, contextlib.suppress(KeyboardInterrupt):
@@ -53,7 +55,16 @@ def watch(where: Where = RUNS) -> None:
             _live(follower, told, console)
         else:
             _in_lines(follower)
+        if not follower.ended:
+            say_nothing_runs(f"nobody answers any more in {follower.folder.resolve().name}; {follower.cut_off()}")
         typer.echo("the experiment has ended")
+
+
+def _goes_on(follower: Follower) -> bool:
+    """Whether there is more to come. (Who runs it is looked for only where it is silent: a disk may be far away.)"""
+    from afspm.record.overview import OLD_S
+
+    return not (follower.ended or (follower.silent_s() > OLD_S and follower.cut_off()))
 
 
 def _live(follower: Follower, told: About, console: Console) -> None:
@@ -69,7 +80,7 @@ def _live(follower: Follower, told: About, console: Console) -> None:
 
     with Live(console=console, screen=True, auto_refresh=False, vertical_overflow="crop") as live:
         shown_s = 0.0
-        while not follower.ended:
+        while _goes_on(follower):
             now_s = follower.clock.monotonic_s()
             if now_s - shown_s >= REFRESH_S:
                 live.update(picture(), refresh=True)  # type: ignore[arg-type]
@@ -91,7 +102,7 @@ def _in_lines(follower: Follower) -> None:
 
     said, seen = "", len(follower.overview.log)
     last = follower.overview.log[-1] if seen else None
-    while not follower.ended:
+    while _goes_on(follower):
         overview = follower.overview
         key = str((overview.control, overview.status))
         if key != said:
@@ -103,7 +114,7 @@ def _in_lines(follower: Follower) -> None:
         for line in fresh:
             typer.echo(telling.log_line(line).plain)
             last = line
-        follower.pump(None)
+        follower.pump(LOOK_S)
 
 
 def _console() -> Console:

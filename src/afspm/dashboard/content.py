@@ -148,7 +148,8 @@ def trouble(watch: Watch) -> str:
         return "Nothing has been heard of the experiment yet."
     silent_s = watch.silent_s()
     if silent_s > OLD_AFTER_S:
-        return f"No word from the experiment for {lasting(silent_s)}: what is shown is that old."
+        why = f" {said[0].upper()}{said[1:]}." if (said := watch.cut_off()) else ""
+        return f"No word from the experiment for {lasting(silent_s)}: what is shown is that old.{why}"
     return ""
 
 

@@ -13,6 +13,7 @@ from afspm.dashboard.server import USUAL_PORT, PageServer, listening
 from afspm.dashboard.watch import Watch
 from afspm.errors import ConfigError
 from afspm.record.facts import name_in
+from afspm.record.going_on import cut_off
 from afspm.runtime.component import Component
 from afspm.runtime.priority import step_back
 
@@ -73,7 +74,7 @@ class Dashboard(Component):
         bound = listening(self._host, self._port or None, self._usual_ports())
         archive = Archive(self.run_dir if launch.run_dir else None)
         problems = self._context.problems
-        self._watch = Watch(self.clock, problems, archive.past(problems))
+        self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off(self.run_dir))
         self._steering = Steering(launch, self.clock, self._watch)
         app, self._farewell = application(
             self._watch,

@@ -25,11 +25,19 @@ class Watch:
     Args:
         clock: of the experiment.
         past: what was so before; None: nothing is known of that.
+        cut_off: what to say if nobody runs it any more; it gives an empty text if somebody does.
     """
 
-    def __init__(self, clock: Clock, problems: ProblemNames | None = None, past: Overview | None = None) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        problems: ProblemNames | None = None,
+        past: Overview | None = None,
+        cut_off: Callable[[], str] = str,
+    ) -> None:
         self.clock = clock
         self.problems = problems or ProblemNames()
+        self.cut_off = cut_off
         self.overview = past or Overview(self.problems)
         self.frames = FrameStore()
         self.spectra = SpectrumStore()

@@ -9,6 +9,12 @@ from typing import Any, Final
 from afspm.errors import FileError
 
 RUN_FILE: Final = "run.json"
+STATE_DIR: Final = "state"
+"""Beside it: what the processes remember."""
+ENDED: Final = "ended"
+"""In run.json once a run is over: how it ended, in words."""
+REPLAY_OF: Final = "replay_of"
+"""In run.json of a replay: the folder of the run that it publishes again."""
 EXPERIMENT_FILE: Final = "experiment.toml"
 """Beside it: the experiment as it was expanded."""
 LATEST_FILE: Final = "latest"

@@ -26,15 +26,12 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record import journal
-from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, known_facts
+from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, REPLAY_OF, known_facts
 from afspm.record.packets import packets, without_reading_files
 from afspm.record.tables import ControlRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
     from afspm.record.overview import DriftPoint, Overview
-
-REPLAY_OF = "replay_of"
-"""In run.json of a replay: the folder of the run that it publishes again."""
 
 
 def open_run(path: str | Path = "runs") -> Run:

@@ -14,6 +14,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, ExperimentEnded, FileError, NoResponse
 from afspm.model import Frame, ProblemNames
 from afspm.record.facts import LATEST_FILE, RUN_FILE, read_facts
+from afspm.record.going_on import cut_off
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
 from afspm.runtime.messages import register_all
@@ -21,8 +22,6 @@ from afspm.runtime.scope import Scope
 from afspm.transport.launching import open_port
 
 GUEST = "guest"
-ENDED = "ended"
-"""What run.json says once a run is over: how it ended, in words."""
 JOINED_WITHIN_S = 5.0
 
 
@@ -64,7 +63,8 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         raise
     if not joined:
         port.close()
-        raise NoResponse("nobody is there", where=str(folder), hint="is the experiment still running?")
+        hint = cut_off(folder) or "is the experiment still running?"
+        raise NoResponse("nobody is there", where=str(folder), hint=hint)
     frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
     scope = Scope(link, ProblemNames(launch.problems), folder / "state", frame=frame)
     weakref.finalize(scope, port.close)

@@ -11,6 +11,7 @@ from afspm import wire
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import Packet, ProblemNames
+from afspm.record.going_on import cut_off
 from afspm.record.overview import Overview
 from afspm.runtime.connect import guest_of
 from afspm.runtime.launch import Launch
@@ -85,11 +86,16 @@ class Follower:
                 break
             self.pump(left_s)
         if self.heard_s is None and not self._link.is_caught_up():
-            raise NoResponse("nobody is there", where=str(self.folder), hint="is the experiment still running?")
+            hint = self.cut_off() or "is the experiment still running?"
+            raise NoResponse("nobody is there", where=str(self.folder), hint=hint)
 
     def silent_s(self) -> float:
         """Real seconds since anything came."""
         return 0.0 if self.heard_s is None else self.clock.monotonic_s() - self.heard_s
+
+    def cut_off(self) -> str:
+        """What to say if nobody runs it any more; empty if somebody does, or it has ended."""
+        return cut_off(self.folder)
 
     def close(self) -> None:
         """Look away."""

@@ -17,9 +17,10 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment.wiring import is_address
 from afspm.model import Frame, Packet
-from afspm.record.facts import EXPERIMENT_FILE
-from afspm.record.run import REPLAY_OF, Run, open_run
-from afspm.runtime.connect import ENDED, GUEST
+from afspm.record.facts import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
+from afspm.record.going_on import locked
+from afspm.record.run import Run, open_run
+from afspm.runtime.connect import GUEST
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.messages import register_all
 from afspm.scheduler.replayer import Replayer
@@ -141,7 +142,7 @@ def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish
         sockets=sockets,
         clock=clock.as_dict(),
         run_dir=str(folder),
-        state_dir=str(folder / run_folder.STATE_DIR),
+        state_dir=str(folder / STATE_DIR),
     )
     source = run.folder / EXPERIMENT_FILE
     if source.is_file():
@@ -153,8 +154,9 @@ def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish
         "processes": {"replay": {"role": "scheduler", "publish": publish, "serve": serve}},
         GUEST: json.loads(joined.to_json()),
     }
-    run_folder.write_run(folder, facts)
-    try:
-        yield folder
-    finally:
-        run_folder.write_run(folder, {**facts, ENDED: "the replay is over"})
+    with locked(folder):
+        run_folder.write_run(folder, facts)
+        try:
+            yield folder
+        finally:
+            run_folder.write_run(folder, {**facts, ENDED: "the replay is over"})

@@ -15,13 +15,12 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load_expanded
 from afspm.record import ahead
-from afspm.record.facts import EXPERIMENT_FILE, read_facts
+from afspm.record.facts import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_facts
+from afspm.record.going_on import locked
 from afspm.record.journal import open_to_read
-from afspm.record.run import REPLAY_OF
 from afspm.record.whole import load
 from afspm.runtime.connect import find_run
 from afspm.supervisor import run as running
-from afspm.supervisor import run_folder
 from afspm.supervisor.ending import Why
 from afspm.supervisor.run import HOMES, HOW, ONLY, WITHOUT, Options, Run
 
@@ -78,7 +77,7 @@ def find(where: Path) -> Resumable:
     if facts.get(HOW) in _OVER:
         raise ConfigError("this run has ended as it should", where=str(folder), hint="`afspm run FILE` begins another")
     file = folder / EXPERIMENT_FILE
-    if not file.is_file() or not (folder / run_folder.STATE_DIR).is_dir():
+    if not file.is_file() or not (folder / STATE_DIR).is_dir():
         raise FileError("this is not the folder of a run", where=str(folder), hint="it lacks its experiment or state")
     homes = tuple(map(Path, facts.get(HOMES, []))) or (folder,)
     return Resumable(folder, str(facts.get("name", folder.name)), load_expanded(file, homes), facts, homes)
@@ -92,7 +91,7 @@ def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -
     experiment, folder, facts = found.experiment, found.folder, found.facts
     experiment.require_valid()
     options = found.options(options)
-    with run_folder.locked(folder):
+    with locked(folder):
         _wait_until_gone(facts, folder)
         clock = _clock(experiment, facts, folder)
         names = [*facts.get("processes", ()), *found.added]
@@ -111,7 +110,7 @@ def _clock(experiment: Experiment, facts: dict[str, Any], folder: Path) -> Exper
 def last_seen_ns(folder: Path) -> int:
     """The last time in the experiment that anything of the run's folder knows of; 0 if nothing does."""
     seen = [0]
-    state = folder / run_folder.STATE_DIR
+    state = folder / STATE_DIR
     for written in ahead.folders(state):
         seen += [one.packet.time_ns or 0 for one in ahead.written_ahead(written)]
     for file in state.glob("*.json"):

@@ -14,7 +14,9 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
 from afspm.experiment.wiring import connectable
 from afspm.record import ahead
-from afspm.runtime.connect import ENDED, GUEST, guest_facts
+from afspm.record.facts import ENDED, STATE_DIR
+from afspm.record.going_on import locked
+from afspm.runtime.connect import GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor import aftermath, common_clock, reporting, run_folder, summary
 from afspm.supervisor.aftermath import Ended
@@ -68,7 +70,7 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     names = [start.launch.name for start in first]
     clock = _common_clock(experiment, first, clock, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, now())
-    with run_folder.locked(folder):
+    with locked(folder):
         run_folder.write_experiment(folder, experiment.expanded())
         return go(experiment, options, clock, folder, experiment.name, terminal, names)
 
@@ -93,7 +95,7 @@ def go(
         facts = {**run_facts(name, starts, clock), **to_resume(experiment, starts, options)}
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
-            ahead.expect_record(folder / run_folder.STATE_DIR)
+            ahead.expect_record(folder / STATE_DIR)
         log.write(SUPERVISOR, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
         reporter = reporting.reporter(experiment, starts, clock)
         supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy(), reporter)
@@ -178,7 +180,7 @@ def _starts(
         without=options.without,
         clock=clock.as_dict(),
         run_dir=str(folder or ""),
-        state_dir=str(folder / run_folder.STATE_DIR) if folder else "",
+        state_dir=str(folder / STATE_DIR) if folder else "",
         log_level=logging.getLevelName(options.log_level),
     )
     if not starts:

@@ -5,19 +5,16 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from afspm.errors import FileError
-from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, RUN_FILE
+from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, RUN_FILE, STATE_DIR
 from afspm.record.whole import replace
 
 LOG_FILE = "log.txt"
-STATE_DIR = "state"
-LOCK_FILE = "running"
 MOST_RUNS_A_SECOND = 1000
 
 
@@ -41,33 +38,6 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
             hint="choose another with --runs",
         ) from error
     return folder
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """The run in this folder goes on while in the block; the system takes the lock back from whoever is killed.
-
-    Raises:
-        FileError: it goes on already, in another process.
-    """
-    with (folder / STATE_DIR / LOCK_FILE).open("a+b") as file:
-        try:
-            _lock(file)
-        except OSError as error:
-            raise FileError("this run is still going on", where=str(folder), hint="`afspm status` shows it") from error
-        yield
-
-
-def _lock(file: IO[bytes]) -> None:
-    if sys.platform == "win32":
-        import msvcrt
-
-        file.seek(0)
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def write_run(folder: Path, facts: Mapping[str, Any]) -> None:

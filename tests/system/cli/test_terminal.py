@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
@@ -154,6 +155,28 @@ def test_a_report_may_be_had_while_it_goes_on(night: Running) -> None:
     said = afspm("report", night.runs)
     assert said.returncode == 0, said.stderr
     assert "goes on" in Path(said.stdout.strip()).read_text(encoding="utf-8")
+
+
+def test_a_run_whose_supervisor_is_killed_is_told_as_cut_off_everywhere(tmp_path: Path) -> None:
+    run = Running(tmp_path)
+    run.wait_for(r"scan 1 of")
+    folder = str(run.runs / (run.runs / "latest").read_text(encoding="utf-8").strip())
+    watching = subprocess.Popen(
+        [*AFSPM, "watch", folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8"
+    )
+    assert watching.stdout is not None
+    assert "AUTOMATED" in watching.stdout.readline()
+    run.process.kill()
+    run.process.communicate(timeout=DEADLINE_S)
+    told = f"it was cut off; `afspm run --resume {folder}` goes on with it"
+    assert told in watching.communicate(timeout=DEADLINE_S)[1]
+    assert watching.returncode == NOT_RUNNING
+    for command in ("status", "pause"):
+        said = afspm(command, folder)
+        assert said.returncode == NOT_RUNNING
+        assert told in said.stderr
+    page = Path(afspm("report", folder).stdout.strip()).read_text(encoding="utf-8")
+    assert told in html.unescape(page)
 
 
 def test_end_asks_first(night: Running) -> None:

@@ -13,7 +13,9 @@ import pytest
 from afspm.cli.dashboard import resumed_with_dashboard
 from afspm.clock import NS_PER_S
 from afspm.errors import ConfigError, FileError
-from afspm.supervisor import resuming, run_folder
+from afspm.record.facts import STATE_DIR
+from afspm.record.going_on import locked
+from afspm.supervisor import resuming
 from afspm.supervisor.run import Options
 
 EXPERIMENT = """
@@ -157,10 +159,10 @@ def test_a_damaged_journal_does_not_keep_a_run_from_going_on(tmp_path: Path, con
 
 
 def test_a_lock_is_given_back_by_who_leaves(tmp_path: Path) -> None:
-    (tmp_path / run_folder.STATE_DIR).mkdir()
-    with run_folder.locked(tmp_path), pytest.raises(FileError, match="still going on"):
-        run_folder.locked(tmp_path).__enter__()
-    with run_folder.locked(tmp_path):
+    (tmp_path / STATE_DIR).mkdir()
+    with locked(tmp_path), pytest.raises(FileError, match="still going on"):
+        locked(tmp_path).__enter__()
+    with locked(tmp_path):
         pass
 
 

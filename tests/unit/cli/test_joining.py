@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -12,13 +12,16 @@ import typer
 from afspm.cli.joining import NOT_RUNNING, acting, looking
 from afspm.cli.status import _console
 from afspm.errors import NoResponse
+from afspm.record.going_on import locked
 
 
+@pytest.mark.parametrize("runs", [False, True], ids=["cut off", "it runs"])
 @pytest.mark.parametrize("keys", ["null", '{"folder": "keys"}'])
 @pytest.mark.parametrize("command", [looking, acting])
-def test_a_run_that_was_cut_off_says_how_it_goes_on(
+def test_a_run_that_was_cut_off_says_how_it_goes_on_and_one_that_runs_what_may_be_wrong(
     command: Callable[[Path], AbstractContextManager[object]],
     keys: str,
+    runs: bool,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -26,7 +29,7 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on(
     def nobody(*_: object) -> None:
         raise NoResponse("nobody is there")
 
-    (tmp_path / "night-1").mkdir()
+    (tmp_path / "night-1" / "state").mkdir(parents=True)
     (tmp_path / "night-1" / "run.json").write_text(
         f'{{"name": "night", "guest": {{"keys": {keys}}}}}', encoding="utf-8"
     )
@@ -34,12 +37,14 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on(
     monkeypatch.setattr("afspm.runtime.following.Follower.__init__", lambda *_: None)
     monkeypatch.setattr("afspm.runtime.following.Follower.close", lambda *_: None)
     monkeypatch.setattr("afspm.runtime.following.Follower.catch_up", nobody)
-    with pytest.raises(typer.Exit), command(tmp_path / "night-1"):
+    held = locked(tmp_path / "night-1") if runs else nullcontext()
+    with held, pytest.raises(typer.Exit), command(tmp_path / "night-1"):
         pass
     said = capsys.readouterr().err
     assert "nobody answers in night-1" in said
-    assert f"`afspm run --resume {tmp_path / 'night-1'}` goes on with it" in said
-    assert ("lacks the public key of terminal" in said) == (keys != "null")
+    assert (f"it was cut off; `afspm run --resume {tmp_path / 'night-1'}` goes on with it" in said) is not runs
+    assert ("though somebody runs it" in said) is runs
+    assert ("lacks the public key of terminal" in said) is (runs and keys != "null")
 
 
 def test_a_run_that_has_ended_is_named_from_its_folder_too(

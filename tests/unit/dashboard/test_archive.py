@@ -8,6 +8,7 @@ import pytest
 
 from afspm import wire
 from afspm.clock import ExperimentClock
+from afspm.dashboard.content import trouble
 from afspm.dashboard.record import Archive
 from afspm.dashboard.watch import Watch
 from afspm.model import (
@@ -28,8 +29,8 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.record.facts import REPLAY_OF
 from afspm.record.journal import SCHEDULER
-from afspm.record.run import REPLAY_OF
 from afspm.record.store import About, Store
 
 S = 1_000_000_000
@@ -92,6 +93,24 @@ def test_a_watch_rings_when_something_has_changed_and_tells_how_long_it_is_silen
     assert watch.silent_s() < 60.0
     assert watch.wait_free(0.0)
     assert not watch.wait_for(lambda overview: overview.control is not None, 0.01)
+
+
+class _Later(ExperimentClock):
+    """A minute later each time that it is asked."""
+
+    looks = 0
+
+    def monotonic_s(self) -> float:
+        type(self).looks += 1
+        return 60.0 * self.looks
+
+
+def test_a_run_that_is_silent_is_said_to_be_and_why_if_that_is_known() -> None:
+    said = {"": "", "it was cut off; `…` goes on with it": " It was cut off; `…` goes on with it."}
+    for cut_off, told in said.items():
+        watch = Watch(_Later(), cut_off=lambda text=cut_off: text)  # type: ignore[misc]
+        watch.take("ScopeStateMsg", ScopeStatus(ScopeState.FREE), S)
+        assert trouble(watch) == f"No word from the experiment for 1 min 00 s: what is shown is that old.{told}"
 
 
 @pytest.mark.timeout(60)

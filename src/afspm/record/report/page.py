@@ -53,7 +53,7 @@ def _when(story: Story) -> str:
     told = f"{from_to(story.start_ns, story.end_ns, UTC)}, {lasting(story.lasted_ns / NS_PER_S)}"
     if story.speed != 1.0:
         told += f" ({lasting(story.lasted_ns / NS_PER_S / story.speed)} real)"
-    return f"{told}; {story.ended or 'it goes on, or was killed'}"
+    return f"{told}; {story.ended}"
 
 
 def _cards(story: Story) -> str:

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from afspm.model import JournalEntry, ProcessCondition, ScopeState, names
+from afspm.record.facts import ENDED
+from afspm.record.going_on import cut_off
 from afspm.record.lanes import Lane, Span
 from afspm.record.overview import Overview, Restart
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow
 
 MOST_ROWS = 200
-ENDED = "ended"
 _PROCESS_TROUBLE = frozenset({ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP})
 
 
@@ -36,7 +37,7 @@ class Story:
     Attributes:
         start_ns, end_ns: the first and the last that is known of it.
         speed: experiment seconds in a real second.
-        ended: how it ended, in words; empty if it goes on, or was killed.
+        ended: how it ended, in words; that it goes on, or was cut off.
         problems: spans of all problems in the order of time.
         restarts, given_up: of processes.
         actions: what was done to the tip, e.g. pulses.
@@ -106,7 +107,7 @@ def read(run: Run) -> Story:
         start_ns=start_ns,
         end_ns=max(overview.newest_ns, start_ns),
         speed=float(clock.get("speed", 1.0)),
-        ended=str(run.facts.get(ENDED, "")),
+        ended=str(run.facts.get(ENDED) or cut_off(run.folder) or "it goes on"),
         overview=overview,
         scans=list(scans),
         spectra=len(run.spectra),

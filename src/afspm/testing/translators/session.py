@@ -19,6 +19,7 @@ from afspm.experiment import Experiment, Role, Start, load
 from afspm.experiment.parts import EMULATED
 from afspm.experiment.wiring import connectable
 from afspm.model import Frame
+from afspm.record.facts import STATE_DIR
 from afspm.runtime.component import Component
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
@@ -196,7 +197,7 @@ def _starts(
         without=[name for name in experiment.component_names if name not in {*wanted, NAME} or name in options.without],
         clock=clock.as_dict(),
         run_dir=str(folder),
-        state_dir=str(folder / run_folder.STATE_DIR),
+        state_dir=str(folder / STATE_DIR),
         log_level="DEBUG",
     )
     own = next(start.launch for start in starts if start.launch.name == NAME)

@@ -1,0 +1,72 @@
+"""Whether a run goes on, has ended, or was cut off: who runs it holds a lock, which nobody leaves behind."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+from afspm.errors import FileError
+from afspm.record.facts import ENDED, REPLAY_OF, STATE_DIR, known_facts
+
+LOCK_FILE = "running"
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """The run in this folder goes on while in the block; the system takes the lock back from whoever is killed.
+
+    Raises:
+        FileError: it goes on already, in another process.
+    """
+    with (folder / STATE_DIR / LOCK_FILE).open("a+b") as file:
+        try:
+            _lock(file)
+        except OSError as error:
+            raise FileError("this run is still going on", where=str(folder), hint="`afspm status` shows it") from error
+        yield
+
+
+def cut_off(folder: Path) -> str:
+    """What to say of a run whose supervisor was killed, or its computer; empty: it goes on, or has ended.
+
+    Only who can read the disk of the computer that it ran on can know.
+    """
+    facts = known_facts(folder)
+    if not facts or facts.get(ENDED) or _is_locked(folder):
+        return ""
+    if REPLAY_OF in facts:
+        return "this replay was cut off"
+    return f"it was cut off; {to_resume(folder)} goes on with it"
+
+
+def to_resume(folder: Path) -> str:
+    """The command that goes on with a run."""
+    return f"`afspm run --resume {shlex.quote(str(folder))}`"
+
+
+def _is_locked(folder: Path) -> bool:
+    try:
+        with (folder / STATE_DIR / LOCK_FILE).open("rb") as file:
+            _lock(file, shared=True)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
+def _lock(file: IO[bytes], *, shared: bool = False) -> None:
+    """Until it is closed. Raises OSError: another process has it."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

@@ -1,0 +1,47 @@
+"""Whether a run goes on, has ended or was cut off is known without asking it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.record.going_on import cut_off, locked
+
+
+def folder_of(tmp_path: Path, **facts: Any) -> Path:
+    folder = tmp_path / "night 1"
+    (folder / "state").mkdir(parents=True)
+    (folder / "run.json").write_text(json.dumps({"name": "night", **facts}), encoding="utf-8")
+    return folder
+
+
+def test_a_run_is_cut_off_if_nobody_runs_it_and_it_has_not_ended(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    assert cut_off(folder) == f"it was cut off; `afspm run --resume '{folder}'` goes on with it"
+    with locked(folder):
+        assert cut_off(folder) == ""
+    assert cut_off(folder), "who ran it is gone"
+
+
+def test_to_look_does_not_hold_up_who_wants_to_go_on(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    for _ in range(3):
+        assert cut_off(folder)
+        with locked(folder):
+            pass
+
+
+def test_a_replay_is_not_to_be_resumed(tmp_path: Path) -> None:
+    assert cut_off(folder_of(tmp_path, replay_of="runs/other")) == "this replay was cut off"
+
+
+@pytest.mark.parametrize("ended", ["the experiment has ended", "Ctrl-C"])
+def test_what_has_ended_was_not_cut_off(tmp_path: Path, ended: str) -> None:
+    assert cut_off(folder_of(tmp_path, ended=ended)) == ""
+
+
+def test_what_is_no_run_was_not_cut_off(tmp_path: Path) -> None:
+    assert cut_off(tmp_path) == ""
