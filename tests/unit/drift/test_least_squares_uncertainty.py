@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from afspm.drift.estimators.least_squares import LeastSquares
 from afspm.drift.estimators.least_squares.expected import shear_by_drift
 from afspm.drift.estimators.least_squares.shear import averaged, models
+from afspm.drift.estimators.least_squares.shrink import denoised
+from afspm.drift.estimators.least_squares.warp import derivative
 from afspm.drift.registration import DriftScan, Prior
 from afspm.model import Region
 
@@ -124,3 +126,22 @@ def test_what_shear_is_plausible_decides_where_shift_and_shear_are_alike() -> No
     assert total[0, 0] < 0.1
     drifting, _ = averaged(theta, covariance, models(1.0, 1.0), np.zeros(4))
     assert drifting[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_what_noise_is_left_in_a_shrunk_image_is_known_from_other_noise() -> None:
+    random = np.random.default_rng(3)
+    y, x = np.mgrid[:128, :128].astype(float)
+    image = np.exp(-(((x - 40) / 3) ** 2)) + np.sin(y / 9) * np.exp(-(((y - 80) / 20) ** 2))
+    own, other = (0.2 * random.standard_normal(image.shape) for _ in range(2))
+    shrunk, through = denoised(image + own, other)
+    left, told = np.vdot(shrunk, own), np.vdot(through, other)
+    assert 0.02 < left / np.vdot(own, own) < 0.5, "some of it is left, and most of it isn't"
+    assert told == pytest.approx(left, rel=0.15)
+
+
+def test_a_derivative_is_exact_for_short_waves_and_at_borders() -> None:
+    x = np.arange(40.0)
+    wave = np.sin(2 * np.pi * x / 5)
+    found = derivative(np.stack([wave] * 12, axis=1), 0)[8:-8, 3]
+    assert found == pytest.approx(2 * np.pi / 5 * np.cos(2 * np.pi * x / 5)[8:-8], abs=0.015)
+    assert derivative(np.stack([3.0 * x] * 12), 1) == pytest.approx(3.0)

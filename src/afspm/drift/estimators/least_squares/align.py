@@ -11,15 +11,17 @@ from afspm.drift.estimators.least_squares.prepare import flatten_rows
 from afspm.drift.estimators.least_squares.rows import LEAST_NOISE, noise_metric, products, seen, without_lines
 from afspm.drift.estimators.least_squares.shrink import denoised
 from afspm.drift.estimators.least_squares.spectra import FineFilter
-from afspm.drift.estimators.least_squares.warp import COUNT, Pair, derivative
+from afspm.drift.estimators.least_squares.warp import COUNT, SLOPES, Pair, derivative
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+Both = tuple[Array, Array]
 
 SHIFT: Index = np.array([0, 1, 6], dtype=np.intp)  # of theta: the shift and the gain
 ALL: Index = np.arange(COUNT, dtype=np.intp)
-ENOUGH_PX = 5e-4  # a step
-SETTLED_PX = 2e-3  # a round
+ROUNDS = 4
+SETTLED_PX = 1e-3
+LEAST_SIGNAL = 1.0  # of H'QH
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +38,7 @@ class Fit:
 
     Attributes:
         theta: (8,), see `Pair`.
-        curvature: (n, 8, 8), H'QJ with J the gradient as it is and H what of it is signal.
+        curvature: (n, 8, 8), H'QJ with J the gradient without noise and H what of it is known.
         spread: (n, 8, 8), H'QH, the covariance of `slope`.
         slope: (n, 8), H'Qr.
     """
@@ -64,50 +66,68 @@ def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, ste
 
 
 def generalised_least_squares(
-    pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter, rounds: int = 3, steps: int = 3
+    pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter, rounds: int = ROUNDS
 ) -> Fit:
     """theta by rows (see `rows`), where scars count less. The gradient, the noise and the weights are estimated anew in
     each round, from what the one before has left."""
-    fit = _round(pair, theta, believed, seen_through, steps)
-    for _ in range(rounds - 1):
-        before, fit = fit, _round(pair, fit.theta, believed, seen_through, steps)
-        if np.hypot(*(fit.theta - before.theta)[:2]) < SETTLED_PX:
+    for _ in range(rounds):
+        fit = _round(pair, theta, believed, seen_through)
+        moved = np.hypot(*(fit.theta - theta)[:2])
+        theta = fit.theta
+        if moved < SETTLED_PX:
             break
     return fit
 
 
-def _round(pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter, steps: int) -> Fit:
-    """Newton's steps to H'Q r + P (theta - mean) = 0. H is free of most of the noise of the gradient (see `shrink`),
-    but it is the gradient with its noise that says how r changes with theta."""
+def _round(pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
+    """Newton's step to H'Q r + P (theta - mean) = 0; H is the gradient J without most of its noise (see `shrink`).
+
+    Noise moves with theta as the surface does, but so does what of it has been left in H, and both cancel: what the
+    slope changes by is H'QJ with a J without noise. The noise in both is taken from their product.
+    """
     one, two, known = pair.warped(theta)
     mean, residual = (one + two) / 2, two - one
-    gradient = derivative(mean, 1), derivative(mean, 0)
     left = without_lines(residual, known)
-    signal = pair.columns(*_signal(gradient, left / 2, known), mean, residual)
+    gradient = derivative(mean, 1), derivative(mean, 0)
+    signal, noise_through, noise = _signal(gradient, left / 2, known)
     weight = known * _row_weights(left, known)[:, None]
-    signal_q = seen(signal, weight, noise_metric(left, known, seen_through))
-    left_over = float(np.vdot(signal_q[:, -1], residual))
-    signal_q *= max(weight.sum(), 1.0) / max(left_over, LEAST_NOISE * weight.sum(), LEAST_NOISE)
-    signal_q, signal = signal_q[:, :-1], signal[:, :-1]
-    curvature = products(signal_q, pair.columns(*gradient, mean, residual)[:, :-1])
-    slope = products(signal_q, residual[:, None])[:, :, 0]
-    for step in range(steps):
-        theta, moved = _stepped(theta, curvature.sum(axis=0), slope.sum(axis=0), believed, ALL)
-        if moved < ENOUGH_PX or step == steps - 1:
-            break
-        one, two, _ = pair.warped(theta)
-        slope = products(signal_q, (two - one)[:, None])[:, :, 0]
-    return Fit(theta, curvature, products(signal_q, signal), slope)
-
-
-def _signal(gradient: tuple[Array, Array], noise: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """What of a gradient is signal. Its rows are flattened first: the step from one row to the next holds the offsets
-    of both, and a patch can't tell them from a feature."""
-    gx, gy = (
-        denoised(flatten_rows(slope, known), without_lines(derivative(noise, axis), known))
-        for slope, axis in zip(gradient, (1, 0), strict=True)
+    metric = noise_metric(left, known, seen_through)
+    columns = pair.columns(*signal, mean, residual)
+    columns_q = seen(columns, weight, metric)
+    left_over = float(np.vdot(columns_q[:, -1], residual))
+    scale = max(weight.sum(), 1.0) / max(left_over, LEAST_NOISE * weight.sum(), LEAST_NOISE)
+    columns_q, columns = scale * columns_q[:, :-1], columns[:, :-1]
+    spread, curvature = (
+        products(columns_q, columns),
+        products(columns_q, pair.columns(*gradient, mean, residual)[:, :-1]),
     )
-    return gx, gy
+    through_q = seen(pair.slopes(*noise_through), weight, metric)
+    curvature[:, :SLOPES, :SLOPES] -= scale * products(through_q, pair.slopes(*noise))
+    curvature = _no_less(curvature, spread)
+    slope = products(columns_q, residual[:, None])[:, :, 0]
+    after, _ = _stepped(theta, curvature.sum(axis=0), slope.sum(axis=0), believed, ALL)
+    return Fit(after, curvature, spread, slope + curvature @ (after - theta))
+
+
+def _signal(gradient: Both, noise: Array, known: NDArray[np.bool_]) -> tuple[Both, Both, Both]:
+    """What of a gradient is signal, what of noise would come through with it, and that noise. Its rows are flattened
+    first: the step from one row to the next holds the offsets of both, and a patch can't tell them from a feature."""
+    nx, ny = (without_lines(derivative(noise, axis), known) for axis in (1, 0))
+    x, through_x = denoised(flatten_rows(gradient[0], known), nx)
+    y, through_y = denoised(flatten_rows(gradient[1], known), ny)
+    return (x, y), (through_x, through_y), (nx, ny)
+
+
+def _no_less(curvature: Array, spread: Array) -> Array:
+    """H'QJ, but in no direction less than H'QH. They are about the same; where a direction is hardly seen, nothing but
+    noise may be left of the difference that the curvature is."""
+    from scipy.linalg import eigh
+
+    total, whole = curvature.sum(axis=0), spread.sum(axis=0)
+    values, vectors = eigh((total + total.T) / 2, whole + 1e-12 * np.trace(whole) * np.eye(len(whole)))
+    missing = np.maximum(LEAST_SIGNAL - values, 0.0)
+    raised: Array = curvature + spread @ (vectors * missing) @ vectors.T @ whole
+    return raised
 
 
 def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, free: Index) -> tuple[Array, float]:

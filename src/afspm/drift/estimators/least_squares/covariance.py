@@ -9,7 +9,6 @@ from afspm.drift.estimators.least_squares.align import Believed, Fit
 
 Array = NDArray[np.float64]
 
-INFLATION = 1.6  # few blocks hold most features, so the variation is itself uncertain: set by the coverage measured
 FLOOR_PX = 1e-3
 
 
@@ -29,6 +28,6 @@ def covariance(fit: Fit, believed: Believed) -> Array:
     change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
     varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
     size = float(np.trace(np.linalg.solve(model[:2, :2], varied[:2, :2]))) / 2
-    total: Array = INFLATION * max(size, 1.0) * (model + model.T) / 2
+    total: Array = max(size, 1.0) * (model + model.T) / 2
     total[:2, :2] += FLOOR_PX**2 * np.eye(2)
     return total

@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
 GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
+BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
 FARTHEST_PX = 8.0  # from where the search has found it
 SURROGATES_PX = 16  # the farthest shift that a match is compared with
 
@@ -117,7 +118,7 @@ def _fine(
     """theta and its covariance."""
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
-    pair = Pair(*scene.splines(values, order=5), box)
+    pair = Pair(*scene.splines(values, order=5), box.without_border(BORDER_PX))
     believed = _believed(expected)
     fit = generalised_least_squares(pair, theta, believed, fine)
     return shear.averaged(fit.theta, covariance(fit, believed), shears[1], shears[0])

@@ -13,20 +13,13 @@ from afspm.drift.estimators.least_squares.warp import LINEAR
 Array = NDArray[np.float64]
 
 DRIFTS = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)  # displacement per length along y
-TURNS_RAD = (2e-4, 0.002, 0.01)
-ANYTHING = (2e-4, 0.003, 0.01)  # of each element: creep, calibration
+BESIDES = (2e-4, 0.01)  # of each element: next to nothing; or creep, a sample that turns, another calibration
 
 
 def of_drift(sd: float) -> Array:
     """Covariance of (axx, axy, ayx, ayy) when drift during the scans shears them: each row is displaced against the one
     before, so what depends on y varies alone."""
     return sd**2 * np.diag([0.0, 1.0, 0.0, 1.0])
-
-
-def of_turn(sd_rad: float) -> Array:
-    """The same of a small rotation."""
-    turn = np.array([0.0, 1.0, -1.0, 0.0])
-    return sd_rad**2 * np.outer(turn, turn)
 
 
 def models(drift: float | None, aspect: float) -> list[Array]:
@@ -37,9 +30,8 @@ def models(drift: float | None, aspect: float) -> list[Array]:
         aspect: height of a pixel over its width.
     """
     to_px = np.diag([1.0, aspect, 1.0 / aspect, 1.0])
-    besides = [of_turn(t) + ANYTHING[0] ** 2 * np.eye(4) for t in TURNS_RAD] + [a**2 * np.eye(4) for a in ANYTHING[1:]]
     drifts = DRIFTS if drift is None else (drift,)
-    return [to_px @ (of_drift(d) + more) @ to_px for d, more in itertools.product(drifts, besides)]
+    return [to_px @ (of_drift(d) + b**2 * np.eye(4)) @ to_px for d, b in itertools.product(drifts, BESIDES)]
 
 
 def averaged(theta: Array, covariance: Array, covariances: Iterable[Array], mean: Array) -> tuple[Array, Array]:

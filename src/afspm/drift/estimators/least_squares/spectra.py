@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance
-BLUR_PX = 0.6  # takes what interpolation would alias
+BLUR_PX = 0.45  # takes what interpolation would alias
 
 
 def cosine_frequencies(shape: tuple[int, ...]) -> Array:
@@ -22,7 +22,7 @@ def cosine_frequencies(shape: tuple[int, ...]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FineFilter:
-    """The radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.6²) that the fine alignment sees both images through.
+    """The radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.45²) through which the fine alignment sees both.
 
     Applied to both of two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and
     Thomson, Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S and N come from the radial
