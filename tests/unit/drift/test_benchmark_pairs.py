@@ -10,7 +10,7 @@ import pytest
 from benchmarks.drift.bounds import bounds, row_precision
 from benchmarks.drift.conditions import CONDITIONS, Array, flattened, measured
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, Sampling, pair
-from benchmarks.drift.surfaces import SURFACES
+from benchmarks.drift.surfaces import OVERSAMPLING, SURFACES, Grid
 from scipy import ndimage
 
 from afspm.drift.registration import DriftScan
@@ -82,6 +82,18 @@ def test_a_prior_is_wrong_by_its_standard_deviation() -> None:
         assert np.allclose(made.prior.covariance_m2, (1.5 * PIXEL_M) ** 2 * np.eye(2))
         off.append((made.prior.mean_m - made.truth.displacement_m) / PIXEL_M)
     assert np.std(off) == pytest.approx(1.5, rel=0.15)
+
+
+def test_no_view_of_a_lattice_is_without_a_defect() -> None:
+    """Without one, its sites are all alike, and a displacement between them has no truth that could be found."""
+    grid = Grid(64.0)
+    every_atom_px = 10  # a square of that side has at least one in it
+    for seed in range(12):
+        height = SURFACES["lattice"](grid, np.random.default_rng(seed), np.random.default_rng([seed, 1]))
+        highest = ndimage.maximum_filter(height, every_atom_px * OVERSAMPLING)
+        atom, side = float(np.median(highest)), 97 * OVERSAMPLING
+        for view in (highest[:side, :side], highest[:side, -side:], highest[-side:, :side], highest[-side:, -side:]):
+            assert view.min() < 0.8 * atom or view.max() > 1.2 * atom
 
 
 def test_noise_has_the_size_it_is_said_to_have() -> None:
