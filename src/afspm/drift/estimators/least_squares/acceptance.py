@@ -26,6 +26,7 @@ class Evidence:
     overlap: float
     sd_px: float
     gap: float
+    rival: float
     information: float
     agreement: float
     correlation: float
@@ -43,6 +44,9 @@ class Limits:
         overlap, overlap_expected: least part of the smaller scan; the latter where there is a prior.
         sd_px: largest standard deviation of the shift.
         gap: how much likelier, in nats, than any other shift.
+        rival: likelihood of another shift, in nats, over that of the match, both compared with none. Where features of
+            one kind are far apart, one may fit another as well as itself, and only shows less: the match may then be
+            the wrong one. A surface that repeats itself has many such, and `gap` and what is asked of it besides count.
         information: mutual information of the aligned scans, nats.
         agreement: share of the parts of the overlap with features that correlate.
         correlation: mean over the parts, by their features.
@@ -61,6 +65,7 @@ class Limits:
     overlap_expected: float = 0.2
     sd_px: float = 0.3
     gap: float = 1.0
+    rival: float = 0.65
     information: float = 60.0
     agreement: float = 0.7
     correlation: float = 0.6
@@ -95,9 +100,9 @@ class Limits:
             return f"the scans overlap by {found.overlap:.0%} only, {overlap:.0%} are needed"
         if found.agreement < self.agreement:
             return f"only {found.agreement:.0%} of the parts with features agree, {self.agreement:.0%} are needed"
-        if found.gap < self.gap:
-            return f"ambiguous: another displacement is almost as likely ({found.gap:.1f} nats less)"
         repeats = found.edges_gap < self.distinct
+        if found.gap < self.gap or (found.rival > self.rival and not repeats):
+            return f"ambiguous: another displacement is almost as likely ({found.gap:.1f} nats less)"
         if found.edges_gap < self.edges_gap or (repeats and found.correlation_gap < self.correlation_gap):
             return "other displacements correlate as well"
         if repeats and found.outliers > self.outliers and found.correlation < self.alike:

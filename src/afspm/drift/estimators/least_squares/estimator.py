@@ -75,7 +75,7 @@ class LeastSquares:
         theta, total = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
         if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
             return Registration.refused("no displacement fits: the scans hold nothing in common")
-        found = _evidence(scene, box, theta, total, start[1], expected)
+        found = _evidence(scene, box, theta, total, start[1:], expected)
         return self._registration(theta, total, box, grid, found, expected=prior is not None)
 
     def _registration(
@@ -95,9 +95,9 @@ class LeastSquares:
         )
 
 
-def _coarse(scene: Scene, expected: Expected | None) -> tuple[Array, float] | None:
-    """theta within a fraction of a pixel, and by how many nats it is likelier than any other; on smaller images where
-    they are large."""
+def _coarse(scene: Scene, expected: Expected | None) -> tuple[Array, float, float] | None:
+    """theta within a fraction of a pixel, its log-likelihood and that of the best other; on smaller images where they
+    are large."""
     small, factor, offset = scene.smaller()
     scaled = None if expected is None else expected.on_smaller(factor, offset)
     best = Scorer(small, scaled).best(candidates(small, scaled))
@@ -109,7 +109,7 @@ def _coarse(scene: Scene, expected: Expected | None) -> tuple[Array, float] | No
     theta = least_squares(pair, theta, _believed(scaled), SHIFT, steps=4)
     theta = least_squares(pair, theta, _believed(scaled), ALL, steps=4)
     theta[:2] = theta[:2] * factor + offset
-    return theta, best[1]
+    return theta, best[0].likelihood, best[1]
 
 
 def _fine(
@@ -142,7 +142,9 @@ def _shear_models(prior: Prior | None, reference: DriftScan, scan: DriftScan, gr
     return mean.ravel(), shear.models(sd, float(height / width))
 
 
-def _evidence(scene: Scene, box: Box, theta: Array, total: Array, gap: float, expected: Expected | None) -> Evidence:
+def _evidence(
+    scene: Scene, box: Box, theta: Array, total: Array, likelihoods: tuple[float, float], expected: Expected | None
+) -> Evidence:
     one, two, known = Pair(*scene.smooth_splines, box).warped(theta)
     one, two = without_lines(one, known), without_lines(two, known)
     edges = Pair(*scene.band_splines, box).warped(theta)
@@ -151,7 +153,8 @@ def _evidence(scene: Scene, box: Box, theta: Array, total: Array, gap: float, ex
     return Evidence(
         overlap=float(known.sum() / scene.least_known),
         sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
-        gap=gap,
+        gap=likelihoods[0] - likelihoods[1],
+        rival=likelihoods[1] / max(likelihoods[0], 1e-300),
         information=shared_information(one, two),
         agreement=share,
         correlation=correlation,

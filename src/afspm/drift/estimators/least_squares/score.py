@@ -41,13 +41,13 @@ class Scorer:
         ]
 
     def best(self, shifts: list[Array]) -> tuple[Scored, float] | None:
-        """The likeliest, and by how many nats it is so before any other; None: they all overlap too little."""
+        """The likeliest, and the likelihood of the best of the others; None: they all overlap too little."""
         scored = [s for s in map(self._score, shifts) if s is not None]
         if not scored:
             return None
         best = max(scored, key=lambda s: s.likelihood)
         rest = [s.likelihood for s in scored if np.hypot(*(s.shift_px - best.shift_px)) > OTHER_PX]
-        return best, float(best.likelihood - max(rest, default=0.0))
+        return best, max(rest, default=0.0)
 
     def _score(self, shift: Array) -> Scored | None:
         box = self._scene.box(shift)
