@@ -11,6 +11,7 @@ from benchmarks.drift.bounds import bounds, row_precision
 from benchmarks.drift.conditions import CONDITIONS, Array, flattened, measured
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, Sampling, pair
 from benchmarks.drift.surfaces import OVERSAMPLING, SURFACES, Grid
+from benchmarks.drift.trials import PUBLISHED, Cell, Trial
 from scipy import ndimage
 
 from afspm.drift.registration import DriftScan
@@ -149,3 +150,14 @@ def test_what_is_unknown_besides_makes_the_bound_larger() -> None:
     for surface in SURFACES:
         best = bounds(pair(surface, "hard", seed=2))
         assert np.trace(best.white) < np.trace(best.rows) < np.trace(best.full)
+
+
+def test_the_published_estimator_is_as_inexact_and_as_trusting_as_it_was_measured() -> None:
+    """0.13 px on rough ground; and scans that have nothing in common are accepted."""
+    pytest.importorskip("skimage")
+    trials = [Trial("", "rough", "real", seed, (PUBLISHED,)) for seed in range(8)]
+    found = Cell.of(outcome for trial in trials for outcome in trial.run())
+    assert found.failed == 0.0
+    assert 0.06 < found.rms_px < 0.26
+    (elsewhere,) = Trial("", "particles", "null", 1, (PUBLISHED,)).run()
+    assert elsewhere.accepted
