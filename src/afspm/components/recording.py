@@ -24,6 +24,8 @@ MOST_BYTES = 256 << 20
 """So much waits to be written at most; beyond it all is dropped, and taken from what others keep once there is room."""
 MUCH_BYTES = 64 << 20
 AT_ONCE, AT_ONCE_BYTES = 500, 32 << 20
+LINGER_S = 0.05
+"""What has come waits so long for more, so that nothing is recorded while it is still on its way to others."""
 AGAIN_S = 2.0
 QUIET_S = 1.0
 SURE_S = 5.0
@@ -190,6 +192,8 @@ class Writer:
         """The next packets; none if nothing has come for a while, or it is ending."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._ending is not None, QUIET_S)
+            if self._queue and self._state is not None:  # where it is written ahead, and so nothing is lost meanwhile
+                self._changed.wait_for(lambda: self._bytes > AT_ONCE_BYTES or self._ending is not None, LINGER_S)
             batch: list[_Item] = []
             size = 0
             while self._queue and len(batch) < AT_ONCE and size < AT_ONCE_BYTES:
