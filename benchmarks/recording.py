@@ -37,8 +37,8 @@ PACED = 20
 FAST = 20
 """Scans of 512² a second: 40 MB/s, more than microscopes deliver."""
 FLOOD = 60
-"""Scans as fast as they can be sent: more than a gigabyte a second, which few disks take. Then each costs what it takes to
-write it down; the recorder itself works when there is nothing else to do."""
+"""Scans as fast as they can be sent: more than a gigabyte a second, which few disks take. Then each costs what it takes
+to write it down; the recorder itself works when there is nothing else to do."""
 RECORDED_WITHIN_S = 120.0
 SCANS = 10_000
 START_NS = 1_773_518_400_000_000_000
