@@ -170,6 +170,27 @@ def test_scans_of_different_places_are_refused(seed: int) -> None:
     assert found.reason
 
 
+def test_one_of_two_like_features_is_refused_unless_one_knows_which_to_expect() -> None:
+    """The reference shows both, 600 nm apart, and the scan one of them, which may be either: a little more is shared if
+    it is the first."""
+    drift_m = np.array([250 * NM, 20 * NM])
+
+    def bumps(moved_m: NDArray[np.float64], start_s: float) -> DriftScan:
+        x, y = REGION.pixels_m((96, 96))
+        away = [np.hypot(x - moved_m[0] - at, 1.3 * (y - moved_m[1])) for at in (-300 * NM, 300 * NM)]
+        values = sum(NM / (1.0 + np.exp((r - 120 * NM) / (8 * NM))) for r in away)
+        noise = 0.02 * NM * np.random.default_rng(int(start_s)).standard_normal(values.shape)
+        return DriftScan(values + noise, REGION, start_s, start_s + 100.0, upwards=True)
+
+    reference, scan = bumps(np.zeros(2), 0.0), bumps(drift_m, 900.0)
+    found = registered(scan, reference)
+    assert not found.accepted
+    assert "ambiguous" in found.reason
+    assert found.quality["gap"] > 1.0
+    known = registered(scan, reference, Prior(drift_m + 10 * NM, (30 * NM) ** 2 * np.eye(2)))
+    assert_displaced(known, drift_m, 2 * NM)
+
+
 def test_a_scan_lies_on_itself_exactly() -> None:
     values = np.random.default_rng(3).normal(size=(64, 64)).cumsum(0).cumsum(1)
     scan = DriftScan(values, Region((0, 0), (1e-6, 1e-6)), 0.0, 1.0)
