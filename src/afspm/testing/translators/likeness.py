@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 LIKE = 0.6
 """Correlation from which on two pictures show the same."""
 CLEARLY = 0.1
+_EQUAL = 0.01
 _SHIFTS = (-0.04, -0.02, 0.0, 0.02, 0.04)
 """Of the larger scan: drift between two scans, and an imperfect scanner."""
 _INSIDE = 0.6
@@ -73,6 +74,15 @@ def likenesses(larger: Picture, details: Sequence[Picture]) -> dict[str, float]:
         name: float(np.mean([_best(idea(larger), idea(detail)) for detail in details]))
         for name, idea in ideas(larger.region.angle_rad).items()
     }
+
+
+def best_of(found: dict[str, float]) -> tuple[str, float]:
+    """The idea of `likenesses` that explains the scans, and how well: of those that do as well, the first and simplest.
+
+    With few details two may be the same: one that is square fits swapped as well as half a frame away.
+    """
+    most = max(found.values())
+    return next((name, likeness) for name, likeness in found.items() if likeness >= most - _EQUAL)
 
 
 def _best(larger: Picture, detail: Picture) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from afspm.model import names
 from afspm.testing.translators.frames import Frame
-from afspm.testing.translators.likeness import CLEARLY, LIKE, Picture, likenesses
+from afspm.testing.translators.likeness import CLEARLY, LIKE, Picture, best_of, likenesses
 from afspm.testing.translators.registry import check
 from afspm.testing.translators.taking import Taken, Taking
 from afspm.testing.translators.verdicts import Failed, Skipped
@@ -25,7 +25,7 @@ def picture(kit: Taking) -> None:
     if not found:
         raise Failed("the same channels in all scans", "none that all have")
     best = max(found, key=lambda likeness: max(likeness.values()))
-    name, likeness = max(best.items(), key=lambda item: item[1])
+    name, likeness = best_of(best)
     as_told = best["as told"]
     if likeness < LIKE:
         raise Skipped(f"no structure is seen in all scans (correlation {likeness:.2f}): noise shows no coordinates")
