@@ -129,7 +129,7 @@ def _only_if_running(folder: Path) -> Iterator[None]:
     except NoResponse:
         if told := cut_off(folder):
             say_nothing_runs(f"nobody answers in {folder.resolve().name}; {told}")
-        said = f"nobody answers in {folder.resolve().name}, though somebody runs it"
+        said = f"nobody answers in {folder.resolve().name}, though it has not ended"
         if (known_facts(folder).get("guest") or {}).get("keys"):
             said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
         say_nothing_runs(said)

@@ -36,11 +36,19 @@ def cut_off(folder: Path) -> str:
     Only who can read the disk of the computer that it ran on can know.
     """
     facts = known_facts(folder)
-    if not facts or facts.get(ENDED) or _is_locked(folder):
+    if not facts or facts.get(ENDED) or not _is_left(folder):
         return ""
     if REPLAY_OF in facts:
         return "this replay was cut off"
     return f"it was cut off; {to_resume(folder)} goes on with it"
+
+
+def standing(folder: Path) -> str:
+    """How it is with a run, in words: how it ended, that it was cut off, that it goes on."""
+    if ended := known_facts(folder).get(ENDED):
+        return str(ended)
+    known = (folder / STATE_DIR / LOCK_FILE).exists()
+    return cut_off(folder) or ("it goes on" if known else "it goes on, or was cut off")
 
 
 def to_resume(folder: Path) -> str:
@@ -48,15 +56,14 @@ def to_resume(folder: Path) -> str:
     return f"`afspm run --resume {shlex.quote(str(folder))}`"
 
 
-def _is_locked(folder: Path) -> bool:
+def _is_left(folder: Path) -> bool:
+    """Whether somebody had the lock, and nobody has it."""
     try:
         with (folder / STATE_DIR / LOCK_FILE).open("rb") as file:
             _lock(file, shared=True)
-    except FileNotFoundError:
-        return False
     except OSError:
-        return True
-    return False
+        return False
+    return True
 
 
 def _lock(file: IO[bytes], *, shared: bool = False) -> None:

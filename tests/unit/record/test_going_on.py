@@ -8,13 +8,15 @@ from typing import Any
 
 import pytest
 
-from afspm.record.going_on import cut_off, locked
+from afspm.record.going_on import cut_off, locked, standing
 
 
 def folder_of(tmp_path: Path, **facts: Any) -> Path:
     folder = tmp_path / "night 1"
     (folder / "state").mkdir(parents=True)
     (folder / "run.json").write_text(json.dumps({"name": "night", **facts}), encoding="utf-8")
+    with locked(folder):
+        pass
     return folder
 
 
@@ -43,5 +45,18 @@ def test_what_has_ended_was_not_cut_off(tmp_path: Path, ended: str) -> None:
     assert cut_off(folder_of(tmp_path, ended=ended)) == ""
 
 
-def test_what_is_no_run_was_not_cut_off(tmp_path: Path) -> None:
+def test_of_what_nobody_ran_here_that_is_not_said(tmp_path: Path) -> None:
     assert cut_off(tmp_path) == ""
+    folder = folder_of(tmp_path)
+    (folder / "state" / "running").unlink()
+    assert cut_off(folder) == ""
+    assert standing(folder) == "it goes on, or was cut off"
+
+
+def test_how_it_is_with_a_run_is_told_in_words(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    assert standing(folder) == cut_off(folder)
+    with locked(folder):
+        assert standing(folder) == "it goes on"
+    (folder / "run.json").write_text(json.dumps({"ended": "Ctrl-C"}), encoding="utf-8")
+    assert standing(folder) == "Ctrl-C"

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from afspm.model import JournalEntry, ProcessCondition, ScopeState, names
-from afspm.record.facts import ENDED
-from afspm.record.going_on import cut_off
+from afspm.record.going_on import standing
 from afspm.record.lanes import Lane, Span
 from afspm.record.overview import Overview, Restart
 from afspm.record.run import Run
@@ -107,7 +106,7 @@ def read(run: Run) -> Story:
         start_ns=start_ns,
         end_ns=max(overview.newest_ns, start_ns),
         speed=float(clock.get("speed", 1.0)),
-        ended=str(run.facts.get(ENDED) or cut_off(run.folder) or "it goes on"),
+        ended=standing(run.folder),
         overview=overview,
         scans=list(scans),
         spectra=len(run.spectra),
