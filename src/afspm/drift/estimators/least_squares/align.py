@@ -21,7 +21,6 @@ SHIFT: Index = np.array([0, 1, 6], dtype=np.intp)  # of theta: the shift and the
 ALL: Index = np.arange(COUNT, dtype=np.intp)
 ROUNDS = 4
 SETTLED_PX = 1e-3
-LEAST_SIGNAL = 1.0  # of H'QH
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +64,10 @@ def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, ste
     return theta
 
 
-def generalised_least_squares(
-    pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter, rounds: int = ROUNDS
-) -> Fit:
+def generalised_least_squares(pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
     """theta by rows (see `rows`), where scars count less. The gradient, the noise and the weights are estimated anew in
     each round, from what the one before has left."""
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         fit = _round(pair, theta, believed, seen_through)
         moved = np.hypot(*(fit.theta - theta)[:2])
         theta = fit.theta
@@ -97,10 +94,8 @@ def _round(pair: Pair, theta: Array, believed: Believed, seen_through: FineFilte
     left_over = float(np.vdot(columns_q[:, -1], residual))
     scale = max(weight.sum(), 1.0) / max(left_over, LEAST_NOISE * weight.sum(), LEAST_NOISE)
     columns_q, columns = scale * columns_q[:, :-1], columns[:, :-1]
-    spread, curvature = (
-        products(columns_q, columns),
-        products(columns_q, pair.columns(*gradient, mean, residual)[:, :-1]),
-    )
+    spread = products(columns_q, columns)
+    curvature = products(columns_q, pair.columns(*gradient, mean, residual)[:, :-1])
     through_q = seen(pair.slopes(*noise_through), weight, metric)
     curvature[:, :SLOPES, :SLOPES] -= scale * products(through_q, pair.slopes(*noise))
     curvature = _no_less(curvature, spread)
@@ -124,8 +119,10 @@ def _no_less(curvature: Array, spread: Array) -> Array:
     from scipy.linalg import eigh
 
     total, whole = curvature.sum(axis=0), spread.sum(axis=0)
-    values, vectors = eigh((total + total.T) / 2, whole + 1e-12 * np.trace(whole) * np.eye(len(whole)))
-    missing = np.maximum(LEAST_SIGNAL - values, 0.0)
+    if not (np.isfinite(total).all() and np.isfinite(whole).all()):
+        return curvature
+    values, vectors = eigh((total + total.T) / 2, whole + 1e-12 * (1.0 + np.trace(whole)) * np.eye(len(whole)))
+    missing = np.maximum(1.0 - values, 0.0)
     raised: Array = curvature + spread @ (vectors * missing) @ vectors.T @ whole
     return raised
 
