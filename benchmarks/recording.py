@@ -36,6 +36,7 @@ PACE_S = 0.1
 PACED = 20
 FAST = 20
 """Scans of 512² a second: 40 MB/s, more than microscopes deliver."""
+WARM = 6
 FLOOD = 60
 """Scans as fast as they can be sent: more than a gigabyte a second, which few disks take. Then each costs what it takes
 to write it down; the recorder itself works when there is nothing else to do."""
@@ -61,6 +62,11 @@ def recording() -> Iterator[Row]:
         recorded_line.ours(1, recorded=True)
         line.ours(1)
 
+        for one in (recorded_line, line):  # as after some minutes: what is written goes over what was
+            for _ in range(WARM):
+                _at_pace_per_s(one, payload)
+        recorded_line.wait_until_sure()
+
         def both(
             measure: Callable[..., float],
             times: int,
@@ -77,7 +83,7 @@ def recording() -> Iterator[Row]:
         at_pace = both(_at_pace_per_s, ALTERNATIONS)
         yield Row(f"scans of 512², {FAST} a second, recorded", "1/s", *at_pace, 0.95, "high")
         floods = both(_flood_per_s, FLOODS, rest=recorded_line.wait_until_sure)
-        yield Row("a flood of scans of 512², recorded", "1/s", *floods, 0.5, "high")
+        yield Row("a flood of scans of 512², recorded", "1/s", *floods, 0.8, "high")
         ours, bare = alternate(
             partial(_recorded_mb_per_s, recorded_line, payload), partial(_written_mb_per_s, payload), FLOODS
         )
