@@ -6,11 +6,13 @@ const LOST_AFTER_MS = 6000;
 let image = null;
 let updated = Date.now();
 let ended = false;
+let watched = null;
 
 /** Called by the dashboard several times a second; its answer says that we keep up. */
 function update(state) {
   updated = Date.now();
   ended = state.ended;
+  watchSocket();
   const root = document.querySelector("#image");
   if (!image && root) image = new ImageView(root);
   image?.setChannels(state.channels);
@@ -33,13 +35,23 @@ function showTrouble(text) {
   document.body.classList.toggle("old", Boolean(text));
 }
 
-setInterval(() => {
-  if (Date.now() - updated < LOST_AFTER_MS && window.socket?.connected !== false) return;
+function tellLost() {
   allowSteering(false);
   image?.setSteering(false);
   const seconds = Math.round((Date.now() - updated) / 1000);
   showTrouble(ended ? "The experiment has ended, and the dashboard with it. What is shown is how it ended."
     : `The connection to the dashboard is lost: what is shown is ${seconds} s old. It is tried again.`);
+}
+
+/** At once, and not at the next look: a dashboard that is started again may be back before that. */
+function watchSocket() {
+  if (!window.socket || watched === window.socket) return;
+  watched = window.socket;
+  watched.on("disconnect", tellLost);
+}
+
+setInterval(() => {
+  if (Date.now() - updated >= LOST_AFTER_MS || window.socket?.connected === false) tellLost();
 }, 1000);
 
 document.addEventListener("click", (event) => {
