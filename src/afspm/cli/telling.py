@@ -161,7 +161,7 @@ def _bar(part: float, about: About) -> str:
 def _left(left_ns: int | None, about: About) -> str:
     if left_ns is None:
         return ""
-    real = f" ({lasting((round(left_ns / about.speed)) / NS_PER_S)} real)" if about.speed != 1.0 else ""
+    real = f" ({lasting(left_ns / about.speed / NS_PER_S)} real)" if about.speed != 1.0 else ""
     return f"{lasting(left_ns / NS_PER_S)} left{real}"
 
 

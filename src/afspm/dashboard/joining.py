@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import os
 import signal
@@ -14,7 +13,10 @@ from types import FrameType
 
 from afspm.clock import ExperimentClock
 from afspm.dashboard.dashboard import Dashboard
+from afspm.errors import FileError
+from afspm.record.facts import STATE_DIR
 from afspm.runtime.connect import guest_of
+from afspm.runtime.memory import Memory
 from afspm.runtime.messages import register_all
 from afspm.runtime.process import Activity, Context
 from afspm.transport.launching import open_port
@@ -32,7 +34,7 @@ def join(folder: Path, dashboard: Dashboard, name: str) -> int:
     """
     launch = guest_of(folder, name)
     register_all(launch.messages)
-    launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / "state"))
+    launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / STATE_DIR))
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
     context = Context(
@@ -64,11 +66,10 @@ def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
 
 def url_in(launch_facts: object, folder: Path, name: str) -> str | None:
     """Where the dashboard that the run was started with is; None if it has none of this name."""
-
     if not isinstance(launch_facts, dict) or name not in launch_facts:
         return None
     try:
-        url = json.loads((folder / "state" / f"{name}.json").read_text(encoding="utf-8")).get("url")
-    except (OSError, ValueError, AttributeError):
+        url = Memory(folder / STATE_DIR / f"{name}.json").get("url")
+    except FileError:
         return None
     return url if isinstance(url, str) else None

@@ -156,20 +156,22 @@ class Pair:
     def columns(self, gx: Array, gy: Array, mean: Array, residual: Array, free: Iterable[int] = range(8)) -> Array:
         """[y, column, x]: the derivatives of the residual by what is free of theta, given the gradient of the mean; and
         the residual."""
-        x, y = self._from_center
-        by = (gx, gy, (gx, x), (gx, y), (gy, x), (gy, y), -mean, (mean, -mean / 2))
-        chosen = [column[0] * column[1] if isinstance(column, tuple) else column for column in (by[i] for i in free)]
-        return np.stack([*chosen, residual], axis=1)
+        by = (*self._by_slopes(gx, gy), -mean, (mean, -mean / 2))
+        return np.stack([*(_product(by[i]) for i in free), residual], axis=1)
 
     def slopes(self, gx: Array, gy: Array) -> Array:
         """The first columns alone, that there is a gradient in."""
-        x, y = self._from_center
-        return np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y], axis=1)
+        return np.stack([_product(column) for column in self._by_slopes(gx, gy)], axis=1)
 
-    @property
-    def _from_center(self) -> tuple[Array, Array]:
+    def _by_slopes(self, gx: Array, gy: Array) -> tuple[Array | tuple[Array, Array], ...]:
+        """The columns that there is a gradient in, where they are products as their factors."""
         cx, cy = self.box.center
-        return self.box.x[None, :] - cx, self.box.y[:, None] - cy
+        x, y = self.box.x[None, :] - cx, self.box.y[:, None] - cy
+        return gx, gy, (gx, x), (gx, y), (gy, x), (gy, y)
+
+
+def _product(column: Array | tuple[Array, Array]) -> Array:
+    return column[0] * column[1] if isinstance(column, tuple) else column
 
 
 NINE_POINTS = np.array([3.0, -32.0, 168.0, -672.0, 0.0, 672.0, -168.0, 32.0, -3.0]) / 840.0
