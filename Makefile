@@ -21,7 +21,7 @@ demo-drift: $(SETUP)
 	@$(BIN)/afspm run experiments/drift_night/experiment.toml
 
 ## all tests: more at a time than there are cores, since many of them wait. Tests and modules stay compiled
-TESTS_AT_A_TIME ?= 6
+TESTS_AT_A_TIME ?= 7
 test: $(SETUP)
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME)
 

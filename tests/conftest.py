@@ -26,8 +26,17 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+COMPUTING = ("tests/deterministic/", "tests/unit/")
+"""How the names of tests begin that need the processor all the time; the others wait for processes of their own."""
+COMPUTERS = 2
+"""So many processes do these as long as there are any, beside those that wait: no core is ever idle."""
 TOGETHER = ("tests/ui/", "tests/unit/components/test_tip_")
 """How the names of tests begin that one process does, in a row, since they share what is made once in a process."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Those that compute come first, those that wait longest at the end."""
+    items.sort(key=lambda item: (not item.nodeid.startswith(COMPUTING), item.nodeid.startswith("tests/docs/")))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -40,13 +49,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
         return 'scope="module"' in (config.rootpath / module).read_text(encoding="utf-8")
 
     class FromBothEnds(LoadScopeScheduling):
-        """Takes tests from both ends in turn: at the one are those that compute, at the other those that wait.
+        """Some take tests from the end of those that compute, the others from the end of those that wait.
 
         What a module makes once is made once. (The marks of pytest-xdist 3.8 for groups go unseen with pytest 9.2:
         its issue 1386.)
         """
-
-        _from_the_end = False
 
         def _split_scope(self, nodeid: str) -> str:
             module = nodeid.split("::")[0]
@@ -54,9 +61,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return next((name for name in TOGETHER if nodeid.startswith(name)), own)
 
         def _assign_work_unit(self, node: Any) -> None:
-            if self._from_the_end:
+            if self.nodes.index(node) >= COMPUTERS:
                 self.workqueue.move_to_end(next(reversed(self.workqueue)), last=False)
-            self._from_the_end = not self._from_the_end
             super()._assign_work_unit(node)
 
     return FromBothEnds(config, log)

@@ -191,7 +191,7 @@ class Rig:
         (self._folder / "surveyor.py").write_text(SURVEYOR, encoding="utf-8")
         file = self._folder / "experiment.toml"
         file.write_text(EXPERIMENT.format(drift=drift, scans=scans, speed=speed), encoding="utf-8")
-        command = (*AFSPM, "run", str(file), "--runs", str(self._folder / "runs"), "--verbose")
+        command = (*AFSPM, "run", str(file), "--runs", str(self._folder / "runs"), "--verbose", "--no-report")
         process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
