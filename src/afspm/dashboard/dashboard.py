@@ -9,7 +9,7 @@ from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, is_loopback, secret_in
 from afspm.dashboard.allowed import allowed_region
 from afspm.dashboard.record import Archive
-from afspm.dashboard.server import USUAL_PORT, PageServer, listening
+from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
 from afspm.dashboard.watch import Watch
 from afspm.errors import ConfigError
 from afspm.record.facts import name_in
@@ -110,9 +110,7 @@ class Dashboard(Component):
         return earlier if self._port == 0 else (*earlier, USUAL_PORT)
 
     def _say_where(self, port: int) -> None:
-        scheme = "http" if self._certificate is None else "https"
-        host = f"[{self._host}]" if ":" in self._host else self._host
-        url = f"{scheme}://{host}:{port}"
+        url = url_of(self._host, port, encrypted=self._certificate is not None)
         self.memory.update({"port": port, "url": url})
         self.memory.save()
         self.log.info("the dashboard is at %s", url)
