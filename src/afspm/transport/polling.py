@@ -45,11 +45,17 @@ class Poller(Generic[S]):
         self._by_socket: dict[Any, S] = {}
         self._owners: list[tuple[Touching, tuple[Socket, int]]] = []
         self._found: list[S] = []
-        self._poll = select.poll()
-        self._poll.register(wake_up.fileno(), select.POLLIN)
+        self._poll, self._urgent = select.poll(), select.poll()
+        for poll in (self._poll, self._urgent):
+            poll.register(wake_up.fileno(), select.POLLIN)
 
-    def register(self, socket: Socket, source: S, owner: Touching | None) -> None:
-        """Wait for `socket` too; without an owner: nothing is sent by it, and everything received at once."""
+    def register(self, socket: Socket, source: S, owner: Touching | None, *, urgent: bool = True) -> None:
+        """Wait for `socket` too.
+
+        Args:
+            owner: None: nothing is sent by it, and everything received at once.
+            urgent: whether its news end a `rest`.
+        """
         descriptor = int(socket.getsockopt(zmq.FD))
         self._by_descriptor[descriptor] = source
         if owner is not None:
@@ -58,6 +64,13 @@ class Poller(Generic[S]):
         elif readable(socket):
             self._found.append(source)
         self._poll.register(descriptor, select.POLLIN)
+        if urgent:
+            self._urgent.register(descriptor, select.POLLIN)
+
+    def rest(self, rest_ms: int) -> None:
+        """Wait so long, or until something urgent comes; not at all if something is known to be there."""
+        if not self._found and not any(owner.touched for owner, _ in self._owners):
+            self._urgent.poll(rest_ms)
 
     def wait(self, timeout_ms: int | None) -> tuple[list[S], bool]:
         """The sources of the sockets that have news, mostly something to receive, and whether we were woken up."""
@@ -85,12 +98,17 @@ class PortablePoller(Generic[S]):
 
     def __init__(self, wake_up: WakeUp[Any]) -> None:
         self._sources: dict[object, S] = {}
-        self._poller = zmq.Poller()
-        self._poller.register(wake_up.fileno(), zmq.POLLIN)
+        self._poller, self._urgent = zmq.Poller(), zmq.Poller()
+        for one in (self._poller, self._urgent):
+            one.register(wake_up.fileno(), zmq.POLLIN)
 
-    def register(self, socket: Socket, source: S, owner: Touching | None) -> None:
+    def register(self, socket: Socket, source: S, owner: Touching | None, *, urgent: bool = True) -> None:
         self._sources[socket] = source
-        self._poller.register(socket, zmq.POLLIN)
+        for one in (self._poller, self._urgent) if urgent else (self._poller,):
+            one.register(socket, zmq.POLLIN)
+
+    def rest(self, rest_ms: int) -> None:
+        self._urgent.poll(rest_ms)
 
     def wait(self, timeout_ms: int | None) -> tuple[list[S], bool]:
         ready = [which for which, _ in self._poller.poll(timeout_ms)]

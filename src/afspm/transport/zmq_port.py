@@ -9,6 +9,7 @@ from afspm.clock import Clock
 from afspm.errors import ConfigError
 from afspm.transport.complaints import Complaints
 from afspm.transport.control_client import ControlClient
+from afspm.transport.flood import REST_MS, Flood
 from afspm.transport.history import Published
 from afspm.transport.network import Network
 from afspm.transport.polling import milliseconds, poller
@@ -52,6 +53,7 @@ class ZmqPort:
         complaints = Complaints(logging.getLogger("afspm.transport"), clock)
         self._publisher = None
         self._published = Published(clock)
+        self._flood = Flood()
         self._control = None
         self._poller = poller(self._wake_up)
         if publish is not None:
@@ -63,7 +65,7 @@ class ZmqPort:
             self._poller.register(self._control.monitor.socket, self._control.follow, None)
         for address in subscribe:
             subscriber = Subscriber(network, name, address, envelopes, complaints)
-            self._poller.register(subscriber.socket, subscriber.receive, subscriber)
+            self._poller.register(subscriber.socket, subscriber.receive, subscriber, urgent=False)
             self._poller.register(subscriber.monitor.socket, subscriber.follow, None)
 
     @property
@@ -83,10 +85,16 @@ class ZmqPort:
         self._control.send(frames)
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
-        drains, woken = self._poller.wait(milliseconds(timeout_s))
+        wait_ms = milliseconds(timeout_s)
+        if self._flood.is_on and (wait_ms is None or wait_ms >= REST_MS):
+            self._poller.rest(REST_MS)
+            wait_ms = None if wait_ms is None else wait_ms - REST_MS
+        drains, woken = self._poller.wait(wait_ms)
         found: list[Incoming] = self._wake_up.take() if woken else []
         for drain in drains:
             found += drain()
+        if found:
+            self._flood.came(len(found), self._clock.monotonic_s())
         return found
 
     def publish(self, envelope: str, payload: bytes) -> None:
