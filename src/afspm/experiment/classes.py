@@ -72,9 +72,17 @@ def importing_from(folders: Sequence[Path]) -> Iterator[None]:
             with contextlib.suppress(ValueError):
                 sys.path.remove(entry)
         for name in set(sys.modules) - before:
-            file = getattr(sys.modules[name], "__file__", None)
-            if file and any(Path(file).is_relative_to(folder) for folder in added):
+            if any(_is_from(folder, name) for folder in folders):
                 del sys.modules[name]
+
+
+def _is_from(folder: Path, name: str) -> bool:
+    """Whether a module was imported from a folder, and not from an environment (.venv) that lies in it."""
+    file = getattr(sys.modules[name], "__file__", None)
+    if not file:
+        return False
+    found, place = Path(file), folder.absolute().joinpath(*name.split("."))
+    return found.parent / found.name.partition(".")[0] in (place, place / "__init__")
 
 
 def full_path(name: str) -> str:
