@@ -50,6 +50,7 @@ from afspm.logic.watchdog import Watchdog
 from afspm.logic.words import is_routine, said
 from afspm.model import (
     CLOCK_REQUEST,
+    HAS_ENDED,
     RESTART_REQUEST,
     TELL_REQUEST,
     ControlRequest,
@@ -309,7 +310,7 @@ class SchedulerCore:
         if kind == TELL_REQUEST:  # a supervisor's last words come after the end
             self._follow(event, self._bulletin.told(event, now_s, now_ns))
         elif self._control.ended:
-            self._desk.answer(event, ControlResponse.FAILURE, "the experiment has ended")
+            self._desk.answer(event, ControlResponse.FAILURE, HAS_ENDED)
         elif kind == RESTART_REQUEST:
             self._follow(event, self._bulletin.ordered(event, now_s))
         elif kind == CLOCK_REQUEST:

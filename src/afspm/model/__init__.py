@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.model.control import Parameter, Request, Response
+from afspm.model.control import HAS_ENDED, Parameter, Request, Response
 from afspm.model.enums import (
     CLOCK_REQUEST,
     RESTART_REQUEST,
@@ -36,6 +36,7 @@ from afspm.model.state import ControlState, Feedback, PositionChange, ProbePosit
 
 __all__ = [
     "CLOCK_REQUEST",
+    "HAS_ENDED",
     "RESTART_REQUEST",
     "TELL_REQUEST",
     "ControlMode",

@@ -7,6 +7,9 @@ from typing import Any
 
 from afspm.model.enums import ControlResponse
 
+HAS_ENDED = "the experiment has ended"
+"""The reason of every refusal after the end."""
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:

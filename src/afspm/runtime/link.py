@@ -10,7 +10,7 @@ from typing import Any
 from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
-from afspm.model import TELL_REQUEST, ControlRequest, Packet, Request, Response, Told, request_name
+from afspm.model import HAS_ENDED, TELL_REQUEST, ControlRequest, Packet, Request, Response, Told, request_name
 from afspm.runtime.process import Activity
 from afspm.runtime.stopping import StopRequested
 from afspm.runtime.view import KEPT, View
@@ -116,7 +116,7 @@ class Link:
         if self.stopping:
             raise StopRequested
         if self.ended:
-            raise ExperimentEnded("the experiment has ended", where=self.name)
+            raise ExperimentEnded(HAS_ENDED, where=self.name)
 
     def wait_caught_up(self, until_s: float | None = None) -> None:
         """Wait until everything the scheduler has cached is here; once that is so, returns at once.
@@ -170,6 +170,7 @@ class Link:
         gone it is waited for.
 
         Raises:
+            ExperimentEnded: that was the answer.
             NoResponse: no answer to any repetition, or none until `until_s` (monotonic).
         """
         request = Request(kind, subject, id=request_id or self.next_id())
@@ -183,6 +184,8 @@ class Link:
                 self.port.send(frames)
                 answer = self._await_answer(connection, self._earlier(self.request_timeout_s, until_s))
                 if answer is not None:
+                    self.ended = self.ended or answer.reason == HAS_ENDED  # that may come before the signal itself
+                    self.check()
                     return answer
                 if until_s is not None and self.clock.monotonic_s() >= until_s:
                     break

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
-from afspm.model import TELL_REQUEST, ControlResponse, Packet, Response
+from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, Response
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
@@ -142,7 +142,7 @@ class Shell:
         if asked.frames[0] == _TELL:
             self._request(asked)
             return
-        response = Response(ControlResponse.FAILURE, reason="the experiment has ended", id=_id_of(asked))
+        response = Response(ControlResponse.FAILURE, reason=HAS_ENDED, id=_id_of(asked))
         self._sockets.router.reply(asked.connection, wire.encode_response(response))
 
     def close(self) -> None:

@@ -14,12 +14,13 @@ from afspm.runtime.launch import Launch
 
 HERE = Path(__file__).parent
 PATIENCE_S = 20.0
+HOST = [sys.executable, "-m", "afspm.runtime.host"]
 
 
 class Child:
     """A process under test: its lines, as they come, and its end."""
 
-    def __init__(self, command: Sequence[str], first_line: bytes) -> None:
+    def __init__(self, command: Sequence[str], first_line: str | None) -> None:
         self.popen = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -35,8 +36,13 @@ class Child:
         ]
         for reader in self._readers:
             reader.start()
+        if first_line is not None:
+            self.tell(first_line)
+
+    def tell(self, line: str) -> None:
+        """A line on its standard input."""
         assert self.popen.stdin is not None
-        self.popen.stdin.write(first_line)
+        self.popen.stdin.write(line.encode() + b"\n")
         self.popen.stdin.flush()
 
     def expect(self, text: str) -> str:
@@ -87,11 +93,14 @@ Start = Callable[..., Child]
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Starts a command with a first line on its standard input; ends all that is left after the test."""
+    """Starts a command with a first line on its standard input; ends all that is left after the test.
+
+    None for the line: it is told later.
+    """
     children: list[Child] = []
 
-    def start_one(command: Sequence[str], first_line: str) -> Child:
-        children.append(Child(command, first_line.encode() + b"\n"))
+    def start_one(command: Sequence[str], first_line: str | None) -> Child:
+        children.append(Child(command, first_line))
         return children[-1]
 
     yield start_one
@@ -102,4 +111,10 @@ def start() -> Iterator[Start]:
 @pytest.fixture
 def host(start: Start) -> Callable[[Launch], Child]:
     """Starts a process in our host."""
-    return lambda launch: start([sys.executable, "-m", "afspm.runtime.host"], launch.to_json())
+    return lambda launch: start(HOST, launch.to_json())
+
+
+@pytest.fixture
+def waiting_host(start: Start) -> Child:
+    """One that is not told yet what it hosts: on a busy computer it takes long to start a process."""
+    return start(HOST, None)

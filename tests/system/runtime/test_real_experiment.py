@@ -13,6 +13,7 @@ import afspm
 from afspm.clock import ExperimentClock
 from afspm.errors import ControlLost, ExperimentEnded, FileError, NoResponse, Refused
 from afspm.model import ControlMode, Region, ScopeState
+from afspm.runtime import connect
 from afspm.runtime.connect import guest_facts
 from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch, Sockets
@@ -118,15 +119,16 @@ def test_the_end_of_the_experiment_ends_every_process(experiment: Experiment) ->
     assert experiment.scheduler.exit_code() == ExitCode.ENDED
 
 
-def test_one_that_comes_as_the_experiment_ends_hears_of_it(experiment: Experiment) -> None:
+def test_one_that_comes_as_the_experiment_ends_hears_of_it(experiment: Experiment, waiting_host: Any) -> None:
     ends = experiment.start("ends", "EndsEverything")
     assert ends.exit_code() == ExitCode.ENDED, ends.error_text
-    late = experiment.start("diary", "Diary")
-    late.expect("start")
-    assert late.exit_code() == ExitCode.ENDED
+    waiting_host.tell(experiment.component_launch("diary", "Diary").to_json())
+    waiting_host.expect("start")
+    assert waiting_host.exit_code() == ExitCode.ENDED
 
 
-def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment) -> None:
+def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connect, "JOINED_WITHIN_S", 30.0)  # the scheduler may still be starting
     facts = {"name": "x", "guest": guest_facts(experiment.component_launch("some"))}
     (experiment.folder / "run.json").write_text(json.dumps(facts))
     with afspm.connect(experiment.folder) as scope:

@@ -11,7 +11,7 @@ from runtime_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of,
 
 from afspm import model, wire
 from afspm.errors import ConfigError, ExperimentEnded, Refused
-from afspm.model import Problem, Scan, ScopeState, ScopeStatus
+from afspm.model import HAS_ENDED, ControlResponse, Problem, Response, Scan, ScopeState, ScopeStatus
 from afspm.runtime.component import Component
 from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch
@@ -229,6 +229,19 @@ def test_a_script_that_ends_the_experiment_has_ended() -> None:
             self.scope.end_experiment()
 
     assert run(Script(), Lab()) in (ExitCode.ENDED, ExitCode.DONE)
+
+
+def test_who_asks_for_control_before_it_has_heard_of_the_end_has_ended_too() -> None:
+    """The answer may come before the signal."""
+
+    class Script(Component):
+        def run(self) -> None:
+            with self.scope.control():
+                raise AssertionError("there is nothing to control any more")
+
+    lab = Lab()
+    lab.intercept = lambda request: Response(ControlResponse.FAILURE, reason=HAS_ENDED)
+    assert run(Script(), lab) == ExitCode.ENDED
 
 
 def test_the_handlers_of_a_script_are_called_between_its_calls() -> None:
