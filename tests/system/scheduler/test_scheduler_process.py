@@ -153,7 +153,7 @@ def test_it_ends_at_once_when_its_parent_is_gone(rig: Any) -> None:
     rig.start()
     rig.component("Component")
     rig.process.stdin.close()
-    assert rig.process.wait(timeout=1) == 81
+    assert rig.process.wait(timeout=10) == 81
 
 
 def test_a_damaged_state_is_not_taken_for_an_empty_one(rig: Any, tmp_path: Any) -> None:

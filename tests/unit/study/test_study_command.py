@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from typer.testing import CliRunner
 
@@ -32,11 +30,6 @@ def test_settings_that_fail_are_told_and_the_others_go_on() -> None:
 
 
 @pytest.mark.timeout(60)
-def test_the_same_study_on_a_cluster_says_the_same(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed", reason="needs Dask, the extra `study`")
+def test_the_same_study_on_a_cluster_says_the_same(cluster: str) -> None:
     here = told(*SMALL, "-n", "2", "-j", "1")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, scheduler_port=0
-    ) as cluster:
-        there = told(*SMALL, "-n", "2", "--cluster", cluster.scheduler_address)
-    assert there == here
+    assert told(*SMALL, "-n", "2", "--cluster", cluster) == here

@@ -53,14 +53,10 @@ def test_what_kills_every_worker_is_told_instead_of_tried_for_ever() -> None:
 
 
 @pytest.mark.timeout(60)
-def test_a_cluster_loses_no_task_with_a_worker(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed", reason="needs Dask, the extra `study`")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, scheduler_port=0
-    ) as cluster:
-        tasks = [(n, tmp_path) for n in range(6)]
-        done = by_index(list(on_cluster(doubled_by_the_next, tasks, address=cluster.scheduler_address)))
-        failed = list(on_cluster(doubled, [(-1,)], address=cluster.scheduler_address))
+def test_a_cluster_loses_no_task_with_a_worker(cluster: str, tmp_path: Path) -> None:
+    tasks = [(n, tmp_path) for n in range(6)]
+    done = by_index(list(on_cluster(doubled_by_the_next, tasks, address=cluster)))
+    failed = list(on_cluster(doubled, [(-1,)], address=cluster))
     assert [outcome.value for outcome in done] == [2 * n for n in range(6)]
     assert (tmp_path / "died").exists()
     assert failed == [Outcome(0, error="below zero")]

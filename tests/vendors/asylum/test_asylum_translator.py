@@ -21,6 +21,7 @@ from afspm.model import (
     Scan,
     ScanParameters,
     ScopeState,
+    ScopeStatus,
     Spectrum,
     names,
 )
@@ -130,7 +131,7 @@ def test_images_that_somebody_takes_at_the_panel_are_published_too(bench: Make) 
 
 
 def test_images_that_follow_each_other_at_the_panel_are_each_published_once(bench: Make) -> None:
-    made = bench(speed=20.0)
+    made = bench(speed=8.0)
     peer = made.start()
     ready(peer)
 
@@ -146,11 +147,12 @@ def test_images_that_follow_each_other_at_the_panel_are_each_published_once(benc
         return round(found[0])
 
     made.at_panel(lambda emulator: emulator.controller.scan(made.clock.now_s(), True))
+    heard = peer.until(lambda one: one == ScopeStatus(ScopeState.SCANNING))
     deadline_s = made.clock.monotonic_s() + 20.0
     while suffix() < 2:
         assert made.clock.monotonic_s() < deadline_s
     last = f"Image{suffix(last_scan=True):04d}.ibw"
-    heard = peer.until(lambda one: isinstance(one, Scan) and Path(one.filename).name == last)
+    heard += peer.until(lambda one: isinstance(one, Scan) and Path(one.filename).name == last)
     files = [Path(one.filename).name for one in heard if isinstance(one, Scan) and one.channel == "HeightTrace"]
     assert files == [f"Image{i:04d}.ibw" for i in range(len(files))]
     assert len(files) > 2
