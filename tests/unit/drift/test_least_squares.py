@@ -197,3 +197,27 @@ def test_a_scan_lies_on_itself_exactly() -> None:
     found = LeastSquares().register(scan, scan)
     assert found.accepted, found.reason
     assert found.displacement_m == pytest.approx([0.0, 0.0], abs=1e-15)
+
+
+def test_a_site_of_a_lattice_is_refused_if_it_is_like_the_others_though_it_was_expected() -> None:
+    """A site away nearly all fits; that the defects don't is seen by what other sites are like."""
+    period_m, cos, sin = 140 * NM, math.cos(0.5), math.sin(0.5)
+    x, y = REGION.pixels_m((96, 96))
+    defects = np.random.default_rng(5).uniform(-SIZE_M / 2, SIZE_M / 2, (12, 2))
+
+    def lattice(moved_m: NDArray[np.float64], start_s: float) -> DriftScan:
+        u, v = x - moved_m[0], y - moved_m[1]
+        along, across = u * cos + v * sin, v * cos - u * sin
+        values = np.cos(2 * np.pi * along / period_m) + np.cos(2 * np.pi * across / period_m)
+        values += sum(2.0 * np.exp(-((u - p) ** 2 + (v - q) ** 2) / (40 * NM) ** 2) for p, q in defects)
+        noise = 0.5 * np.random.default_rng(int(start_s)).standard_normal(values.shape)
+        return DriftScan(NM * (values + noise), REGION, start_s, start_s + 100.0, upwards=True)
+
+    def expecting(displacement_m: NDArray[np.float64]) -> Registration:
+        prior = Prior(displacement_m, (15 * NM) ** 2 * np.eye(2))
+        return registered(lattice(DRIFT_M, 900.0), lattice(np.zeros(2), 0.0), prior)
+
+    assert_displaced(expecting(DRIFT_M), DRIFT_M, 2 * NM)
+    wrong = expecting(DRIFT_M + period_m * np.array([cos, sin]))
+    assert not wrong.accepted
+    assert "a site like the others" in wrong.reason

@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.least_squares.search import Correlation
 from afspm.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -17,6 +16,8 @@ Mask = NDArray[np.bool_]
 
 RINGS_PX = (9, 16)
 PARTS = 8  # of the overlap in each direction
+APART_PX = 4  # nearer than this a repetition is the match itself
+FEW = 10  # with fewer repetitions a surface doesn't repeat itself
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Evidence:
     correlation: float
     correlation_gap: float
     edges_gap: float
+    above_repeats: float
     outliers: float
     surprise: float
 
@@ -55,9 +57,12 @@ class Limits:
         distinct: with this much of it the place is a place of its own. With less, the surface repeats itself, and more
             is asked for:
         correlation_gap: like `edges_gap`, of the scans as they are;
+        above_repeats: standard deviations by which the match exceeds the sites about it that look the same. A prior
+            singles out one site, whether or not it is the right one. A wrong one is one of many, and as far from their
+            mean as chance has it (three, of some seventy); the right one alone has its defects in their places. Not
+            asked where nothing is left to differ, the correlation being `alike`.
         outliers: largest variance of the residual over what is typical of it: of features that one scan alone has. In a
-            lattice, defects are all that tells one place from another. Not asked where nothing is left to differ, the
-            correlation being `alike`.
+            lattice, defects are all that tells one place from another. Not asked where scans are `alike`, either.
         surprise: largest chi² of the shift, given the prior.
     """
 
@@ -72,6 +77,7 @@ class Limits:
     edges_gap: float = 0.0
     distinct: float = 0.3
     correlation_gap: float = 0.02
+    above_repeats: float = 5.0
     outliers: float = 2.5
     alike: float = 0.985
     surprise: float = 14.0
@@ -105,7 +111,10 @@ class Limits:
             return f"ambiguous: another displacement is almost as likely ({found.gap:.1f} nats less)"
         if found.edges_gap < self.edges_gap or (repeats and found.correlation_gap < self.correlation_gap):
             return "other displacements correlate as well"
-        if repeats and found.outliers > self.outliers and found.correlation < self.alike:
+        differ = found.correlation < self.alike
+        if differ and found.above_repeats < self.above_repeats:
+            return f"the surface repeats itself: a site like the others ({found.above_repeats:.1f} standard deviations)"
+        if differ and repeats and found.outliers > self.outliers:
             return f"the surface repeats itself, and features differ ({found.outliers:.1f} times the typical residual)"
         if found.surprise > self.surprise:
             return f"far from what was expected (chi² {found.surprise:.0f})"
@@ -147,11 +156,26 @@ def correlated(one: Array, two: Array) -> float:
     return float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-300))
 
 
-def above_surrogates(one: Array, two: Array, correlation: Correlation) -> float:
-    """By how much the correlation of two aligned images exceeds the best of those at 32 shifts on two rings."""
-    found = correlation.of(one, two)
-    cy, cx = correlation.origin
+def above_surrogates(found: Array, origin: Array) -> float:
+    """By how much the correlation of two aligned images, [y, x] with no shift at the origin, exceeds the best of those
+    at 32 shifts on two rings."""
+    cy, cx = origin
     angles = 2.0 * np.pi * np.arange(16) / 16
     y, x = (np.rint(np.outer(RINGS_PX, f(angles))).astype(int).ravel() for f in (np.sin, np.cos))
     inside = (np.abs(y) <= cy) & (np.abs(x) <= cx)
     return float(found[cy, cx] - found[y[inside] + cy, x[inside] + cx].max())
+
+
+def above_repeats(found: Array, overlap: Array, origin: Array) -> float:
+    """The same as a number of standard deviations of the shifts at which the surface repeats itself, about their mean:
+    of the peaks at least half as high, where at least half as much overlaps. Coefficients are compared as Fisher does,
+    by atanh. Infinite if there are next to no such peaks."""
+    from scipy.ndimage import maximum_filter
+
+    cy, cx = origin
+    y, x = np.ogrid[: found.shape[0], : found.shape[1]]
+    peak = (found == maximum_filter(found, 3)) & (found > found[cy, cx] / 2) & (overlap >= overlap[cy, cx] / 2)
+    repeats = np.arctanh(found[peak & (np.hypot(y - cy, x - cx) >= APART_PX)])
+    if repeats.size < FEW:
+        return math.inf
+    return float((np.arctanh(found[cy, cx]) - repeats.mean()) / max(float(repeats.std()), 1e-12))

@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators.least_squares import shear
-from afspm.drift.estimators.least_squares.acceptance import Evidence, Limits, above_surrogates, agreement, outliers
+from afspm.drift.estimators.least_squares.acceptance import (
+    Evidence,
+    Limits,
+    above_repeats,
+    above_surrogates,
+    agreement,
+    outliers,
+)
 from afspm.drift.estimators.least_squares.align import (
     ALL,
     SHIFT,
@@ -36,7 +43,7 @@ GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
 BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
 FARTHEST_PX = 8.0  # from where the search has found it
-SURROGATES_PX = 16  # the farthest shift that a match is compared with
+SURROGATES_PX = 32  # the farthest shift that a match is compared with
 
 
 class LeastSquares:
@@ -149,7 +156,8 @@ def _evidence(
     one, two = without_lines(one, known), without_lines(two, known)
     edges = Pair(*scene.band_splines, box).warped(theta)
     share, correlation = agreement(one, two, known)
-    surrogates = Correlation(known, known, SURROGATES_PX)
+    elsewhere = Correlation(known, known, SURROGATES_PX)
+    by_shift, edges_by_shift = elsewhere.of(one, two), elsewhere.of(edges[0], edges[1])
     return Evidence(
         overlap=float(known.sum() / scene.least_known),
         sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
@@ -158,8 +166,9 @@ def _evidence(
         information=shared_information(one, two),
         agreement=share,
         correlation=correlation,
-        correlation_gap=above_surrogates(one, two, surrogates),
-        edges_gap=above_surrogates(edges[0], edges[1], surrogates),
+        correlation_gap=above_surrogates(by_shift, elsewhere.origin),
+        edges_gap=above_surrogates(edges_by_shift, elsewhere.origin),
+        above_repeats=above_repeats(by_shift, elsewhere.overlap, elsewhere.origin),
         outliers=outliers((two - one)[known]),
         surprise=0.0 if expected is None else expected.surprise(theta[:2], total[:2, :2]),
     )
