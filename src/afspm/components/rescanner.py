@@ -14,6 +14,7 @@ WANTED, TOLD = "DriftRescan", "DriftMapping"
 AGAIN, OPPOSITE, SEARCH = 1, 2, 3
 """The numbers of RescanKind."""
 FLAGGED_WITHIN_S = 5.0
+_BEFORE = "direction_before"
 Pixels = tuple[int, int] | None
 
 _IN_WORDS = {AGAIN: "the same region again", OPPOSITE: "the other direction", SEARCH: "a wider region"}
@@ -68,7 +69,11 @@ class Rescanner(Component):
             self.scope.flag(self.problem)
             self.scope.wait_until(self._is_flagged, timeout_s=FLAGGED_WITHIN_S)
         with self.scope.control(solving=self.problem):
-            found = self._take(message, parameters, told)
+            try:
+                found = self._take(message, parameters, told)
+            except Refused as refused:
+                self.log.error("it can't be scanned again: %s", refused.reason)
+                found = False
             self.scope.clear(self.problem)
         if found:
             return
@@ -90,8 +95,7 @@ class Rescanner(Component):
             for attempt in range(self.attempts):
                 self._forget(told)
                 if message.kind == SEARCH:
-                    wider, pixels = self._wider(region, shape, attempt + 1)
-                    self.scope.scan(wider, shape=pixels)
+                    self._search(region, shape, attempt + 1)
                 else:
                     self.scope.scan(region, shape=shape)
                 if self._is_as_asked(message.kind, told):
@@ -100,6 +104,7 @@ class Rescanner(Component):
         finally:
             if direction is not None:
                 self.scope.set(names.SCAN_DIRECTION, direction)
+            self.memory.pop(_BEFORE, None)
             if message.kind == SEARCH:
                 self._set_back(region, shape)
 
@@ -108,9 +113,23 @@ class Rescanner(Component):
         if not message.HasField("upwards"):
             return None
         wanted = names.UP if message.upwards else names.DOWN
-        before = str(self.scope.get(names.SCAN_DIRECTION))
+        before: str = self.memory.setdefault(_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
+        self.memory.save()  # else one that was killed meanwhile would take what it has set for what was there
         self.scope.set(names.SCAN_DIRECTION, wanted)
         return None if before == wanted else before
+
+    def _search(self, region: Region, shape: Pixels, times: int) -> None:
+        """Scan a wider region, or the widest that the limits and the scanner allow."""
+        for fewer in range(times, -1, -1):
+            wider, pixels = self._wider(region, shape, fewer)
+            try:
+                self.scope.scan(wider, shape=pixels)
+            except Refused as refused:
+                if fewer == 0:
+                    raise
+                self.log.warning("no region of %.3g nm: %s", wider.size_m[0] * 1e9, refused.reason)
+            else:
+                return
 
     def _wider(self, region: Region, shape: Pixels, times: int) -> tuple[Region, Pixels]:
         factor = self.widen**times

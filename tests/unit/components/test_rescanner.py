@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
 from runtime_lab import REGION, Lab, run
 
 from afspm import wire
 from afspm.components.rescanner import AGAIN, OPPOSITE, SEARCH, Rescanner
 from afspm.errors import ConfigError
-from afspm.model import Problem, Region, ScanParameters, names
+from afspm.model import ControlResponse, Problem, Region, Request, Response, ScanParameters, names
 from afspm.runtime.exit_codes import ExitCode
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
@@ -103,6 +106,52 @@ def test_a_sample_that_is_not_found_again_is_a_person_s_business() -> None:
     lab = asked(SEARCH, ["lost"] * 10)
     assert len(lab.finished) == 3
     assert lab.problems == (MALFUNCTION,)
+
+
+def refusing(lab: Drifting, most_m: float) -> None:
+    """No region may be wider."""
+
+    def too_wide(request: Request) -> Response | str:
+        starts = lab.parameters if request.subject == "start-scan" else request.subject
+        region = starts.region if isinstance(starts, ScanParameters) else None
+        if isinstance(region, Region) and region.size_m[0] > most_m:
+            return Response(ControlResponse.PARAM_ERROR, reason="[limits] region")
+        return "go on"
+
+    lab.intercept = too_wide
+
+
+@pytest.mark.parametrize(("most_m", "widths"), [(3e-6, [2e-6, 2e-6]), (1.5e-6, [1e-6, 1e-6])])
+def test_a_search_is_as_wide_as_is_allowed(most_m: float, widths: list[float]) -> None:
+    lab = Drifting(["lost", "well"])
+    refusing(lab, most_m)
+    lab.at(10.0, lambda: lab.wants(SEARCH))
+    lab.at(5000.0, lab.kill)
+    assert run(Rescanner(), lab) == ExitCode.ENDED
+    assert [region.size_m[0] for region in lab.finished] == pytest.approx(widths)
+    assert lab.problems == ()
+
+
+@pytest.mark.parametrize(("kind", "left"), [(SEARCH, (MALFUNCTION,)), (AGAIN, ())])
+def test_what_may_not_be_scanned_at_all_has_not_helped(kind: int, left: tuple[int, ...]) -> None:
+    lab = Drifting([])
+    refusing(lab, 0.0)
+    lab.at(10.0, lambda: lab.wants(kind))
+    lab.at(5000.0, lab.kill)
+    assert run(Rescanner(), lab) == ExitCode.ENDED  # and did not crash over it
+    assert not lab.finished
+    assert lab.problems == left
+
+
+def test_killed_in_the_middle_it_sets_back_the_direction_from_before(tmp_path: Path) -> None:
+    (tmp_path / "rescanner.json").write_text(json.dumps({"direction_before": names.UP}))
+    lab = Drifting(["well"])
+    lab.values[names.SCAN_DIRECTION] = names.DOWN  # set in an earlier life
+    lab.at(10.0, lambda: lab.wants(OPPOSITE, upwards=False))
+    lab.at(5000.0, lab.kill)
+    assert run(Rescanner(), lab, state_dir=tmp_path) == ExitCode.ENDED
+    assert lab.values[names.SCAN_DIRECTION] == names.UP
+    assert "direction_before" not in json.loads((tmp_path / "rescanner.json").read_text())
 
 
 def test_what_it_was_asked_for_by_its_own_scans_is_not_done_again() -> None:

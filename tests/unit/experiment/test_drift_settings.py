@@ -53,6 +53,10 @@ def test_settings_reach_the_scheduler_in_si_and_a_table_with_a_class_is_left_to_
         ('rescan = { rule = "papr" }', "not 'papr'"),
         ('compensate = { x = "x-rate" }', "drift.compensate.y is missing"),
         ('compensate = { x = "x-drift-rate-x", y = "x-rate" }', "needs the parameter 'x-rate'"),
+        (
+            'tracker = "paper", compensate = { x = "x-drift-rate-x", y = "x-drift-rate-y" }',
+            "the tracker does not reckon with a controller that compensates",
+        ),
         ("rescan = { tolerance = 0.0 }", "a tolerance of 0.0 m is none"),
     ],
 )
@@ -76,7 +80,7 @@ def test_a_rescanner_without_anybody_to_ask_it_is_told_of(write: Write) -> None:
 def test_drift_must_be_somebody_s_business(write: Write) -> None:
     alone = MICROSCOPE + SCHEDULER.format(name="DriftCompensatedScheduler")
     assert "thermal-drift" in only_error(write(alone, frame="")).what
-    assert not errors(write(alone + '[control]\nsolved_by_hand = ["thermal-drift"]\n', frame=""))
+    assert not errors(write(alone + '[control]\nsolved_by_hand = ["thermal-drift", "device-malfunction"]\n', frame=""))
 
 
 def test_the_published_names_are_ours(write: Write) -> None:

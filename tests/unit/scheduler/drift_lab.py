@@ -132,6 +132,7 @@ class Lab:
         *,
         state: dict[str, Any] | None = None,
         now_s: float = START_S,
+        answer_start: bool = True,
     ) -> None:
         self.worker = FakeWorker()
         self.now_s = now_s
@@ -145,10 +146,11 @@ class Lab:
         self.done(self.core.start(self.now_s, self.now_ns))
         self.step(TranslatorUp())
         self.step(TranslatorCaughtUp())
-        while forwards := self.forwards():  # one is asked after the other
+        while answer_start and (forwards := self.forwards()):  # one is asked after the other
             for forward in forwards:
                 self.answer(forward, ControlResponse.PARAM_NOT_SUPPORTED)
-        self.effects.clear()
+        if answer_start:
+            self.effects.clear()
 
     @property
     def now_ns(self) -> int:

@@ -230,6 +230,45 @@ def test_the_direction_of_a_scan_is_that_in_force_when_it_began(lab: Lab, direct
     assert lab.worker.jobs[0].upwards is upwards
 
 
+def test_that_it_scans_is_told_again_and_the_scan_began_when_it_did(lab: Lab) -> None:
+    """To a scheduler that was started anew, say."""
+    set_direction(lab, "up")
+    lab.scope_is(ScopeState.SCANNING)
+    began_s = lab.now_s
+    lab.now_s += 200.0
+    lab.scope_is(ScopeState.SCANNING)
+    lab.now_s += 56.0
+    lab.publish(Scan(HERE, "Height", "m", np.ones(SHAPE), lab.now_ns, "a.nc"))
+    (job,) = lab.worker.jobs
+    assert job.start_s == pytest.approx(began_s, abs=1e-6)
+    assert job.upwards is True
+
+
+def test_of_a_scan_that_was_paused_nobody_knows_when_which_row_was_taken(lab: Lab) -> None:
+    set_direction(lab, "up")
+    lab.scope_is(ScopeState.SCANNING)
+    began_s = lab.now_s
+    for paused in (True, False):
+        lab.now_s += 100.0
+        lab.publish(ScopeStatus(ScopeState.SCANNING, paused=paused))
+    lab.now_s += 100.0
+    lab.publish(Scan(HERE, "Height", "m", np.ones(SHAPE), lab.now_ns, "a.nc"))
+    (job,) = lab.worker.jobs
+    assert (job.start_s, job.upwards) == (pytest.approx(began_s, abs=1e-6), None)
+
+
+def test_a_microscope_that_scans_on_begins_the_next_scan_when_it_says_so(lab: Lab) -> None:
+    lab.scope_is(ScopeState.SCANNING)
+    lab.now_s += 100.0
+    lab.publish(Scan(HERE, "Height", "m", np.ones(SHAPE), lab.now_ns, "a.nc"))
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
+    lab.scope_is(ScopeState.SCANNING)
+    began_s = lab.now_s
+    lab.now_s += 100.0
+    lab.publish(Scan(HERE, "Height", "m", np.ones(SHAPE), lab.now_ns, "b.nc"))
+    assert lab.worker.jobs[1].start_s == pytest.approx(began_s, abs=1e-6)
+
+
 # --- what follows ---
 
 
@@ -279,6 +318,90 @@ def test_who_searches_puts_its_region_back_before_the_flag_goes(lab: Lab) -> Non
     assert not problems(lab)
 
 
+def test_who_searches_is_not_asked_again_with_the_region_that_it_has_widened(lab: Lab) -> None:
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), lost=True))
+    lab.ask(ControlRequest.REQUEST_CTRL, int(Problem.THERMAL_DRIFT), name="rescanner")
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[1], forecast(DRIFT), lost=True))
+    assert len(rescans(lab)) == 1
+
+
+def fail(lab: Lab, why: str = "clocks were set back") -> None:
+    lab.scan()
+    lab.says(NotRegistered(lab.worker.jobs[-1].key, why))
+
+
+def test_three_scans_in_a_row_that_nobody_could_register_are_a_sample_that_is_lost(lab: Lab) -> None:
+    lab.take_control()
+    for _ in range(2):
+        fail(lab)
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT)))
+    for _ in range(2):
+        fail(lab)
+    assert not problems(lab)
+    fail(lab)
+    assert problems(lab) == (Problem.THERMAL_DRIFT,)
+    assert lab.core.control.holder is None
+    assert rescans(lab) == [(3, "3 scans in a row could not be registered: clocks were set back")]
+
+
+def test_scans_without_the_channel_tell_as_little() -> None:
+    lab = Lab(DriftSettings(channel="Heigth"))
+    lab.in_force()
+    for _ in range(3):
+        assert not problems(lab)
+        lab.scan()
+    assert problems(lab) == (Problem.THERMAL_DRIFT,)
+    assert "Heigth" in rescans(lab)[0][1]
+
+
+def test_how_many_there_were_is_known_after_a_kill(lab: Lab) -> None:
+    for _ in range(2):
+        fail(lab)
+    again = Lab(state=lab.saved(), now_s=lab.now_s)
+    fail(again)
+    assert problems(again) == (Problem.THERMAL_DRIFT,)
+
+
+def test_where_nothing_is_corrected_scans_need_not_be_registered() -> None:
+    lab = Lab(DriftSettings(correct=False))
+    lab.in_force()
+    for _ in range(4):
+        fail(lab)
+    for _ in range(MOST_ENDS):
+        lab.says(WorkerGone("no memory"))
+    assert not problems(lab)
+
+
+def test_a_person_is_called_where_nothing_will_be_registered_any_more_and_who_removes_that_has_it_tried_again(
+    lab: Lab,
+) -> None:
+    for _ in range(MOST_ENDS):
+        lab.says(WorkerGone("the state can't be read"))
+    assert problems(lab) == (Problem.DEVICE_MALFUNCTION,)
+    starts = lab.worker.starts
+    lab.step(Tick())
+    assert lab.worker.starts == starts
+    lab.ask(ControlRequest.RMV_EXP_PRBLM, int(Problem.DEVICE_MALFUNCTION), name="dashboard:Ada")
+    assert not problems(lab)
+    assert lab.worker.starts == starts + 1
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT)))
+    assert centers(lab)[-1] == pytest.approx(BACK, abs=1e-16)
+
+
+def test_registering_that_takes_long_is_told_before_it_takes_too_long(lab: Lab) -> None:
+    for _ in range(2):
+        lab.scan()
+        lab.now_s += 12.0
+        lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT)))
+    (told,) = logged(lab, "WARNING")
+    assert "12.0 s" in told
+    assert "longest_registration = 30 s" in told
+
+
 def test_a_flag_of_somebody_else_is_not_touched(lab: Lab) -> None:
     lab.ask(ControlRequest.ADD_EXP_PRBLM, int(Problem.THERMAL_DRIFT), name="somebody")
     lab.scan()
@@ -324,6 +447,19 @@ def test_without_correction_drift_is_told_and_nothing_is_done_about_it() -> None
 
 
 # --- a controller that compensates by itself ---
+
+
+def test_what_the_controller_compensates_is_what_is_reckoned_with_from_the_start_on() -> None:
+    """Not what was left of the night before; and after its restart what it was told before."""
+    drift = DriftSettings(compensate=Compensate("x-rate-x", "x-rate-y"))
+    lab = Lab(drift, answer_start=False)
+    told = []
+    while forwards := lab.forwards():
+        for forward in forwards:
+            if isinstance(forward.request.subject, Parameter) and forward.request.subject.value is not None:
+                told.append(forward.request.subject)
+            lab.answer(forward)
+    assert told == [Parameter("x-rate-x", "0", "m/s"), Parameter("x-rate-y", "0", "m/s")]
 
 
 def test_a_rate_that_is_known_is_handed_over_and_the_worker_hears_since_when() -> None:

@@ -215,6 +215,27 @@ def test_settings_that_can_not_work_are_the_reason(work: Callable[..., Heard]) -
     assert "NoSuch" in gone.reason
 
 
+def test_a_state_of_another_tracker_is_refused_with_what_to_do(work: Callable[..., Heard], tmp_path: Path) -> None:
+    Store(tmp_path / "drift.npz").save({"tracker": {"kind": "bank", "version": 1}, "answers": []})
+    gone = work().next(WorkerGone)
+    assert isinstance(gone, WorkerGone)
+    assert "of another tracker" in gone.reason
+    assert "remove the file" in gone.reason
+
+
+def test_where_nothing_can_be_saved_scans_are_registered_all_the_same(
+    work: Callable[..., Heard], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    heard = work()
+    heard.next(Forecasted)
+    (tmp_path / "drift.npz").mkdir()  # as good as a full disk
+    for number in range(2):
+        heard.registrar.register(job(number, 30, 30))
+    heard.next(Registered, 2)
+    (told,) = (record.message for record in caplog.records if "lost in a kill" in record.message)
+    assert "drift.npz" in told
+
+
 def test_a_scan_out_of_its_turn_is_refused_and_the_next_is_not(work: Callable[..., Heard]) -> None:
     heard = work()
     heard.registrar.register(job(5, 30, 30))

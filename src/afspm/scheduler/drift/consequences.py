@@ -17,7 +17,9 @@ from afspm.scheduler.drift.settings import DriftSettings
 from afspm.scheduler.drift.told import DriftCodec, Registered, RescanKind, RescanWanted, ScanJob, Worker
 
 RESCAN = "DriftRescan"
-_DRIFT = int(Problem.THERMAL_DRIFT)
+_DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
+_MOST_UNREGISTERED = 3
+"""So many scans in a row that nobody could register are as good as a sample that is lost: that of the trackers."""
 _AT_START = "drift is not known until a scan in the other direction has told the velocity"
 
 Step = Callable[[Input], list[Effect]]
@@ -48,23 +50,50 @@ class Consequences:
         self._worker = worker
         self._name = name
         self._started = settings.at_start == "nothing"
+        self._unregistered = 0
         self._given_m_s = [0.0, 0.0]
         self._accepted: dict[str, float] = {}
 
     def of(self, registered: Registered, job: ScanJob, step: Step, now_ns: int) -> list[Effect]:
         """What is done after a scan was published."""
+        self._unregistered = 0
         if not self._knowledge.corrects(now_ns * 1e-9):
             self._started = True  # until it is corrected there is time enough to learn the velocity
             return []
         if registered.lost:
-            effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
-            return effects + self._want(RescanKind.SEARCH, f"the sample is lost: {registered.reason}", step, now_ns)
+            return self._lost(f"the sample is lost: {registered.reason}", step, now_ns)
         if not self._started:
             return self._begin(job.upwards, step, now_ns)
         effects = self._found(step)
         if registered.rescan:
             effects += self._want(RescanKind.AGAIN, registered.rescan, step, now_ns)
         return effects
+
+    def unregistered(self, why: str, step: Step, now_ns: int) -> list[Effect]:
+        """What is done after a scan was published as predicted, since it could not be registered."""
+        if not self._knowledge.corrects(now_ns * 1e-9):
+            return []
+        self._unregistered += 1
+        if self._unregistered < _MOST_UNREGISTERED:
+            return []
+        self._unregistered = 0  # who goes on in spite of it is told again after as many
+        return self._lost(f"{_MOST_UNREGISTERED} scans in a row could not be registered: {why}", step, now_ns)
+
+    def give_up(self, step: Step) -> list[Effect]:
+        """Nothing will be registered any more: a person has to look, and says so by removing the problem."""
+        return step(ProblemSeen(_MALFUNCTION, flagged=True, name=self._name))
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether that problem is still there."""
+        return _MALFUNCTION in self._core.control.problems
+
+    def _lost(self, why: str, step: Step, now_ns: int) -> list[Effect]:
+        """Nobody scans on, but for whoever searches."""
+        searching = self._core.control.solving == _DRIFT
+        effects = step(ProblemSeen(_DRIFT, flagged=True, name=self._name))
+        # whoever searches already has widened the region: it is that of the scans before which was asked for
+        return effects if searching else effects + self._want(RescanKind.SEARCH, why, step, now_ns)
 
     def _begin(self, upwards: bool | None, step: Step, now_ns: int) -> list[Effect]:
         """The first scan is there: nobody goes on before it has been taken in the other direction."""
@@ -95,6 +124,16 @@ class Consequences:
 
     # --- a controller that compensates by itself ---
 
+    def begin_compensation(self, now_s: float) -> list[Effect]:
+        """Have the controller compensate what we reckon with: nothing at first, whatever the night before has left."""
+        compensate = self._settings.compensate
+        if compensate is None:
+            return []
+        effects: list[Effect] = []
+        for axis, value_m_s in zip((compensate.x, compensate.y), self._given_m_s, strict=True):
+            effects += self._core.ask_own(self._set(axis, value_m_s), now_s, self._told(axis))
+        return effects
+
     def hand_over(self, now_s: float, now_ns: int) -> list[Effect]:
         """Tell the controller the newest rate, if there is one beyond what it has been told."""
         compensate, time_s = self._settings.compensate, now_ns * 1e-9
@@ -115,12 +154,13 @@ class Consequences:
         parameter = Parameter(name, f"{value_m_s:.9g}", "m/s")
         return Request(int(ControlRequest.PARAM), parameter, self._codec.encode_parameter(parameter))
 
+    def _told(self, axis: str) -> OwnEnd:
+        return lambda response, now_s, now_ns: _refusal(axis, response)
+
     def _answered(self, axis: str, total_m_s: list[float]) -> OwnEnd:
         def ended(response: Response, now_s: float, now_ns: int) -> list[Effect]:
-            if response.code == ControlResponse.NOT_FREE:
-                return []  # a scan has begun already: it is handed over after the next
             if not response.ok:
-                return [Log("ERROR", f"the controller does not take the rate of the drift, {axis}: {response.reason}")]
+                return _refusal(axis, response)
             self._accepted[axis] = now_ns * 1e-9
             if len(self._accepted) == 2:
                 self._given_m_s = total_m_s
@@ -133,7 +173,15 @@ class Consequences:
 
     def to_dict(self) -> dict[str, Any]:
         """As plain JSON."""
-        return {"started": self._started, "given_m_s": self._given_m_s}
+        return {"started": self._started, "unregistered": self._unregistered, "given_m_s": self._given_m_s}
 
     def restore(self, plain: dict[str, Any]) -> None:
         self._started, self._given_m_s = bool(plain["started"]), [float(v) for v in plain["given_m_s"]]
+        self._unregistered = int(plain["unregistered"])
+
+
+def _refusal(axis: str, response: Response) -> list[Effect]:
+    """What is told where a rate is not taken."""
+    if response.ok or response.code == ControlResponse.NOT_FREE:
+        return []  # a scan has begun already: it is handed over after the next
+    return [Log("ERROR", f"the controller does not take the rate of the drift, {axis}: {response.reason}")]

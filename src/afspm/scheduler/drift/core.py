@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from afspm.drift.mapping import Mapping
@@ -37,7 +37,8 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.scheduler.drift.consequences import Consequences
+from afspm.scheduler.drift.beginning import Beginning
+from afspm.scheduler.drift.consequences import Consequences, Step
 from afspm.scheduler.drift.frame import DriftFrame
 from afspm.scheduler.drift.gate import Gate, Held, Matrix
 from afspm.scheduler.drift.knowledge import Knowledge
@@ -59,14 +60,6 @@ _MOST_TRIES = 2
 """So often a scan is registered, if the worker ends over it."""
 _MOST_ENDS = 4
 """After so many ends in a row, without a scan registered between them, it is not started again."""
-
-
-@dataclass(frozen=True)
-class _Begun:
-    """When a scan began, and in which direction."""
-
-    time_s: float
-    upwards: bool | None
 
 
 class DriftCore:
@@ -92,10 +85,11 @@ class DriftCore:
         self._consequences = Consequences(drift, self.core, codec, self.frame, self.knowledge, worker, name)
         self._gate = Gate()
         self._jobs: dict[str, ScanJob] = {}
-        self._begun: _Begun | None = None
+        self._beginning = Beginning()
         self._channel = drift.channel
         self._ends = 0
-        self._told_channel = False
+        self._waits_for_a_person = False
+        self._told_channel = self._told_slow = False
 
     # --- life ---
 
@@ -113,12 +107,15 @@ class DriftCore:
             self._gate.keep(event)  # there is more to come, which waits as well
             return []
         if held is not None and isinstance(event, RequestIn) and event.request.kind == ControlRequest.END_EXPERIMENT:
-            effects = self._give_up(held.key, now_s, now_ns)  # what was measured is published before the end
+            effects = self._publish_as_predicted(held, now_s, now_ns)  # what was measured, before the end
         effects += self.core.step(event, now_s, now_ns)
+        if self._waits_for_a_person and not self._consequences.is_given_up:
+            self._waits_for_a_person, self._ends = False, 0
+            self._worker.start()
         if isinstance(event, Tick):
             effects += self._late(now_s, now_ns)
         elif isinstance(event, TranslatorUp):
-            effects += self._ask_direction(now_s)
+            effects += self._ask_direction(now_s) + self._consequences.begin_compensation(now_s)
         return effects
 
     def said(self, event: WorkerSaid, now_s: float, now_ns: int) -> list[Effect]:
@@ -128,7 +125,7 @@ class DriftCore:
         if isinstance(event, NotRegistered):
             self._ends = 0
             told = Log("ERROR", f"a scan could not be registered, it goes out as predicted: {event.reason}")
-            return [told, *self._give_up(event.key, now_s, now_ns)]
+            return [told, *self._give_up(event.key, event.reason, now_s, now_ns)]
         if isinstance(event, WorkerGone):
             return self._gone(event, now_s, now_ns)
         return self._learn(event.forecast)
@@ -201,6 +198,7 @@ class DriftCore:
         key = scan_key(scan, event.packet)
         if self._gate.is_settled(key):
             return self.core.step(self._relocated(event, scan, self._gate.mapping_of(key)), now_s, now_ns)
+        self._beginning.scan_came()
         until_s = now_s + self._settings.longest_registration
         self._gate.hold(Held(key, self._middle_s(scan, event, now_ns), until_s))
         self.core.put_off(until_s)
@@ -214,12 +212,12 @@ class DriftCore:
         if held.asked:
             return []
         if self._ends >= _MOST_ENDS:
-            return self._give_up(held.key, now_s, now_ns)
+            return self._publish_as_predicted(held, now_s, now_ns)  # a person was told, or decided that it goes on
         message = event.header.message
         if message == "ScopeStateMsg":
             status = self._codec.decode_packet(message, event.packet.payload)
             if isinstance(status, ScopeStatus) and status.state is not ScopeState.SCANNING:
-                return self._without_channel() + self._give_up(held.key, now_s, now_ns)
+                return self._without_channel(held.key, now_s, now_ns)
         elif message == "Scan2d":
             scan = self._codec.decode_packet(message, event.packet.payload)
             if isinstance(scan, Scan) and scan_key(scan, event.packet) == held.key and self._is_channel(scan):
@@ -231,18 +229,18 @@ class DriftCore:
             self._channel = scan.channel
         return scan.channel == self._channel
 
-    def _without_channel(self) -> list[Effect]:
-        if self._told_channel:
-            return []
+    def _without_channel(self, key: str, now_s: float, now_ns: int) -> list[Effect]:
+        why = f"a scan without the channel {self._channel or 'in a unit of length'}: drift can't be seen in it"
+        effects: list[Effect] = [] if self._told_channel else [Log("WARNING", why)]
         self._told_channel = True
-        wanted = self._channel or "in a unit of length"
-        return [Log("WARNING", f"a scan without the channel {wanted}: drift can't be seen in it")]
+        return effects + self._give_up(key, why, now_s, now_ns)
 
     def _register(self, held: Held, scan: Scan, event: PacketIn, now_ns: int) -> None:
         end_s = self._end_s(scan, event, now_ns)
         start_s, upwards = 2 * held.middle_s - end_s, None
-        if self._begun is not None and self._begun.time_s < end_s:
-            upwards = self._begun.upwards
+        begun = self._beginning.of_scan(end_s)
+        if begun is not None and not begun.was_paused:
+            upwards = begun.upwards
             self.frame.durations.learn(scan.shape, scan.region.size_m, end_s - start_s)
         job = ScanJob(held.key, scan, start_s, end_s, upwards, self._asked(scan))
         self._jobs = {held.key: job}
@@ -259,8 +257,8 @@ class DriftCore:
     def _middle_s(self, scan: Scan, event: PacketIn, now_ns: int) -> float:
         """Between when it began and its own end, so that a file that comes late biases nothing."""
         end_s = self._end_s(scan, event, now_ns)
-        begun = self._begun
-        if begun is not None and begun.time_s < end_s:
+        begun = self._beginning.of_scan(end_s)
+        if begun is not None:
             return (begun.time_s + end_s) / 2
         return end_s - self.frame.durations.expected_s(scan.shape, scan.region.size_m) / 2
 
@@ -270,10 +268,8 @@ class DriftCore:
 
     def _note_state(self, payload: bytes | memoryview, time_ns: int | None) -> None:
         status = self._codec.decode_packet("ScopeStateMsg", payload)
-        if not isinstance(status, ScopeStatus) or time_ns is None:
-            return
-        if status.state is ScopeState.SCANNING and status.paused is not True:
-            self._begun = _Begun(time_ns * 1e-9, self.frame.upwards)
+        if isinstance(status, ScopeStatus) and time_ns is not None:
+            self._beginning.state(status, time_ns * 1e-9, self.frame.upwards)
 
     def _relocated(self, event: PacketIn, scan: Scan, matrix: Matrix | None) -> PacketIn:
         if matrix is None:
@@ -294,9 +290,10 @@ class DriftCore:
         job = self._jobs.pop(said.key, None)
         held = self._gate.held
         is_awaited = held is not None and held.key == said.key
-        if is_awaited:
+        if held is not None and is_awaited:
             correcting = self.knowledge.corrects(said.time_s)
             self._gate.settle(said.key, said.matrix if correcting else None)
+            effects += self._slow(held, now_s)
         if job is None:
             return effects  # long told: a worker that was restarted says it again
         correcting = self.knowledge.corrects(now_ns * 1e-9)
@@ -305,11 +302,7 @@ class DriftCore:
         effects += self.core.step(Announced(MAPPING, payload, before_ns), now_s, now_ns)
         if is_awaited:
             effects += self._release(now_s, now_ns)
-
-        def step(event: Input) -> list[Effect]:
-            return self.core.step(event, now_s, now_ns)
-
-        effects += self._consequences.of(said, job, step, now_ns)
+        effects += self._consequences.of(said, job, self._stepper(now_s, now_ns), now_ns)
         return effects + self._consequences.hand_over(now_s, now_ns)
 
     def _learn(self, forecast: dict[str, Any] | None) -> list[Effect]:
@@ -319,13 +312,31 @@ class DriftCore:
             return [Log("ERROR", f"the forecast of the drift can't be understood: {error}")]
         return []
 
-    def _give_up(self, key: str, now_s: float, now_ns: int) -> list[Effect]:
-        """A scan goes out with the prediction."""
+    def _slow(self, held: Held, now_s: float) -> list[Effect]:
+        """Told once, before it takes too long: with more references it takes several times as long."""
+        limit_s = self._settings.longest_registration
+        took_s = now_s - (held.until_s - limit_s)
+        if self._told_slow or took_s < limit_s / 3:
+            return []
+        self._told_slow = True
+        text = f"a scan was registered in {took_s:.1f} s, and is not waited for longer than longest_registration = "
+        return [Log("WARNING", f"{text}{limit_s:g} s: fewer pixels are as good, or allow more")]
+
+    def _give_up(self, key: str, why: str, now_s: float, now_ns: int) -> list[Effect]:
+        """A scan goes out with the prediction; too many of them, and the prediction is not to be relied on."""
         held = self._gate.held
         if held is None or held.key != key:
             return []
-        self._gate.settle(key, self.knowledge.matrix_at(held.middle_s))
+        effects = self._publish_as_predicted(held, now_s, now_ns)
+        effects += self._consequences.unregistered(why, self._stepper(now_s, now_ns), now_ns)
+        return [*effects, SaveState(self.snapshot())]  # how many they were
+
+    def _publish_as_predicted(self, held: Held, now_s: float, now_ns: int) -> list[Effect]:
+        self._gate.settle(held.key, self.knowledge.matrix_at(held.middle_s))
         return [SaveState(self.snapshot()), *self._release(now_s, now_ns)]
+
+    def _stepper(self, now_s: float, now_ns: int) -> Step:
+        return lambda event: self.core.step(event, now_s, now_ns)
 
     def _release(self, now_s: float, now_ns: int) -> list[Effect]:
         effects: list[Effect] = []
@@ -338,27 +349,33 @@ class DriftCore:
         held = self._gate.held
         if held is None or now_s < held.until_s:
             return []
+        limit_s = self._settings.longest_registration
+        why = f"a scan was not registered within {limit_s:g} s"
         effects: list[Effect] = []
         if held.asked:
-            limit_s = self._settings.longest_registration
-            effects.append(Log("ERROR", f"a scan was not registered within {limit_s:g} s, it goes out as predicted"))
+            effects.append(Log("ERROR", f"{why}, it goes out as predicted"))
             self._jobs.clear()
             self._worker.start()
-        return effects + self._give_up(held.key, now_s, now_ns)
+        return effects + self._give_up(held.key, why, now_s, now_ns)
 
     def _gone(self, event: WorkerGone, now_s: float, now_ns: int) -> list[Effect]:
         self._ends += 1
         held = self._gate.held
         if self._ends >= _MOST_ENDS:
             effects: list[Effect] = [Log("CRITICAL", f"drift is not followed any more: {event.reason}")]
-            return effects + ([] if held is None else self._give_up(held.key, now_s, now_ns))
+            if held is not None:
+                effects += self._publish_as_predicted(held, now_s, now_ns)
+            if self.knowledge.corrects(now_ns * 1e-9):
+                self._waits_for_a_person = True
+                effects += self._consequences.give_up(self._stepper(now_s, now_ns))
+            return effects
         effects = [Log("ERROR", f"what registers scans has ended and is started again: {event.reason}")]
         self._worker.start()
         if held is None or not held.asked:
             return effects
         job = self._jobs.get(held.key)
         if job is None or held.tries >= _MOST_TRIES:
-            return effects + self._give_up(held.key, now_s, now_ns)
+            return effects + self._give_up(held.key, event.reason, now_s, now_ns)
         held.tries += 1
         self._worker.register(job)
         return effects

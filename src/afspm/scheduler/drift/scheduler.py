@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from afspm.errors import ConfigError
 from afspm.model import Frame
 from afspm.scheduler.drift.codec import DriftWireCodec
 from afspm.scheduler.drift.consequences import RESCAN
@@ -26,7 +27,9 @@ class DriftCompensatedScheduler(Scheduler):
     what is asked for is sent to where it is at the tip by then.
 
     It publishes a `DriftMapping` whenever more is known, and a `DriftRescan` when it would like a scan to be taken
-    again, for the component `Rescanner`. When it does not know any more where the sample is, it flags thermal-drift.
+    again, for the component `Rescanner`. When it does not know any more where the sample is, since it is not found or
+    three scans in a row could not be registered, it flags thermal-drift; when nothing will be registered any more,
+    device-malfunction: who removes that has it tried again.
 
     Args:
         drift: how drift is followed and corrected.
@@ -34,7 +37,7 @@ class DriftCompensatedScheduler(Scheduler):
     """
 
     frame: ClassVar = Frame.SAMPLE
-    flags: ClassVar = ("thermal-drift",)
+    flags: ClassVar = ("thermal-drift", "device-malfunction")
     publishes: ClassVar = (MAPPING, RESCAN)
     plain_settings: ClassVar = ("drift",)
     needs_parameters: tuple[str, ...] = ()
@@ -52,11 +55,17 @@ class DriftCompensatedScheduler(Scheduler):
             self.needs_parameters = (compensate.x, compensate.y)
 
     def check(self) -> None:
-        """Whether estimator and tracker can be made. Raises ConfigError if not."""
+        """Whether estimator and tracker can be made, and do what is asked of them. Raises ConfigError if not."""
         from afspm.drift.estimators import estimator
         from afspm.drift.trackers import tracker
 
-        tracker(self.drift.tracker, estimator(self.drift.estimator))
+        made = tracker(self.drift.tracker, estimator(self.drift.estimator))
+        if self.drift.compensate is not None and not hasattr(made, "compensated"):
+            raise ConfigError(
+                "the tracker does not reckon with a controller that compensates by itself",
+                where="drift: compensate",
+                hint='tracker = "bank", or leave compensate out',
+            )
 
     def _core(self, context: SchedulerContext) -> Core:
         launch = context.launch

@@ -27,7 +27,7 @@ class Store:
         self.path = path
 
     def save(self, state: dict[str, Any]) -> None:
-        """Write it aside and rename.
+        """Write it aside and rename; a power cut leaves the one or the other.
 
         Raises:
             FileError: the disk is full …
@@ -38,7 +38,7 @@ class Store:
         text = json.dumps(_without_arrays(state, arrays))
         file = io.BytesIO()
         np.savez(file, **{_JSON: np.frombuffer(text.encode(), np.uint8)}, **arrays)  # type: ignore[arg-type]
-        write_whole(self.path, [file.getbuffer()], synced=False)
+        write_whole(self.path, [file.getbuffer()], synced=True)
 
     def load(self) -> dict[str, Any] | None:
         """What was saved last; None if nothing was.

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
-from afspm.errors import AfspmError
+from afspm.errors import AfspmError, FileError
 from afspm.scheduler.drift import pipe
 from afspm.scheduler.drift.settings import DriftSettings
 
@@ -49,6 +49,7 @@ class _Worker:
         self._store = Store(Path(settings["file"]) if settings["file"] else None)
         self._answers = answers
         self._scheduler = os.getppid()
+        self._told_full = False
         self._begin()
         self._tell_forecast()
 
@@ -60,14 +61,27 @@ class _Worker:
 
         made = tracker(self._drift.tracker, estimator(self._drift.estimator))
         self._estimation = Estimation(made, self._drift.rescan, self._save)
-        if (state := self._store.load()) is not None:
+        if (state := self._store.load()) is None:
+            return
+        try:
             self._estimation.restore(state)
+        except (AfspmError, LookupError, TypeError, ValueError) as error:
+            reason = f"the saved state is of another tracker, or damaged: {error}"
+            hint = "go on with the tracker that it is of, or remove the file: then where the sample is is not known"
+            raise FileError(reason, where=str(self._store.path), hint=hint) from error
 
     def _save(self, state: dict[str, Any]) -> None:
         """Unless the scheduler was killed meanwhile: the next one's worker knows more by now."""
         if os.getppid() != self._scheduler:
             raise BrokenPipeError
-        self._store.save(state)
+        try:
+            self._store.save(state)
+        except FileError as error:  # what is known of the drift now is worth more than what a kill would lose
+            if not self._told_full:
+                self._complain(f"what is known of the drift would be lost in a kill: {error}")
+            self._told_full = True
+        else:
+            self._told_full = False
 
     def take(self, head: dict[str, Any], data: bytes) -> None:
         if head["do"] == "register":
@@ -76,7 +90,7 @@ class _Worker:
         try:
             self._estimation.compensated(head["time_s"], tuple(head["velocity_m_s"]))
         except AfspmError as error:
-            pipe.write(self._answers, {"is": "complaint", "reason": str(error)})
+            self._complain(str(error))
         self._tell_forecast()
 
     def _register(self, head: dict[str, Any], data: bytes) -> None:
@@ -90,6 +104,9 @@ class _Worker:
             pipe.write(self._answers, {"is": "not registered", "key": head["key"], "reason": reason})
             return
         pipe.write(self._answers, {"is": "registered", **asdict(answer)})
+
+    def _complain(self, reason: str) -> None:
+        pipe.write(self._answers, {"is": "complaint", "reason": reason})
 
     def _tell_forecast(self) -> None:
         pipe.write(self._answers, {"is": "forecast", "forecast": self._estimation.forecast})
