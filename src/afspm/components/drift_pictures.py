@@ -70,7 +70,7 @@ class DriftPictures(DriftTable):
         super().__init__(file)
         self.channel, self.estimator, self.features, self.title = channel, estimator, features, title
         self._pairs: dict[tuple[str, str], Registration] = {}
-        self._drawing_is_loaded = False
+        self._drawing_is_loaded = self._has_told = False
 
     def on_tick(self) -> None:
         if not self._drawing_is_loaded and importlib.util.find_spec("matplotlib"):
@@ -100,8 +100,12 @@ class DriftPictures(DriftTable):
         from afspm.drift.record import DriftRecord
 
         folder = Path(self.run_dir)
-        record = DriftRecord.read(folder / self.file)
-        scans = [self._scan(one) for one in told]
+        readable = {number: scan for number, one in enumerate(told) if (scan := self._scan_of(one)) is not None}
+        if len(readable) < 2:
+            self.log.error("no pictures: only %d of %d scans can be read", len(readable), len(told))
+            return
+        record = DriftRecord.read(folder / self.file).chosen(list(readable))
+        told, scans = [told[number] for number in readable], list(readable.values())
         truth = true_drift(folder) if self.simulated else None
         run = album.Run(
             scans=scans,
@@ -152,8 +156,23 @@ class DriftPictures(DriftTable):
             try:
                 self._pairs[pair] = estimator(self.estimator).register(self._scan(first), self._scan(other))
             except FileError as error:
+                self._tell(error)
                 self._pairs[pair] = Registration.refused(str(error))
         return self._pairs[pair]
+
+    def _scan_of(self, told: Told) -> DriftScan | None:
+        """The same; None: it can't be had."""
+        try:
+            return self._scan(told)
+        except (AfspmError, OSError) as error:
+            self._tell(error)
+            return None
+
+    def _tell(self, error: Exception) -> None:
+        """Once in a night: of a channel that is not there each scan would say the same."""
+        if not self._has_told:
+            self.log.error("a scan is left out of the pictures: %s", error)
+        self._has_told = True
 
     def _scan(self, told: Told) -> DriftScan:
         """As the microscope saved it, in tip coordinates."""

@@ -56,6 +56,14 @@ class DriftRecord:
             self.rate_m_s[part], self.matched[part], self.reasons[part],
         )  # fmt: skip
 
+    def chosen(self, which: Sequence[int]) -> DriftRecord:
+        """Those of some numbers."""
+        at = list(which)
+        return DriftRecord(
+            tuple(self.keys[k] for k in at), self.time_s[at], self.center_m[at], self.drift_m[at],
+            self.covariance_m2[at], self.rate_m_s[at], self.matched[at], tuple(self.reasons[k] for k in at),
+        )  # fmt: skip
+
     @property
     def sd_m(self) -> Array:
         """(n, 2) standard deviations of x and y of the drift."""

@@ -110,7 +110,7 @@ def as_set(scan: Scan, measured: Mapping[str, Any], *, part: float, angle_rad: f
 
 def lines_missing(one: Scan | Spectrum) -> int:
     """How many lines of a scan have no value at all: it was broken off."""
-    return int(np.isnan(one.values).all(axis=1).sum()) if isinstance(one, Scan) else 0
+    return one.lines_missing if isinstance(one, Scan) else 0
 
 
 def modified_ns(path: Path) -> int:

@@ -115,6 +115,13 @@ class Scan:
         """When it was finished, UTC."""
         return None if self.time_ns is None else datetime.fromtimestamp(self.time_ns / 1e9, UTC)
 
+    @property
+    def lines_missing(self) -> int:
+        """How many lines have no value at all: it was broken off."""
+        import numpy as np
+
+        return int(np.isnan(self.values).all(axis=1).sum())
+
     def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
         """As it would have been at the middle of its acquisition, without the drift meanwhile (needs scipy).
 

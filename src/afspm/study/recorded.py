@@ -80,4 +80,6 @@ def drift_scan(scan: Scan, content: FileContent) -> DriftScan:
 def _unfit(scan: Scan, content: FileContent) -> str:
     if content.end_ns is None and content.start_ns is None:
         return "it does not say when it was taken"
+    if missing := scan.lines_missing:
+        return f"it was broken off: {missing} of {scan.shape[0]} lines are missing"
     return f"{scan.shape[1]} x {scan.shape[0]} pixels" if min(scan.shape) < 2 else ""

@@ -105,6 +105,26 @@ def test_a_restart_loses_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "drift_errors.png").exists(), "the truth is for simulated microscopes"
 
 
+@pytest.mark.timeout(60)
+def test_scans_that_can_not_be_read_are_left_out_with_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    lab = night(tmp_path)
+    for gone in (2, 7):
+        (tmp_path / "scans" / f"scan-{gone}.nc").unlink()
+    lab.at(1500.0, lab.kill)
+    component = DriftPictures(estimator="correlation", features="correlation")
+    assert run(component, lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.ENDED
+    assert (tmp_path / "drift_estimates_on.png").exists()
+    assert len([text for text in caplog.messages if "left out" in text]) == 1
+
+
+def test_a_channel_that_is_not_there_is_told_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    lab = night(tmp_path)
+    lab.at(450.0, lambda: caplog.clear() if "'Z'" in caplog.text else pytest.fail("nothing was said"))
+    lab.at(1500.0, lab.kill)
+    assert run(DriftPictures(channel="Z"), lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.ENDED
+    assert "no pictures: only 0 of 9 scans can be read" in caplog.text
+
+
 def test_the_truth_is_that_of_the_simulated_world(tmp_path: Path) -> None:
     assert true_drift(tmp_path) is None
     saved(tmp_path)

@@ -37,11 +37,16 @@ def test_scans_of_the_topography_come_in_the_order_of_time_with_what_their_files
     assert (found.scans[0].start_s, found.scans[0].end_s, found.scans[0].upwards) == (0.0, 100.0, True)
 
 
+BROKEN_OFF = "e.nc: it was broken off: 3 of 8 lines are missing"
+
+
 def test_what_cannot_be_followed_is_told_and_the_rest_goes_on() -> None:
     others = [content("Height", end_s=None, name="c.nc"), content("Height", pixels=1, name="d.nc")]
+    others.append(content("Height", name="e.nc"))
+    others[-1].scans[0].values[5:] = np.nan
     found = series([content("Height"), *others, content("Height", end_s=900.0, name="b.nc")])
     assert [one.key for one in found.scans] == ["a.nc", "b.nc"]
-    assert found.left_out == ("c.nc: it does not say when it was taken", "d.nc: 1 x 1 pixels")
+    assert found.left_out == ("c.nc: it does not say when it was taken", "d.nc: 1 x 1 pixels", BROKEN_OFF)
 
 
 def test_a_channel_without_two_scans_is_refused_with_those_there_are() -> None:
