@@ -26,7 +26,7 @@ def test_a_quiet_night_s_scans_lie_where_they_were_taken_on_the_sample() -> None
 
 
 def test_a_worker_in_trouble_costs_no_scan() -> None:
-    calm, troubled = DriftNight(Plan(seed=5, hours=8.0)), DriftNight(Plan(seed=5, hours=8.0), trouble=0.6)
+    calm, troubled = DriftNight(Plan(seed=5, hours=8.0)), DriftNight(Plan(seed=5, hours=8.0), trouble=0.3)
     scans = calm.run().scans
     assert troubled.run().scans > 0.7 * scans
     assert troubled.worker.failed > 10

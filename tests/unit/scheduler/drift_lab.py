@@ -20,6 +20,7 @@ from afspm.logic.events import (
     Reply,
     RequestIn,
     SaveState,
+    Tick,
     TranslatorCaughtUp,
     TranslatorReply,
     TranslatorUp,
@@ -161,7 +162,15 @@ class Lab:
         return effects
 
     def step(self, event: Input) -> list[Effect]:
-        return self.done(self.core.step(event, self.now_s, self.now_ns))
+        done = self.done(self.core.step(event, self.now_s, self.now_ns))
+        return done + self.follow()
+
+    def follow(self) -> list[Effect]:
+        """What is due at once, as whoever hosts the core would see to it."""
+        done: list[Effect] = []
+        while self.core._following:
+            done += self.done(self.core.step(Tick(), self.now_s, self.now_ns))
+        return done
 
     def knows(self, plain: dict[str, Any]) -> None:
         """The worker has this forecast."""
@@ -169,7 +178,8 @@ class Lab:
 
     def says(self, said: WorkerSaid) -> list[Effect]:
         """The worker says something."""
-        return self.done(self.core.said(said, self.now_s, self.now_ns))
+        done = self.done(self.core.said(said, self.now_s, self.now_ns))
+        return done + self.follow()
 
     # --- components ---
 

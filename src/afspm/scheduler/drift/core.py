@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -56,6 +57,7 @@ from afspm.scheduler.drift.told import (
 from afspm.units import same_kind
 
 MAPPING = "DriftMapping"
+Following = Callable[[Step, int], list[Effect]]
 _MOST_TRIES = 2
 """So often a scan is registered, if the worker ends over it."""
 _MOST_ENDS = 4
@@ -87,6 +89,7 @@ class DriftCore:
         self._jobs: dict[str, ScanJob] = {}
         self._beginning = Beginning()
         self._channel = drift.channel
+        self._following: deque[tuple[float, Following]] = deque()
         self._ends = 0
         self._waits_for_a_person = False
         self._told_channel = self._told_slow = False
@@ -102,6 +105,8 @@ class DriftCore:
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
         if isinstance(event, PacketIn):
             return self._on_packet(event, now_s, now_ns)
+        if isinstance(event, Tick) and self._following:
+            return self._follow(now_s, now_ns)
         held, effects = self._gate.held, list[Effect]()
         if held is not None and isinstance(event, TranslatorCaughtUp):
             self._gate.keep(event)  # there is more to come, which waits as well
@@ -131,10 +136,13 @@ class DriftCore:
         return self._learn(event.forecast)
 
     def deadline_s(self) -> float | None:
-        due_s, held = self.core.deadline_s(), self._gate.held
-        if held is None:
-            return due_s
-        return held.until_s if due_s is None else min(due_s, held.until_s)
+        held = self._gate.held
+        due_s = (
+            self.core.deadline_s(),
+            None if held is None else held.until_s,
+            self._following[0][0] if self._following else None,
+        )
+        return min((one_s for one_s in due_s if one_s is not None), default=None)
 
     def deadline_ns(self) -> int | None:
         return self.core.deadline_ns()
@@ -302,8 +310,16 @@ class DriftCore:
         effects += self.core.step(Announced(MAPPING, payload, before_ns), now_s, now_ns)
         if is_awaited:
             effects += self._release(now_s, now_ns)
-        effects += self._consequences.of(said, job, self._stepper(now_s, now_ns), now_ns)
+        self._following.append((now_s, lambda step, now_ns: self._consequences.of(said, job, step, now_ns)))
         return effects + self._consequences.hand_over(now_s, now_ns)
+
+    def _follow(self, now_s: float, now_ns: int) -> list[Effect]:
+        """What follows from a scan that was published: a step of its own, since it may change who is in control."""
+        _, following = self._following.popleft()
+        if self.core.control.ended:
+            return []
+        effects = following(lambda event: self.core.step(event, now_s, now_ns), now_ns)
+        return [*effects, SaveState(self.snapshot())]
 
     def _learn(self, forecast: dict[str, Any] | None) -> list[Effect]:
         try:
@@ -327,16 +343,12 @@ class DriftCore:
         held = self._gate.held
         if held is None or held.key != key:
             return []
-        effects = self._publish_as_predicted(held, now_s, now_ns)
-        effects += self._consequences.unregistered(why, self._stepper(now_s, now_ns), now_ns)
-        return [*effects, SaveState(self.snapshot())]  # how many they were
+        self._following.append((now_s, lambda step, now_ns: self._consequences.unregistered(why, step, now_ns)))
+        return self._publish_as_predicted(held, now_s, now_ns)
 
     def _publish_as_predicted(self, held: Held, now_s: float, now_ns: int) -> list[Effect]:
         self._gate.settle(held.key, self.knowledge.matrix_at(held.middle_s))
         return [SaveState(self.snapshot()), *self._release(now_s, now_ns)]
-
-    def _stepper(self, now_s: float, now_ns: int) -> Step:
-        return lambda event: self.core.step(event, now_s, now_ns)
 
     def _release(self, now_s: float, now_ns: int) -> list[Effect]:
         effects: list[Effect] = []
@@ -363,12 +375,8 @@ class DriftCore:
         held = self._gate.held
         if self._ends >= _MOST_ENDS:
             effects: list[Effect] = [Log("CRITICAL", f"drift is not followed any more: {event.reason}")]
-            if held is not None:
-                effects += self._publish_as_predicted(held, now_s, now_ns)
-            if self.knowledge.corrects(now_ns * 1e-9):
-                self._waits_for_a_person = True
-                effects += self._consequences.give_up(self._stepper(now_s, now_ns))
-            return effects
+            self._following.append((now_s, self._wait_for_a_person))
+            return effects if held is None else effects + self._publish_as_predicted(held, now_s, now_ns)
         effects = [Log("ERROR", f"what registers scans has ended and is started again: {event.reason}")]
         self._worker.start()
         if held is None or not held.asked:
@@ -379,6 +387,11 @@ class DriftCore:
         held.tries += 1
         self._worker.register(job)
         return effects
+
+    def _wait_for_a_person(self, step: Step, now_ns: int) -> list[Effect]:
+        """Nothing will be registered any more, until somebody has looked why."""
+        self._waits_for_a_person = self.knowledge.corrects(now_ns * 1e-9)
+        return self._consequences.give_up(step) if self._waits_for_a_person else []
 
     def _ask_direction(self, now_s: float) -> list[Effect]:
         """In which direction it scans, where it tells."""

@@ -11,7 +11,7 @@ from typing import Any
 from afspm.drift.mapping import Mapping
 from afspm.errors import AfspmError
 from afspm.logic.frame import Mapped
-from afspm.logic.limits import PROBE_CHANGES, REGION_CHANGES, scan_values
+from afspm.logic.places import PROBE_CHANGES, REGION_CHANGES, scan_values
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -37,7 +37,6 @@ MOVES_M = 1e-11
 """The same of the probe: finer than any scanner positions it."""
 
 _REMEMBERED = 64
-_AT_PROBE = frozenset({names.START_SPEC, names.PULSE, names.CRASH})
 _SET_SCAN, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
 _PARAM = int(ControlRequest.PARAM)
 _MESSAGES = {_SET_SCAN: "ScanParameters2d", _SET_PROBE: "ProbePosition"}
@@ -128,7 +127,7 @@ class DriftFrame:
         here: Place[Any] | None = None
         if action == names.START_SCAN:
             here = self.region.current
-        elif action in _AT_PROBE:
+        elif action in names.AT_PROBE:
             here = self.probe.current
         if here is None:
             return None
