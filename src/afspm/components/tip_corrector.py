@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar, Literal
 
 from afspm import wire
@@ -9,9 +10,9 @@ from afspm.components import verdicts
 from afspm.components.planned_scans import pair
 from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.components.tip_scans import Pairing
-from afspm.components.treatments import Pulse, Treatment, clearance_m, fresh_place, treatments
+from afspm.components.treatments import XY, Pulse, Treatment, clearance_m, fresh_place, treatments
 from afspm.components.verdicts import read_verdict
-from afspm.errors import ConfigError, ControlLost, Refused
+from afspm.errors import ConfigError, ControlLost, FileError, NoResponse, Refused
 from afspm.model import Problem, Region, Scan, ScanSet, ScopeState, names
 from afspm.runtime.component import Component
 from afspm.runtime.events import Events
@@ -33,7 +34,10 @@ class TipCorrector(Component):
     the experiment stands still rather than measuring with a bad tip. Once that flag is removed it may try again.
 
     What it does to the sample it does at fresh places about `workshop_center`, and never within `keep_away` of the
-    experiment's region or of the test scan. It publishes each action done as an `ActionMsg`.
+    experiment's region or of the test scan. Where control is lost on the way to one of them, to a person who moves the
+    probe, say, it begins again with another place when control is back. It does nothing where the probe is not
+    published to stand there, nor what it can't write down, on a full disk: a restart would do it again. It publishes
+    each action done as an `ActionMsg`.
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
@@ -129,12 +133,16 @@ class TipCorrector(Component):
         with self.scope.events("ControlState", verdicts.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
             if tried and self._is_cured(looks, shape, answers):  # a kill may have come between treatment and test
                 return
-            for treatment in self.allowed[tried:]:
-                if self._treat(treatment, (region, test)) and self._is_cured(looks, shape, answers):
-                    self.log.info("the tip is repaired")
-                    return
+            try:
+                for number, treatment in enumerate(self.allowed[tried:], tried + 1):
+                    if self._treat(number, treatment, (region, test)) and self._is_cured(looks, shape, answers):
+                        self.log.info("the tip is repaired")
+                        return
+                why = f"all {len(self.allowed)} treatments that are allowed were tried"
+            except FileError as error:
+                why = error.what
         self._restore(region)
-        self._give_up(f"all {len(self.allowed)} treatments that are allowed were tried")
+        self._give_up(why)
 
     def _of_experiment(self) -> tuple[Region | None, tuple[int, int] | None]:
         """Region and shape of the experiment's scans, as they were before we moved away."""
@@ -150,35 +158,75 @@ class TipCorrector(Component):
         shape = self.memory["shape"]
         return Region((x, y), (width, height), angle), (shape[0], shape[1]) if shape else None
 
-    def _treat(self, treatment: Treatment, safe: tuple[Region, Region]) -> bool:
-        """Whether it was done."""
-        number = int(self.memory.get("places", 0))
-        place = fresh_place(self.workshop_center, self.place_spacing, number)
-        # counted before it is done: a kill must not make it happen twice
-        self.memory["tried"], self.memory["places"] = int(self.memory.get("tried", 0)) + 1, number + 1
-        self.memory.save()
+    def _treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
+        """Whether the `number`-th treatment was done, at a place that the probe was moved to in the same tenure."""
+        while True:
+            place = self._fresh_place(number)
+            try:
+                with self.scope.control(unbroken=True):
+                    return self._treat_at(place, treatment, safe)
+            except Refused as refused:
+                self.log.warning("no %s, it was refused: %s", treatment, refused.reason)
+                return False
+            except ControlLost as lost:
+                if not self._is_flagged(self.problem):
+                    raise
+                self.log.warning("no %s yet: %s; it is begun again at a fresh place", treatment, lost.what)
+
+    def _fresh_place(self, number: int) -> XY:
+        """Where the `number`-th treatment is to be tried. It is counted before: a kill must not make it happen twice.
+
+        Raises:
+            FileError: that can't be written down.
+        """
+        places = int(self.memory.get("places", 0))
+        self.memory["tried"], self.memory["places"] = number, places + 1
+        if not self.memory.save():
+            raise FileError("the disk is full: a treatment that can't be written down would be done again by a restart")
+        return fresh_place(self.workshop_center, self.place_spacing, places)
+
+    def _treat_at(self, place: XY, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
+        """Whether it was done. All of it in one tenure of control: whoever has it in between may move the probe."""
+        parameters = self.scope.scan_parameters  # a person may have chosen another region meanwhile
+        if parameters is not None and isinstance(parameters.region, Region):
+            safe = (*safe, parameters.region)
         if (away := min(clearance_m(place, region) for region in safe)) < self.keep_away:
             self.log.error("no %s: its place is only %.0f nm away from what is scanned", treatment, away * 1e9)
             return False
         action = names.PULSE if isinstance(treatment, Pulse) else names.CRASH
-        try:
-            if not self.scope.supports(action):
-                self.log.warning("no %s: the microscope has no %s", treatment, action)
-                return False
-            self.scope.move_probe(place)
-            self._prepare(treatment)
-            self._act(action)
-        except Refused as refused:
-            self.log.warning("no %s, it was refused: %s", treatment, refused.reason)
+        if not self.scope.supports(action):
+            self.log.warning("no %s: the microscope has no %s", treatment, action)
             return False
-        self.log.info("%s at (%.0f, %.0f) nm", treatment, place[0] * 1e9, place[1] * 1e9)
+        self.scope.move_probe(place)
+        self._prepare(treatment)
+        if not self.scope.wait_until(
+            lambda: self._stands_at(place) or not self.scope.in_control, timeout_s=SETTLED_WITHIN_S
+        ):
+            self.log.error("no %s: the probe is %s, and not at %s", treatment, self._where(), _nm(place))
+            return False
+        where = self._where()
+        self._act(action)
+        self.log.info("%s %s", treatment, where)
         self.publish(wire.message_type(DONE_ACTION)(action=action), f"{DONE_ACTION}_{self.name}")
         return True
+
+    def _stands_at(self, place: XY) -> bool:
+        """Whether the probe is published to be so near to a place that no other one is nearer."""
+        position = self.scope.probe_position
+        return position is not None and math.dist(position.xy_m, place) <= self.place_spacing / 2
+
+    def _where(self) -> str:
+        position = self.scope.probe_position
+        return "nobody knows where" if position is None else f"at {_nm(position.xy_m)}"
 
     def _act(self, action: str) -> None:
         """Do it, and let it end: what is asked of a busy microscope it refuses."""
         with self.scope.events("ScopeStateMsg", timeout_s=SETTLED_WITHIN_S) as states:
-            self.scope.action(action)
+            try:
+                self.scope.action(action)
+            except NoResponse as silent:
+                self.log.warning("%s: it counts as done, %s", silent.what, silent.hint)
+                return
             was_busy = False
             for event in states:
                 if event.message.state is ScopeState.FREE and was_busy:
@@ -268,3 +316,7 @@ class TipCorrector(Component):
 
     def _is_flagged(self, problem: int | str) -> bool:
         return self.scope.problems.number(problem) in self.scope.control_state.problems
+
+
+def _nm(place: XY) -> str:
+    return f"({place[0] * 1e9:.0f}, {place[1] * 1e9:.0f}) nm"

@@ -47,10 +47,13 @@ class Asker:
     ) -> Response:
         """Ask for a command until it succeeds. Control must be held around it; where it is lost it is waited for.
 
+        Not so in an unbroken block: what comes in the tenure after may find the microscope otherwise.
+
         Raises:
             Refused: the microscope, or a limit, says no.
-            NoResponse: the microscope stays silent, or is not free until `until_s`.
-            ControlLost: control was not back until `until_s`.
+            NoResponse: the microscope stays silent, or is not free until `until_s`; or, in an unbroken block, control
+                was lost before an action was answered.
+            ControlLost: control was not back until `until_s`; or, in an unbroken block, was lost, and no action done.
         """
         request_id = self._link.next_id()
         while True:
@@ -62,6 +65,12 @@ class Asker:
             if response.code != ControlResponse.NO_RESPONSE:  # else it may have been carried out: the same id again
                 self.get_over(kind, response, states, until_s)
                 request_id = self._link.next_id()
+            elif kind == ControlRequest.ACTION and self._holding.is_unbroken:  # what is set is set anew
+                raise NoResponse(
+                    f"control was lost before the action was answered: {self._holding.why_lost}",
+                    where=self._link.name,
+                    hint="whether it was carried out is not known",
+                )
 
     def send(
         self,

@@ -25,6 +25,7 @@ class Holding:
         held: we are in control.
         why_lost: for a person, why we no longer are.
         gives_back_inherited: give back whatever control an earlier life of this component died with.
+        is_unbroken: in this block control that is lost is not waited for: nothing is asked for in a second tenure.
 
     That it is, the scheduler's answers say; that it no longer is, its published control state, once that has named us.
     (A state from before the grant may still be under way: it must not be taken for a loss.)
@@ -38,6 +39,7 @@ class Holding:
         self.held = False
         self.why_lost = ""
         self.gives_back_inherited = False
+        self.is_unbroken = False
         link.listen(self._on_packet)
 
     @property
@@ -46,11 +48,13 @@ class Holding:
         return bool(self._wanted) and not self.held
 
     @contextmanager
-    def hold(self, *, solving: int = Problem.NONE, until_s: float | None = None) -> Iterator[None]:
+    def hold(
+        self, *, solving: int = Problem.NONE, until_s: float | None = None, unbroken: bool = False
+    ) -> Iterator[None]:
         """Have control in the block; within another such block it is that one's.
 
         Raises:
-            ControlLost: it was not given until `until_s`.
+            ControlLost: it was not given until `until_s`; or, in the block, if `unbroken`, is no longer there.
             Refused: the problem to be solved is not flagged.
         """
         if self._wanted and solving in (Problem.NONE, self._wanted[0]):
@@ -62,8 +66,10 @@ class Holding:
                 hint="leave the one `with scope.control(...)` before the other begins",
             )
         self._wanted.append(solving)
+        was_unbroken = self.is_unbroken
         try:
             self.regain(until_s)
+            self.is_unbroken = was_unbroken or unbroken
             yield
         except (ExperimentEnded, StopRequested):
             self._wanted.pop()
@@ -75,13 +81,21 @@ class Holding:
             raise
         else:
             self._leave(quietly=False)
+        finally:
+            self.is_unbroken = was_unbroken
 
     def regain(self, until_s: float | None = None) -> None:
         """Be in control: at once if we are, else ask, wait for the control state to change, and ask again.
 
         Raises:
-            ControlLost: not until `until_s`, or what we wanted control for has been solved.
+            ControlLost: not until `until_s`, or what we wanted control for has been solved, or not without a break.
         """
+        if self.is_unbroken and not self.held:
+            raise ControlLost(
+                f"control was lost: {self.why_lost}",
+                where=self._link.name,
+                hint="others may have moved the probe or set something: begin the block again",
+            )
         solving = self._wanted[-1] if self._wanted else Problem.NONE
         view, clock = self._link.view, self._link.clock
         told = ""

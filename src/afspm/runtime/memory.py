@@ -39,10 +39,14 @@ class Memory(MutableMapping[str, Any]):
             values, self.damage = load(path, _read)
             self._values = values or {}
 
-    def save(self) -> None:
+    def save(self) -> bool:
         """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
 
-        A disk that is full must not end the experiment: it is said, and the experiment goes on.
+        A disk that is full must not end the experiment: it is said, and the experiment goes on. Whoever does something
+        that must not happen twice looks at what is returned, and doesn't do it.
+
+        Returns:
+            Whether it was written: False if the disk is full.
 
         Raises:
             InvalidValue: a value is not of JSON's types.
@@ -59,6 +63,8 @@ class Memory(MutableMapping[str, Any]):
                 self._generations.save(text.encode())
             elif self._path is not None:
                 write_whole(self._path, [text.encode(), b"\n"])
+            return True
+        return False
 
     def __getitem__(self, key: str) -> Any:
         return self._values[key]

@@ -51,7 +51,7 @@ class Scope:
     Every call may raise:
         Refused: the scheduler, a limit or the microscope said no; `reason` says why.
         NoResponse: the time given was up, or nobody answers.
-        ControlLost: control was not given within the timeout.
+        ControlLost: control was not given within the timeout, or is lost in an unbroken block.
         ExperimentEnded: there is nothing more to ask.
 
     Args:
@@ -192,7 +192,9 @@ class Scope:
     # --- control ---
 
     @contextmanager
-    def control(self, *, solving: int | str | None = None, timeout_s: float | None = None) -> Iterator[None]:
+    def control(
+        self, *, solving: int | str | None = None, timeout_s: float | None = None, unbroken: bool = False
+    ) -> Iterator[None]:
         """Keep control over all calls in the block; waits for it first.
 
         Within the block control may still be lost: to a problem, to MANUAL. The next call then waits until it is back.
@@ -200,9 +202,14 @@ class Scope:
 
         Args:
             solving: the flagged problem that will be solved, by name or number.
+            unbroken: what the block does hangs together, as a pulse does with the place that the probe was moved to.
+                Where control is lost, the next call in the block raises ControlLost, and nothing more is done: begin
+                the block again, whoever was in control meanwhile may have changed anything. `action` raises NoResponse
+                if the loss came before the answer, so that it is not known whether it was done. Within another block,
+                control is waited for when this one begins.
         """
         number = Problem.NONE if solving is None else self.problems.number(solving)
-        with self._holding.hold(solving=number, until_s=self._link.until(timeout_s)):
+        with self._holding.hold(solving=number, until_s=self._link.until(timeout_s), unbroken=unbroken):
             yield
 
     @property

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import errno
+import logging
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +17,11 @@ from afspm.components.tip_corrector import TipCorrector
 from afspm.components.verdicts import BAD, GOOD, MESSAGE, UNCLEAR, verdict_message
 from afspm.errors import ConfigError
 from afspm.model import (
+    ControlMode,
     ControlRequest,
     ControlResponse,
     Parameter,
+    ProbePosition,
     Problem,
     Region,
     Request,
@@ -57,6 +62,11 @@ class Repairs(Lab):
                 self.executed.append(request.id)
             return Response(ControlResponse.SUCCESS)
         return super()._execute(request)
+
+    def stand_at(self, xy_m: tuple[float, float]) -> None:
+        """Somebody else has moved the probe."""
+        self.position = ProbePosition(xy_m)
+        self.publish(self.position)
 
     @property
     def problems(self) -> tuple[int, ...]:
@@ -201,3 +211,153 @@ def test_settings_without_sense_are_refused() -> None:
     for wrong in ({"pulse_voltages": (), "crash_depths": ()}, {"place_spacing": 0.0}, {"workshop_center": (1.0,)}):
         with pytest.raises((ConfigError, ValueError)):
             corrector(**wrong)
+
+
+def is_of_treatment(request: Request) -> bool:
+    return request.subject in ("x-pulse", "x-crash") and request.kind == ControlRequest.ACTION
+
+
+def a_person_takes_over(lab: Repairs) -> None:
+    """Sets MANUAL, moves the probe to where the experiment scans, and hands back."""
+    lab.set_mode(ControlMode.MANUAL)
+    lab.at(60.0, lambda: lab.stand_at((0.0, 0.0)))
+    lab.at(90.0, lambda: lab.set_mode(ControlMode.AUTOMATED))
+
+
+def just_before(lab: Repairs, kind: ControlRequest, happens: Callable[[], None], number: int = 1) -> None:
+    """Something happens just before the scheduler hears the `number`-th request of a kind."""
+    heard = 0
+
+    def intercept(request: Request) -> Response | str:
+        nonlocal heard
+        if request.kind == kind and request.subject != "start-scan":
+            heard += 1
+            if heard == number:
+                happens()
+        return "go on"
+
+    lab.intercept = intercept
+
+
+@pytest.mark.parametrize(
+    ("kind", "number"),
+    [
+        (ControlRequest.SET_PROBE_POS, 1),
+        (ControlRequest.PARAM, 1),
+        (ControlRequest.PARAM, 2),
+        (ControlRequest.ACTION, 1),
+    ],
+)
+def test_a_probe_that_a_person_has_moved_is_moved_back_before_the_tip_is_treated(
+    kind: ControlRequest, number: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    lab = Repairs([GOOD])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(5000.0, lab.kill)
+    just_before(lab, kind, lambda: a_person_takes_over(lab), number)
+    run(corrector(), lab)
+    ((action, (x, y)),) = lab.actions
+    assert action == "x-pulse"
+    assert x > 7e-6
+    assert f"pulse of +3 V, 50 ms at ({x * 1e9:.0f}, {y * 1e9:.0f}) nm" in caplog.text
+    assert lab.problems == ()
+
+
+def test_a_region_that_a_person_has_chosen_over_the_workshop_is_kept_away_from(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lab = Repairs([BAD] * 9)
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(20_000.0, lab.kill)
+
+    def person() -> None:
+        a_person_takes_over(lab)
+        lab.publish(ScanParameters(REGION.moved_to((8e-6, 0.0)), (8, 8)))
+
+    just_before(lab, ControlRequest.PARAM, person)
+    run(corrector(crash_depths=(), pulse_voltages=(3.0,)), lab)
+    assert lab.actions == []
+    assert "away from what is scanned" in caplog.text
+    assert MALFUNCTION in lab.problems
+
+
+def test_nothing_is_done_where_the_probe_is_not_published_to_stand(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Repairs([])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(20_000.0, lab.kill)
+
+    def somebody(request: Request) -> Response | str:  # by the software of the controller
+        if request.kind == ControlRequest.PARAM:
+            lab.stand_at((0.0, 0.0))
+        return "go on"
+
+    lab.intercept = somebody
+    run(corrector(), lab)
+    assert lab.actions == []
+    assert "no pulse of +3 V, 50 ms: the probe is at (0, 0) nm, and not at (8000, 0) nm" in caplog.text
+    assert lab.problems == (TIP, MALFUNCTION)
+
+
+@pytest.mark.parametrize("is_done", [False, True])
+def test_a_treatment_that_was_not_answered_before_a_person_took_over_is_not_asked_for_again(is_done: bool) -> None:
+    lab = Repairs([BAD, GOOD])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(5000.0, lab.kill)
+
+    def silent(request: Request) -> Response | str:
+        if not is_of_treatment(request):
+            return "go on"
+        lab.intercept = lambda request: "go on"
+        if is_done:
+            lab._answer_once(request)
+        a_person_takes_over(lab)
+        return Response(ControlResponse.NO_RESPONSE, reason="the translator is not connected")
+
+    lab.intercept = silent
+    run(corrector(), lab)
+    assert len(lab.actions) == 1 + is_done  # the next one, after the test scan that was bad
+    assert all(x > 7e-6 for _, (x, _) in lab.actions)
+    assert len(lab.finished) == 2
+    assert lab.problems == ()
+
+
+def test_what_can_not_be_written_down_is_not_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    lab = Repairs([BAD] * 9)
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(5000.0, lab.kill)
+    monkeypatch.setattr(os, "fsync", full)
+    run(corrector(), lab, tmp_path)
+    assert lab.actions == []
+    assert lab.problems == (TIP, MALFUNCTION)
+    assert "the tip can't be repaired: the disk is full" in caplog.text
+
+
+def test_once_there_is_room_again_and_a_person_has_looked_it_is_repaired(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fsync, is_full = os.fsync, True
+
+    def disk(descriptor: int) -> None:
+        if is_full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(descriptor)
+
+    def person() -> None:
+        nonlocal is_full
+        is_full = False
+        lab.clear(MALFUNCTION)
+
+    lab = Repairs([BAD, GOOD])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(5000.0, person)
+    lab.at(9000.0, lab.kill)
+    monkeypatch.setattr(os, "fsync", disk)
+    run(corrector(), lab, tmp_path)
+    assert len(lab.actions) == 2
+    assert lab.problems == ()

@@ -70,9 +70,9 @@ def test_a_full_disk_is_told_once_and_all_is_kept_when_there_is_room(
         disk.setattr(os, "fsync", full)
         for step in range(3):
             memory["step"] = step
-            memory.save()
+            assert memory.save() is False
     assert [record.levelname for record in caplog.records] == ["CRITICAL"]
-    memory.save()
+    assert memory.save() is True
     assert dict(Memory(tmp_path / "x.json")) == {"step": 2}
     assert "there is room again" in caplog.text
 
