@@ -8,7 +8,7 @@ from datetime import UTC
 from typing import Any
 
 from afspm import wire
-from afspm.errors import NoResponse, WireError
+from afspm.errors import NoResponse, Refused, WireError
 from afspm.logic.sessions import KEYED
 from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
 from afspm.model.words import day_and_time
@@ -35,6 +35,7 @@ class Plan:
         fits: whether a result can be of this plan.
         facts: the plan in JSON's types, to recognise it in a later life.
         name_of: what must not be there twice in one result (the channel of a scan).
+        words_for: a result for a person: of what, and where.
     """
 
     what: str
@@ -45,6 +46,7 @@ class Plan:
     fits: Callable[[Any], bool]
     facts: dict[str, Any]
     name_of: Callable[[Any], str]
+    words_for: Callable[[Any], str]
 
 
 @dataclass
@@ -181,7 +183,7 @@ class Measuring:
             )
             if not response.ok and not cycle.begun:
                 is_unknown = False
-                self._asker.get_over(ControlRequest.ACTION, response, states, progress.until_s)
+                self._get_over(response, states, progress, is_new=resumed is None)
                 if not _may_have_begun(response, resumed):
                     return None
                 cycle.control_was_lost()
@@ -195,6 +197,16 @@ class Measuring:
                 self._resumed, self._forget_resumed = cycle, forget
             else:
                 forget()
+
+    def _get_over(self, response: Response, states: int, progress: _Progress, *, is_new: bool) -> None:
+        """Wait for what stands in the way of an action, or raise Refused."""
+        try:
+            self._asker.get_over(ControlRequest.ACTION, response, states, progress.until_s)
+        except Refused:
+            # What was asked for before is answered from memory: it was refused then, and nothing was done. What is
+            # answered now, another id tells.
+            if is_new:
+                raise
 
     def _write_down(self, progress: _Progress) -> None:
         if progress.key is None:
@@ -234,6 +246,10 @@ class Measuring:
             why = f"control was lost: {self._holding.why_lost}"
         elif cycle.outcome is Outcome.INTERRUPTED:
             why = "it was stopped, not by us"
+        elif cycle.outcome is Outcome.ANOTHER:
+            why = (
+                f"not what was asked for was measured, but {plan.words_for(cycle.other)}; who else sets the microscope?"
+            )
         else:
             why = "the microscope is free again without a result; was it started anew?"
         self._note(progress, why)

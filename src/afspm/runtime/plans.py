@@ -19,6 +19,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.model.words import area, place
 from afspm.runtime.asking import Asker
 from afspm.runtime.measurement import Plan
 from afspm.runtime.view import View
@@ -27,6 +28,7 @@ SAME = 1e-6  # of the size: closer than any controller positions
 FITS = 1e-2  # of the size: a controller's rounding, not another region
 SAME_PLACE_M = 1e-9
 MOVED = 0.5  # of the size: where drift is corrected, a scan lies where it turned out to have been taken
+SHEARED = 0.1  # of the size: and is as large, and as turned, as it turned out to be
 
 MEASURED = {"scan": (ScopeState.SCANNING, "Scan2d"), "spectrum": (ScopeState.SPEC, "Spec1d")}
 """By what is measured: the state of the microscope meanwhile, and the message of the results."""
@@ -59,6 +61,7 @@ class Plans:
             fits=lambda result: fits(facts, result),
             facts=facts,
             name_of=lambda scan: str(scan.channel),
+            words_for=_scan_in_words,
         )
 
     def spectrum(self, at_m: tuple[float, float] | None, kind: str | None) -> Plan:
@@ -82,6 +85,7 @@ class Plans:
             fits=lambda result: fits(facts, result),
             facts=facts,
             name_of=lambda spectrum: "",  # there is one, and the next may be of another kind
+            words_for=_spectrum_in_words,
         )
 
     def move_probe(self, xy_m: tuple[float, float], until_s: float | None) -> None:
@@ -100,13 +104,14 @@ class Plans:
         # in sample coordinates the same region is another place of the tip a while later
         fixed = not (isinstance(wanted.region, Region) and wanted.region.frame is Frame.SAMPLE)
         now = self._view.scan_parameters
-        if fixed and (_is_set(wanted, now) or (now is not None and (wanted, now) == self._set)):
+        if fixed and (_is_set(wanted, now, SAME) or (now is not None and (wanted, now) == self._set)):
             return
         count = self._view.count("ScanParameters2d")
         self._asker.ask(ControlRequest.SET_SCAN_PARAMS, wanted, until_s=until_s)
         self._asker.settle("ScanParameters2d", count, until_s)
-        # a controller may round: then this is what our wish looks like when it is set
-        self._set = (wanted, self._view.scan_parameters)
+        # a controller may round: then this is what our wish looks like when it is set; what lies elsewhere is another's
+        now = self._view.scan_parameters
+        self._set = (wanted, now) if _is_set(wanted, now, FITS) else None
 
 
 def fits(facts: dict[str, Any], result: Any) -> bool:
@@ -123,7 +128,7 @@ def _scan_fits(facts: dict[str, Any], scan: Scan) -> bool:
     wanted = _region_of(numbers, frame)
     if wanted.frame is Frame.SAMPLE:
         near = math.dist(wanted.center_m, scan.region.center_m) <= MOVED * min(wanted.size_m)
-        return near and _is_near(wanted.moved_to(scan.region.center_m), scan.region, FITS)
+        return near and _is_near(wanted.moved_to(scan.region.center_m), scan.region, SHEARED)
     return _is_near(wanted, scan.region, FITS)
 
 
@@ -138,6 +143,17 @@ def _spectrum_fits(facts: dict[str, Any], spectrum: Spectrum) -> bool:
 _FITS: dict[str, Callable[[dict[str, Any], Any], bool]] = {"scan": _scan_fits, "spectrum": _spectrum_fits}
 
 
+def _scan_in_words(scan: Scan) -> str:
+    region, (rows, columns) = scan.region, scan.shape
+    turned = f", turned by {math.degrees(region.angle_rad):.4g} degrees" if region.angle_rad else ""
+    return f"{area(region.size_m)} at {place(region.center_m)}{turned}, {rows} x {columns} pixels"
+
+
+def _spectrum_in_words(spectrum: Spectrum) -> str:
+    where = "somewhere" if spectrum.position_m is None else f"at {place(spectrum.position_m)}"
+    return f"{spectrum.kind or 'of no kind'} {where}"
+
+
 def _region_facts(region: Region | None) -> list[Any] | None:
     if region is None:
         return None
@@ -149,12 +165,13 @@ def _region_of(numbers: list[float], frame: str) -> Region:
     return Region((x, y), (width, height), angle, Frame(frame))
 
 
-def _is_set(wanted: ScanParameters, now: ScanParameters | None) -> bool:
+def _is_set(wanted: ScanParameters, now: ScanParameters | None, tolerance: float) -> bool:
+    """Whether what is in force is what is wanted, but for `tolerance` of the size."""
     if now is None or (wanted.shape is not None and wanted.shape != now.shape):
         return False
     if not isinstance(wanted.region, Region):
         return wanted.region is None
-    return isinstance(now.region, Region) and _is_near(wanted.region, now.region, SAME)
+    return isinstance(now.region, Region) and _is_near(wanted.region, now.region, tolerance)
 
 
 def _is_near(a: Region, b: Region, tolerance: float) -> bool:

@@ -21,7 +21,9 @@ CASES = [
     ("its beginning was lost", ["a", "b", FREE], Outcome.COMPLETED, ["a", "b"]),
     ("begun once more in the middle", [BUSY, "a", BUSY, "b", FREE], Outcome.COMPLETED, ["b"]),
     ("what comes after the end", [BUSY, "a", FREE, BUSY, "b", FREE], Outcome.COMPLETED, ["a"]),
-    ("a result that drift has moved", [BUSY, "other", FREE], Outcome.COMPLETED, ["other"]),
+    ("another was measured", [BUSY, "other", FREE], Outcome.ANOTHER, []),
+    ("another's result among ours", [BUSY, "other", "a", FREE], Outcome.COMPLETED, ["a"]),
+    ("another before it begins once more", [BUSY, "other", BUSY, FREE], Outcome.VANISHED, []),
 ]
 
 
@@ -60,4 +62,5 @@ def test_a_peer_that_tells_no_times_is_believed_only_about_what_we_wait_for() ->
 def test_what_somebody_else_has_measured_while_we_were_dead_is_not_ours() -> None:
     cycle = Cycle(BUSY, lambda result: result != "other", since_ns=0, resumed=True)
     follow(cycle, [BUSY, "other", FREE])
-    assert cycle.outcome is Outcome.VANISHED
+    assert cycle.outcome is Outcome.ANOTHER
+    assert cycle.other == "other"

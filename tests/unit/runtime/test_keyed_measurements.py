@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,7 +13,7 @@ from runtime_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 
 from afspm.errors import InvalidValue, NoResponse, Refused
 from afspm.logic.arbitration import Event
-from afspm.model import ControlRequest, ControlResponse, Problem, Response, ScanSet
+from afspm.model import ControlRequest, ControlResponse, Problem, Request, Response, ScanSet
 from afspm.runtime.link import Link
 from afspm.runtime.scope import Scope
 
@@ -194,3 +195,46 @@ def test_after_a_refusal_the_same_key_is_asked_for_with_another_id(tmp_path: Pat
     scope.scan(None, key="tile")
     ids = [request.id for request in lab.requests if request.subject == "start-scan"]
     assert ids == ["experiment/key/tile/1", "experiment/key/tile/2"]
+
+
+def retracted(lab: Lab) -> Callable[[], None]:
+    """The tip is retracted: no scan begins, and ids are remembered with that answer. Returns what engages it again."""
+    execute, is_retracted = lab._execute, [True]
+
+    def carry_out(request: Request) -> Response:
+        if is_retracted and request.subject == "start-scan":
+            return Response(ControlResponse.ACTION_ERROR, reason="the tip is retracted")
+        return execute(request)
+
+    lab._execute = carry_out  # type: ignore[method-assign]
+    return is_retracted.clear
+
+
+def test_what_was_refused_in_earlier_lives_is_done_once_it_can_be(tmp_path: Path) -> None:
+    lab = Lab()
+    engage = retracted(lab)
+    for life in range(3):
+        with pytest.raises(Refused, match="retracted"):
+            scope_of(lab, tmp_path, life).scan(REGION, shape=(8, 8), key="tile")
+        lab.restart_component()
+    engage()
+    assert scope_of(lab, tmp_path, 3).scan(REGION, shape=(8, 8), key="tile").region == REGION
+    assert lab.begun_scans == 1
+
+
+@pytest.mark.parametrize("is_late", [True, False])
+def test_what_was_refused_is_done_once_at_whichever_step_it_was_killed(*, is_late: bool) -> None:
+    for deadly_call in range(1, 1000):
+        lab = Lab()
+        engage = retracted(lab)
+        with TemporaryDirectory() as folder:
+            port = LabPort(lab, deadly_call, is_late=is_late)
+            with pytest.raises((Kill9, Refused)):
+                scope_of(lab, Path(folder), 0, port).scan(REGION, shape=(8, 8), key="tile")
+            engage()
+            lab.restart_component()
+            scope_of(lab, Path(folder), 1).scan(REGION, shape=(8, 8), key="tile")
+        assert lab.finished == [REGION], f"killed at call {deadly_call}"
+        if not port.is_dead:
+            break
+    assert deadly_call > 5
