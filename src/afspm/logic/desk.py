@@ -80,11 +80,13 @@ class Desk:
 
     def snapshot(self) -> dict[str, Any]:
         """What must survive a kill, as plain JSON."""
-        return {"sent": list(self._sent), "sessions": self.sessions.tokens()}
+        return {"sent": list(self._sent), "sessions": self.sessions.tokens(), "guard": self.guard.snapshot()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take up what `snapshot` wrote."""
         self.sessions.restore(state["sessions"])
+        if "guard" in state:  # not in what a scheduler wrote that was older
+            self.guard.restore(state["guard"])
         for client, request_id, print_ in state["sent"]:
             self._sent.append((client, request_id, print_))
             self._once.restore(client, request_id, print_, Fate.UNKNOWN)
@@ -200,9 +202,9 @@ class Desk:
             if not self._is_within_limits(event, mapped, now_ns):
                 return
             self._lease.used(now_ns)
-            if self._frame is not None and request.kind == _ACTION and self._moves_first(event, now_s, now_ns):
+            if request.kind == _ACTION and not self._may_act_here(event, now_s, now_ns):
                 return
-        self._send(event, mapped, now_s, command=command)
+        self._send(event, mapped, now_s, now_ns, command=command)
 
     def _is_within_limits(self, event: RequestIn, mapped: Mapped | None, now_ns: int) -> bool:
         """What goes to the microscope is within the limits; if not, the asker is told."""
@@ -216,6 +218,15 @@ class Desk:
             return True
         self._refused_by_us(event, refusal)
         return False
+
+    def _may_act_here(self, event: RequestIn, now_s: float, now_ns: int) -> bool:
+        """Whether an action may be sent at once: if not, it is answered, or waits for a move."""
+        if self._frame is not None and self._moves_first(event, now_s, now_ns):
+            return False
+        refusal = self.guard.check_place(event.request)
+        if refusal is not None:
+            self._refused_by_us(event, refusal)
+        return refusal is None
 
     def _refused_by_us(self, event: RequestIn, refusal: Response) -> None:
         refusal.id = event.request.id
@@ -238,20 +249,32 @@ class Desk:
         if job is None:
             return False  # nobody is there to be moved, as the action will be told
         job.mapped = move
-        self._asked_by_us[job.number] = lambda response, now_s, now_ns: self._moved(job, response, now_s)
+        self._asked_by_us[job.number] = lambda response, now_s, now_ns: self._moved(job, response, now_s, now_ns)
         self.mover.begin(event, job)
         self._once.note(event.name, event.request, Fate.PENDING)
         self.effects.append(self._save())  # with where it is sent: what is told of it is then known after a restart
         return True
 
-    def act_when_moved(self, now_s: float) -> None:
+    def act_when_moved(self, now_s: float, now_ns: int) -> None:
         """Send the action that waited for the microscope to be moved, if it is."""
-        if (ready := self.mover.ready(now_s)) is not None:
-            event, deadline_s = ready
-            self._send(event, None, now_s, command=True, deadline_s=deadline_s)
+        if (ready := self.mover.ready(now_s)) is None:
+            return
+        event, deadline_s = ready
+        if (refusal := self.guard.check_place(event.request)) is not None:  # moved by somebody else meanwhile
+            self._log("WARNING", f"refused {event.name}: {refusal.reason}")
+            self.answer_late(event, refusal)
+            return
+        self._send(event, None, now_s, now_ns, command=True, deadline_s=deadline_s)
 
     def _send(
-        self, event: RequestIn, mapped: Mapped | None, now_s: float, *, command: bool, deadline_s: float = 0.0
+        self,
+        event: RequestIn,
+        mapped: Mapped | None,
+        now_s: float,
+        now_ns: int,
+        *,
+        command: bool,
+        deadline_s: float = 0.0,
     ) -> None:
         name, request = event.name, event.request
         seen = self._watchdog.states_seen
@@ -264,13 +287,16 @@ class Desk:
             self._once.forget(name, request)
             self._tell(event, refused.response)
             return
+        is_to_be_saved = command and self.guard.sending(name, request, now_ns)
         if request.id:
             self._once.note(name, request, Fate.PENDING)
             if request.kind == _ACTION and (self._frame is not None or not self._ids_known):
                 self._sent.append((name, request.id, fingerprint(request)))
-                self.effects.append(self._save())
+                is_to_be_saved = True
             elif mapped is not None:
-                self.effects.append(self._save())  # with what it was mapped to: asked again, it is sent the same
+                is_to_be_saved = True  # with what it was mapped to: asked again, it is sent the same
+        if is_to_be_saved:
+            self.effects.append(self._save())
 
     def ask_own(self, request: Request, now_s: float, ended: OwnEnd) -> bool:
         """Ask the microscope in the scheduler's own name; False: it can't be asked now."""
@@ -302,7 +328,9 @@ class Desk:
         elif end is End.ANSWERED:
             self._finish(job, response, _unknown_fate(response))
         elif end is End.LATE:
-            self._once.note(job.client, job.request, _unknown_fate(response) or response)
+            fate = _unknown_fate(response)
+            self._once.note(job.client, job.request, fate or response)
+            self._is_not_done(job, response, fate)
             self._chronicle.answered(job.client, job.request, response, job.heard_s, LATE)
             self._log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
         elif end is End.UNKNOWN:
@@ -315,12 +343,19 @@ class Desk:
     def _forget(self, job: Job, response: Response) -> None:
         """Nothing was done: asked again, with the same id too, it is."""
         self._once.forget(job.client, job.request)
+        self.guard.not_done(job.client, job.request)
         self._sent = deque((s for s in self._sent if s[:2] != (job.client, job.request.id)), _SENT_REMEMBERED)
         self._reply_to(job, response)
 
     def _finish(self, job: Job, response: Response, fate: Fate | None = None) -> None:
         self._once.note(job.client, job.request, response if fate is None else fate)
+        self._is_not_done(job, response, fate)
         self._reply_to(job, response)
+
+    def _is_not_done(self, job: Job, response: Response, fate: Fate | None) -> None:
+        """What was refused does not count as used; what nobody knows of does."""
+        if fate is None and response.code != _SUCCESS:
+            self.guard.not_done(job.client, job.request)
 
     def _reply_to(self, job: Job, response: Response) -> None:
         """Answer over the newest connection of the client; without an id only over the one that it asked by."""
@@ -334,7 +369,8 @@ class Desk:
         request = job.request
         told = self._codec.decode_parameter(response.payload) if request.kind == _PARAM and response.payload else None
         sent, used = (request, None) if job.mapped is None else (job.mapped.request, job.mapped.names)
-        self.guard.carried_out(sent, now_ns, told, used)
+        if self.guard.carried_out(sent, now_ns, told, used, job.client):
+            self.effects.append(self._save())
         if self._frame is not None:
             self._frame.carried_out(sent, told, now_ns)
             if request.kind == _PARAM and (mapped := self._frame.answer(request, told, now_ns)) is not None:
@@ -353,11 +389,11 @@ class Desk:
         if told is not None:
             self.effects += [told, self._save()]
 
-    def _moved(self, job: Job, response: Response, now_s: float) -> Iterable[Effect]:
+    def _moved(self, job: Job, response: Response, now_s: float, now_ns: int) -> Iterable[Effect]:
         """A move before an action was answered."""
         if (event := self.mover.ended(job, response, now_s)) is not None:
             self.answer_late(event, response)
-        self.act_when_moved(now_s)
+        self.act_when_moved(now_s, now_ns)
         return ()
 
     def answer_late(self, event: RequestIn, response: Response) -> None:

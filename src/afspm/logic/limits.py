@@ -6,11 +6,13 @@ Nothing is clamped. A refusal names the parameter, the value, the limit and wher
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from afspm.errors import AfspmError, InvalidValue
+from afspm.errors import AfspmError
+from afspm.logic.places import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, Whereabouts, moved, scan_values
+from afspm.logic.usage import Usage, Use
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -66,7 +68,8 @@ class Limits:
     Attributes:
         parameters: by name of the parameter.
         actions: by name of the action.
-        region: what scans (with their corners) and the probe must stay in, in m.
+        region: what scans (with their corners) and the probe must stay in, in m, in tip coordinates. Nothing is done
+            outside, whoever set the place.
         region_source: where that was set.
         most_pixels: of a scan.
     """
@@ -76,12 +79,6 @@ class Limits:
     region: Region | None = None
     region_source: str = "[limits] region"
     most_pixels: int = 8192 * 8192
-
-
-@dataclass(slots=True)
-class _Known:
-    value: float
-    since_ns: int
 
 
 class _Breach(Exception):
@@ -98,10 +95,8 @@ class Guard:
 
     def __init__(self, limits: Limits | None = None) -> None:
         self._limits = limits or Limits()
-        self._known: dict[str, _Known] = {}
-        self._last_ns: dict[str, int] = {}
-        self._scan = ScanParameters()
-        self._probe: XY | None = None
+        self._usage = Usage()
+        self._at = Whereabouts()
 
     def check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> Response | None:
         """The refusal of a request that breaks a limit or has no meaning; None: it may be sent.
@@ -115,40 +110,79 @@ class Guard:
             return Response(int(breach.code), b"", breach.reason, request.id)
         return None
 
-    def carried_out(
-        self, request: Request, now_ns: int, told: Parameter | None = None, used: Collection[str] | None = None
-    ) -> None:
-        """A request that was checked succeeded; `told` is the parameter as the translator answered it."""
-        subject = told if told is not None and told.value is not None else request.subject
-        if isinstance(subject, str):
-            self._last_ns[subject] = now_ns
-            return
-        sets = not isinstance(request.subject, Parameter) or request.subject.value is not None
-        for name, value in self._values(subject):
-            self._learn(name, value, now_ns)
-            if sets and (used is None or name in used):
-                self._last_ns[name] = now_ns
-        self.published(subject, now_ns)
+    def check_place(self, request: Request) -> Response | None:
+        """The refusal of an action where the scan, or the probe, is now: somebody at the panel may have set that."""
+        try:
+            self._check_place(str(request.subject))
+        except _Breach as breach:
+            reason = f"{request.subject}: {breach.reason}"
+            return Response(int(ControlResponse.ACTION_ERROR), b"", reason, request.id)
+        return None
 
-    def published(self, subject: object, now_ns: int) -> None:
-        """The translator said what is in force: a ScanParameters, Feedback or ProbePosition."""
-        if isinstance(subject, ScanParameters):
-            with suppress(InvalidValue):  # a part of a region that is not known yet
-                self._scan = subject.onto(self._scan)
-        elif isinstance(subject, ProbePosition):
-            self._probe = subject.xy_m
-        elif isinstance(subject, PositionChange) and self._probe is not None:
-            self._probe = _moved(self._probe, subject)
-        if isinstance(subject, ScanParameters | Feedback | ProbePosition):
-            for name, value in self._values(subject):
-                self._learn(name, value, now_ns)
+    def sending(self, who: str, request: Request, now_ns: int) -> bool:
+        """A request that was checked is about to be sent. Returns whether that is to be saved first."""
+        if request.kind != ControlRequest.ACTION or not self._has_interval(str(request.subject)):
+            return False
+        self._usage.sending(str(request.subject), Use(now_ns, who, request.id))
+        return True
+
+    def not_done(self, who: str, request: Request) -> None:
+        """A request was not carried out, for sure."""
+        if request.kind == ControlRequest.ACTION:
+            self._usage.not_done(str(request.subject), who, request.id)
+
+    def carried_out(
+        self,
+        request: Request,
+        now_ns: int,
+        told: Parameter | None = None,
+        used: Collection[str] | None = None,
+        who: str = "",
+    ) -> bool:
+        """A request that was checked succeeded; `told` is the parameter as the translator answered it.
+
+        Returns:
+            Whether what steps, rates and intervals are measured from has changed.
+        """
+        subject = told if told is not None and told.value is not None else request.subject
+        use = Use(now_ns, who, request.id)
+        if isinstance(subject, str):
+            if is_kept := self._has_interval(subject):
+                self._usage.done(subject, use)
+            return is_kept
+        sets = not isinstance(request.subject, Parameter) or request.subject.value is not None
+        is_new = False
+        for name, value in self._values(subject):
+            is_new |= self._learn(name, value, now_ns)
+            if sets and (used is None or name in used) and self._has_interval(name):
+                self._usage.done(name, use)
+                is_new = True
+        if isinstance(subject, Parameter):
+            self._at.has_values(self._values(subject))
+        self._at.is_at(subject)
+        return is_new
+
+    def published(self, subject: object, now_ns: int) -> bool:
+        """The translator said what is in force: a ScanParameters, Feedback or ProbePosition. Returns as above."""
+        self._at.is_at(subject)
+        new = [name for name, value in self._values(subject) if self._learn(name, value, now_ns)]
+        return bool(new)
+
+    def snapshot(self) -> dict[str, Any]:
+        """What must survive a kill, as plain JSON."""
+        return {"usage": self._usage.snapshot(), "at": self._at.snapshot()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take up what `snapshot` wrote."""
+        self._usage.restore(state["usage"])
+        self._at.restore(state["at"])  # until it is published again
 
     # --- checks ---
 
     def _check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None) -> None:
         subject = request.subject
         if request.kind == ControlRequest.ACTION:
-            self._check_use(who, str(subject), self._limits.actions.get(str(subject)), now_ns, "action")
+            self._check_use(who, request.id, str(subject), self._limits.actions.get(str(subject)), now_ns, "action")
             return
         if isinstance(subject, Parameter) and subject.value is None:
             return
@@ -163,18 +197,18 @@ class Guard:
         for name, value in self._values(subject):
             limit = self._limits.parameters.get(name)
             if used is None or name in used:
-                self._check_use(who, name, limit, now_ns, "parameter")
+                self._check_use(who, request.id, name, limit, now_ns, "parameter")
             if limit is not None:
                 self._check_value(name, value, limit, now_ns)
 
-    def _check_use(self, who: str, name: str, limit: Limit | None, now_ns: int, what: str) -> None:
+    def _check_use(self, who: str, request_id: str, name: str, limit: Limit | None, now_ns: int, what: str) -> None:
         if limit is None:
             return
         error = ControlResponse.ACTION_ERROR if what == "action" else ControlResponse.PARAM_ERROR
         if limit.only is not None and not {who, component_of(who)} & set(limit.only):
             allowed = ", ".join(sorted(limit.only)) or "nobody"
             raise _Breach(error, f"{who} may not use the {what} {name}, only {allowed} ({limit.source})")
-        last_ns = self._last_ns.get(name)
+        last_ns = self._usage.last_ns(name, who, request_id)
         if limit.interval_s is not None and last_ns is not None and now_ns - last_ns < limit.interval_s * 1e9:
             ago_s = (now_ns - last_ns) / 1e9
             raise _Breach(
@@ -190,7 +224,7 @@ class Guard:
             raise _param_error(f"{said} is above the highest allowed, {limit.high:g}{unit} ({limit.source})")
         if limit.step is None and limit.rate_per_s is None:
             return
-        known = self._known.get(name)
+        known = self._usage.known(name)
         if known is None:
             raise _param_error(
                 f"{said}: its value now is not known, so the step to it can't be checked; get it first ({limit.source})"
@@ -211,7 +245,7 @@ class Guard:
         """What is checked is the scan as it would be afterwards: a request may give only a part of it."""
         shape, region = wanted.shape, wanted.region
         if isinstance(shape, ShapeChange):
-            shape = shape.onto(self._scan.shape if isinstance(self._scan.shape, tuple) else (1, 1))
+            shape = shape.onto(self._at.shape or (1, 1))
         if shape is not None and shape[0] * shape[1] > self._limits.most_pixels:
             raise _param_error(f"a scan of {shape[1]} x {shape[0]} pixels; the most are {self._limits.most_pixels}")
         if isinstance(region, RegionChange):
@@ -234,8 +268,8 @@ class Guard:
         for size in (change.width_m, change.height_m):
             if size is not None and size <= 0:
                 raise _param_error(f"a scan region of size {size:g} m is empty")
-        if isinstance(self._scan.region, Region):
-            return change.onto(self._scan.region)
+        if self._at.region is not None:
+            return change.onto(self._at.region)
         if self._limits.region is not None:
             raise _param_error("where the scan is now is not known, so a part of its place can't be checked")
         return None
@@ -250,24 +284,36 @@ class Guard:
                 f" ({self._limits.region_source})"
             )
 
+    def _check_place(self, action: str) -> None:
+        if self._limits.region is None:
+            return
+        if action == names.START_SCAN:
+            if self._at.region is None:
+                raise _param_error("where the scan is now is not known")
+            self._check_scan(ScanParameters(self._at.region))
+        elif action in names.AT_PROBE:
+            if self._at.probe is None:
+                raise _param_error("where the probe is now is not known")
+            self._check_point(self._at.probe)
+
     def _check_move(self, change: PositionChange) -> None:
         if self._limits.region is None:
             return
-        if self._probe is None:
+        if self._at.probe is None:
             raise _param_error("where the probe is now is not known, so a part of its place can't be checked")
-        self._check_point(_moved(self._probe, change))
+        self._check_point(moved(self._at.probe, change))
 
     def _check_parameter_geometry(self, parameter: Parameter) -> None:
         """A single parameter may move or turn the scan, or make it too many pixels, as well."""
         for name, value in self._values(parameter):
-            if name not in REGION_CHANGES and name not in PROBE_CHANGES and name not in _RESOLUTION:
+            if name not in REGION_CHANGES and name not in PROBE_CHANGES and name not in SHAPE_CHANGES:
                 continue
             if name in PROBE_CHANGES:
                 self._check_move(PROBE_CHANGES[name](value))
-            elif name in _RESOLUTION:
+            elif name in SHAPE_CHANGES:
                 if value < 1 or value != int(value):
                     raise _param_error(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
-                self._check_scan(ScanParameters(shape=_RESOLUTION[name](int(value))))
+                self._check_scan(ScanParameters(shape=SHAPE_CHANGES[name](int(value))))
             else:
                 self._check_scan(ScanParameters(REGION_CHANGES[name](value)))
 
@@ -317,33 +363,15 @@ class Guard:
         except AfspmError as error:
             raise _param_error(f"{parameter.name} = {parameter.value} {given}: {error}") from error
 
-    def _learn(self, name: str, value: float, now_ns: int) -> None:
-        if name not in self._limits.parameters:
-            return
-        known = self._known.get(name)
-        if known is None or known.value != value:
-            self._known[name] = _Known(value, now_ns)
+    def _learn(self, name: str, value: float, now_ns: int) -> bool:
+        limit = self._limits.parameters.get(name)
+        if limit is None or (limit.step is None and limit.rate_per_s is None):
+            return False
+        return self._usage.learn(name, value, now_ns)
 
-
-_RESOLUTION: dict[str, Callable[[int], ShapeChange]] = {
-    names.SCAN_RESOLUTION_X: lambda value: ShapeChange(columns=value),
-    names.SCAN_RESOLUTION_Y: lambda value: ShapeChange(rows=value),
-}
-PROBE_CHANGES: dict[str, Callable[[float], PositionChange]] = {
-    names.PROBE_POS_X: lambda value: PositionChange(x_m=value),
-    names.PROBE_POS_Y: lambda value: PositionChange(y_m=value),
-}
-REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
-    names.SCAN_TOP_LEFT_X: lambda value: RegionChange(left_m=value),
-    names.SCAN_TOP_LEFT_Y: lambda value: RegionChange(low_m=value),
-    names.SCAN_SIZE_X: lambda value: RegionChange(width_m=value),
-    names.SCAN_SIZE_Y: lambda value: RegionChange(height_m=value),
-    names.SCAN_ANGLE: lambda value: RegionChange(angle_rad=value),
-}
-
-
-def _moved(xy_m: XY, change: PositionChange) -> XY:
-    return (xy_m[0] if change.x_m is None else change.x_m, xy_m[1] if change.y_m is None else change.y_m)
+    def _has_interval(self, name: str) -> bool:
+        limit = self._limits.actions.get(name) or self._limits.parameters.get(name)
+        return limit is not None and limit.interval_s is not None
 
 
 def _param_error(reason: str) -> _Breach:
@@ -363,26 +391,3 @@ def _is_numeric(limit: Limit) -> bool:
 def _inside(allowed: Region, xy_m: XY) -> bool:
     grown = (allowed.size_m[0] * (1 + _REACH), allowed.size_m[1] * (1 + _REACH))
     return replace(allowed, size_m=grown).contains(xy_m)
-
-
-def scan_values(wanted: ScanParameters) -> list[tuple[str, float]]:
-    """The parameters that a request for a scan sets, with their values in SI."""
-    region, values = wanted.region, list[tuple[str, float]]()
-    if isinstance(region, Region):
-        (left, low), (width, height) = region.top_left_m, region.size_m
-        region = RegionChange(left, low, width, height, region.angle_rad)
-    if region is not None:
-        given = (
-            (names.SCAN_TOP_LEFT_X, region.left_m),
-            (names.SCAN_TOP_LEFT_Y, region.low_m),
-            (names.SCAN_SIZE_X, region.width_m),
-            (names.SCAN_SIZE_Y, region.height_m),
-            (names.SCAN_ANGLE, region.angle_rad),
-        )
-        values += [(name, value) for name, value in given if value is not None]
-    shape = wanted.shape
-    if shape is not None:
-        change = shape if isinstance(shape, ShapeChange) else ShapeChange(*shape)
-        pixels = ((names.SCAN_RESOLUTION_X, change.columns), (names.SCAN_RESOLUTION_Y, change.rows))
-        values += [(name, value) for name, value in pixels if value is not None]
-    return values

@@ -472,11 +472,11 @@ class SchedulerCore:
             self._trust_is(told.state, now_s, now_ns)
             self._desk.errands.send(now_s)
             if self._desk.mover.busy:
-                self._desk.act_when_moved(now_s)
+                self._desk.act_when_moved(now_s, now_ns)
         elif isinstance(told, Feedback):
             self._watchdog.feedback_is(told)
-        if isinstance(told, Feedback | ScanParameters | ProbePosition):
-            self._guard.published(told, now_ns)
+        if isinstance(told, Feedback | ScanParameters | ProbePosition) and self._guard.published(told, now_ns):
+            self._effects.append(self._save())
 
     def _trust_is(self, state: ScopeState, now_s: float, now_ns: int) -> None:
         self._trust.scope_is(state, now_s)
@@ -514,7 +514,7 @@ class SchedulerCore:
         if holder is not None and lease_ns is not None and now_ns >= lease_ns:
             self._arbitrate(Ask(Event.IDLE, holder), None, now_s, now_ns)
         self._desk.refuse_unclear(now_s)
-        self._desk.act_when_moved(now_s)
+        self._desk.act_when_moved(now_s, now_ns)
         self._desk.settle_all(self._forwarder.expire(now_s), now_s, now_ns)
 
     # --- telling people ---

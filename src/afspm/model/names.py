@@ -19,6 +19,9 @@ ENGAGE: Final = "x-engage"
 
 EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE)
 
+AT_PROBE: Final = frozenset({START_SPEC, PULSE, CRASH})
+"""What is done at the probe position."""
+
 SCAN_TOP_LEFT_X: Final = "scan-top-left-x"
 SCAN_TOP_LEFT_Y: Final = "scan-top-left-y"
 SCAN_SIZE_X: Final = "scan-size-x"

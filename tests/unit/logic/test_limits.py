@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -217,3 +218,103 @@ def test_an_angle_without_a_unit_is_in_degrees() -> None:
     g = guard(scan_angle=Limit(-math.pi / 2, math.pi / 2))
     assert not why(g, set_("89", None, "scan-angle"))
     assert why(g, set_("91", None, "scan-angle"))
+
+
+def act(action: str, id_: str = "") -> Request:
+    return Request(int(ControlRequest.ACTION), action, id=id_)
+
+
+def here(guard: Guard, action: str) -> str:
+    """The reason why it is refused where the scan and the probe are; empty if it is not."""
+    refusal = guard.check_place(act(action))
+    if refusal is None:
+        return ""
+    assert refusal.code == ControlResponse.ACTION_ERROR
+    return refusal.reason
+
+
+def restarted(limits: Limits, before: Guard) -> Guard:
+    again = Guard(limits)
+    again.restore(json.loads(json.dumps(before.snapshot())))
+    return again
+
+
+def test_nothing_is_scanned_outside_the_region_whoever_set_the_frame() -> None:
+    g = Guard(Limits(region=STAGE, region_source="toml:9"))
+    assert "not known" in here(g, "start-scan")
+    g.published(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
+    assert "toml:9" in here(g, "start-scan")
+    assert here(g, "stop-scan") == here(g, "x-retract") == ""
+    g.published(ScanParameters(Region((4e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
+    assert here(g, "start-scan") == ""
+    assert here(Guard(), "start-scan") == ""
+
+
+@pytest.mark.parametrize("action", ["start-spec", "x-pulse", "x-crash"])
+def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action: str) -> None:
+    g = Guard(Limits(region=STAGE, region_source="toml:9"))
+    assert "not known" in here(g, action)
+    g.published(ProbePosition((9e-6, 0.0)), 0)
+    assert "(9e-06, 0)" in here(g, action)
+    assert "toml:9" in here(g, action)
+    g.published(ProbePosition((5e-6, 0.0)), 0)
+    assert here(g, action) == ""
+
+
+def test_a_place_set_by_single_parameters_is_known_before_it_is_published() -> None:
+    g = Guard(Limits(region=STAGE))
+    g.published(ProbePosition((0.0, 0.0)), 0)
+    g.published(ScanParameters(Region((0, 0), (1e-6, 1e-6)), (8, 8)), 0)
+    g.carried_out(set_("9", "um", "probe-pos-x"), 0)
+    g.carried_out(set_("9", "um", "scan-top-left-y"), 0)
+    assert here(g, "x-pulse")
+    assert here(g, "start-scan")
+
+
+def test_an_interval_counts_from_the_sending_and_over_a_restart() -> None:
+    limits = Limits(actions={"x-pulse": Limit(interval_s=60.0)})
+    g = Guard(limits)
+    assert g.sending("corrector", act("x-pulse", "corrector/1"), 0)
+    again = restarted(limits, g)
+    assert why(again, act("x-pulse", "corrector/2"), "corrector", 59 * NS)
+    assert not why(again, act("x-pulse", "corrector/2"), "corrector", 60 * NS)
+    g.carried_out(act("x-pulse", "corrector/1"), NS, who="corrector")
+    assert why(restarted(limits, g), act("x-pulse", "corrector/2"), "corrector", 60 * NS)
+
+
+def test_a_request_that_is_asked_again_is_not_too_soon_after_itself() -> None:
+    g = Guard(Limits(actions={"x-pulse": Limit(interval_s=60.0)}))
+    g.sending("corrector", act("x-pulse", "corrector/1"), 0)
+    assert not why(g, act("x-pulse", "corrector/1"), "corrector", NS)
+    assert why(g, act("x-pulse", "corrector/1"), "another", NS)
+    assert why(g, act("x-pulse"), "corrector", NS)
+
+
+def test_what_was_refused_by_the_microscope_does_not_count_as_used() -> None:
+    g = Guard(Limits(actions={"x-pulse": Limit(interval_s=60.0)}))
+    g.sending("corrector", act("x-pulse", "corrector/1"), 0)
+    g.not_done("corrector", act("x-pulse", "corrector/1"))
+    assert not why(g, act("x-pulse", "corrector/2"), "corrector", NS)
+
+
+def test_only_what_is_measured_from_is_to_be_saved() -> None:
+    g = Guard(Limits({BIAS: Limit(step=0.5), "scan-speed": Limit(high=1.0)}, {"x-crash": Limit(only=["corrector"])}))
+    assert not g.sending("corrector", act("x-crash"), 0)
+    assert not g.carried_out(set_("1e-6", "m/s", "scan-speed"), 0)
+    assert g.carried_out(set_("1", "V"), 0)
+    assert not g.carried_out(set_("1", "V"), 0)
+
+
+def test_steps_rates_and_places_are_known_after_a_restart() -> None:
+    limits = Limits({BIAS: Limit(step=0.5, rate_per_s=0.1)}, region=STAGE)
+    g = Guard(limits)
+    g.carried_out(set_("1", "V"), 0)
+    g.published(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6), 0.5), (8, 9)), 0)
+    g.published(ProbePosition((4e-6, 0.0)), 0)
+    again = restarted(limits, g)
+    assert "step" in why(again, set_("1.6", "V"), now_ns=60 * NS)
+    assert "per second" in why(again, set_("1.4", "V"), now_ns=3 * NS)
+    assert not why(again, set_("1.4", "V"), now_ns=4 * NS)
+    assert here(again, "x-pulse") == ""
+    assert "corner" in here(again, "start-scan")
+    assert again.snapshot() == g.snapshot()
