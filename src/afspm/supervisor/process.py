@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal
 
+from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
 from afspm.runtime.exit_codes import ExitCode
+from afspm.supervisor.thinning import PAUSE_S, Thinning
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
 FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
@@ -34,6 +36,14 @@ class Printed:
 
 
 @dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A child writes more than can be kept: so many lines of it are left out here."""
+
+    name: str
+    lines: int
+
+
+@dataclass(frozen=True, slots=True)
 class Exited:
     """A child is gone; a negative code is the number of the signal that ended it, as in `subprocess`."""
 
@@ -42,7 +52,7 @@ class Exited:
     code: int
 
 
-ChildEvent = Printed | Exited
+ChildEvent = Printed | LeftOut | Exited
 
 
 class ChildProcess:
@@ -118,10 +128,54 @@ class ChildProcess:
 
     def _read(self, stream: Stream, pipe: IO[bytes] | None) -> None:
         assert pipe is not None
+        output = _Output(self.name, self.pid, stream, self._tell)
         with contextlib.suppress(OSError, ValueError), pipe:
             while line := pipe.readline(LONGEST_LINE):
-                text = line.decode("utf-8", errors="replace").rstrip("\r\n")
-                self._tell(Printed(self.name, self.pid, stream, text))
+                output.take(line)
+        output.end()
+
+
+class _Output:
+    """Tells what a stream of a child says, as far as that can be kept.
+
+    The child never has to wait for us: a driver that says much must not become slow.
+    """
+
+    def __init__(self, name: str, pid: int, stream: Stream, tell: Callable[[ChildEvent], None]) -> None:
+        self._name, self._pid, self._stream, self._tell = name, pid, stream, tell
+        self._clock = ExperimentClock.real()
+        self._thinning = Thinning(self._clock.monotonic_s())
+        self._lock = threading.Lock()
+        self._pause: threading.Timer | None = None
+
+    def take(self, line: bytes) -> None:
+        with self._lock:
+            was_pausing = self._thinning.pausing
+            if self._thinning.passes(line, self._clock.monotonic_s()):
+                self._tell_line(line)
+            elif not was_pausing:
+                # a timer, and not the next line: after a flood there may be silence
+                self._pause = threading.Timer(PAUSE_S, self._go_on)
+                self._pause.daemon = True
+                self._pause.start()
+
+    def end(self) -> None:
+        """Nothing more comes."""
+        if self._pause is not None:
+            self._pause.cancel()
+        self._go_on()
+
+    def _go_on(self) -> None:
+        with self._lock:
+            left_out, last = self._thinning.go_on()
+            if left_out:
+                self._tell(LeftOut(self._name, left_out))
+            for line in last:
+                self._tell_line(line)
+
+    def _tell_line(self, line: bytes) -> None:
+        text = line.decode("utf-8", errors="replace").rstrip("\r\n")
+        self._tell(Printed(self._name, self._pid, self._stream, text))
 
 
 _IN_WORDS = {

@@ -20,7 +20,7 @@ from afspm.runtime.exit_codes import ExitCode
 from afspm.supervisor import signals
 from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import SUPERVISOR, LineReader, RunLog
-from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed, describe_exit
+from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed, describe_exit
 from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter
 from afspm.supervisor.standing import Standing
 from afspm.supervisor.task import Task
@@ -184,10 +184,14 @@ class Supervisor:
                 child.up = True
                 self._log.write(child.name, logging.DEBUG, "is up")
             self._carry_out(child, child.watch.beat(beat, now_s))
-        for event in self._wakeup.take():
+        # whoever wants it to end does not wait behind what the processes say
+        for event in sorted(self._wakeup.take(), key=lambda event: not isinstance(event, signals.Signalled)):
             match event:
                 case Printed():
                     self._on_printed(self._children[event.name], event)
+                case LeftOut():
+                    told = f"says more than can be kept: {event.lines} lines are left out here"
+                    self._log.write(event.name, logging.WARNING, told)
                 case Exited():
                     self._on_exited(self._children[event.name], event)
                 case signals.Signalled():

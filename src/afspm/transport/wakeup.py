@@ -39,14 +39,11 @@ class WakeUp(Generic[T]):
             self._writer.send(b"\0")
 
     def take(self) -> list[T]:
-        """What was posted since the last call, oldest first."""
+        """What was posted since the last call, oldest first. What comes meanwhile waits for the next."""
         with contextlib.suppress(BlockingIOError, OSError):
             while len(self._reader.recv(4096)) == 4096:
                 pass
-        items = []
-        while self._items:
-            items.append(self._items.popleft())
-        return items
+        return [self._items.popleft() for _ in range(len(self._items))]
 
     def close(self) -> None:
         self._reader.close()

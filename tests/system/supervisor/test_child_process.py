@@ -12,7 +12,7 @@ from queue import Queue
 import pytest
 
 from afspm.errors import AfspmError
-from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed
+from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed
 
 DEADLINE_S = 15.0
 Start = Callable[[str], ChildProcess]
@@ -117,3 +117,16 @@ def test_output_is_not_held_back(start: Start, events: Queue[ChildEvent]) -> Non
     printed = events.get(timeout=DEADLINE_S)
     assert isinstance(printed, Printed)
     assert printed.line == "at once"
+
+
+def test_a_child_that_prints_without_end_is_not_kept_in_memory(start: Start, events: Queue[ChildEvent]) -> None:
+    start("for i in range(200_000): print('waiting', i)\nraise SystemExit('no stage')")
+    got = [events.get(timeout=DEADLINE_S)]
+    while not isinstance(got[-1], Exited):
+        got.append(events.get(timeout=DEADLINE_S))
+    printed = [event.line for event in got if isinstance(event, Printed)]
+    left_out = sum(event.lines for event in got if isinstance(event, LeftOut))
+    assert printed[0] == "waiting 0"
+    assert {"waiting 199999", "no stage"} <= set(printed)
+    assert len(printed) < 10_000
+    assert left_out + len(printed) == 200_001

@@ -153,6 +153,15 @@ def test_a_second_wish_to_stop_is_not_made_to_wait(run_tasks: RunTasks) -> None:
     assert clock.monotonic_s() - began_s < 1.0
 
 
+def test_a_wish_to_stop_does_not_wait_behind_what_a_process_prints(run_tasks: RunTasks) -> None:
+    code = "import itertools, sys\nfor i in itertools.count(): print('waiting', i)"
+    running = run_tasks(peer("quiet"), Task(peer("loud").launch, (sys.executable, "-c", code), beats=False))
+    running.terminal.wait_for(" quiet ", "life 1")
+    running.terminal.wait_for(" loud ", "waiting 1000")
+    running.stop()
+    assert running.outcome().why is Why.STOPPED
+
+
 def test_nothing_is_restarted_while_the_run_ends(run_tasks: RunTasks, tmp_path: Path) -> None:
     deaf = peer("deaf", first="deaf", then="deaf", lives=str(tmp_path / "lives"))
     running = run_tasks(deaf)
