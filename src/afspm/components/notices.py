@@ -16,7 +16,8 @@ from afspm.errors import AfspmError, ConfigError
 END: Final = "end"
 UNSOLVED: Final = "unsolved-problem"
 GIVEN_UP: Final = "given-up"
-OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP)
+CRITICAL: Final = "critical"
+OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL)
 
 TIMEOUT_S = 10.0  # of one try
 FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from afspm.components import notices
 from afspm.components.notices import (
+    CRITICAL,
     GIVEN_UP,
     MOST_TRIES,
     MOST_WAITING,
@@ -17,17 +18,18 @@ from afspm.components.notices import (
     Targets,
 )
 from afspm.errors import ConfigError
-from afspm.model import ControlState, ProcessCondition, ProcessStates
+from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
 from afspm.model.words import lasting
 from afspm.record.facts import name_in
 from afspm.runtime.component import Component
 from afspm.units import Duration
 
 LAST_TRIES = 2  # the end of the experiment does not wait for more
+SUPERVISOR = "afspm"  # as which it writes in the log: what it says there is told of as given up, and as the end
 
 
 class Notifier(Component):
-    """Calls a command, a webhook or both when a problem stays unsolved and when a component is given up.
+    """Calls a command, a webhook or both when a problem stays unsolved, a component is given up or says CRITICAL.
 
     [notify] of the experiment file makes it part of an experiment. It only listens, and holds up nobody. What can't be
     delivered is tried again, later and later, for half an hour; killed and started again, it goes on with that, and
@@ -37,12 +39,12 @@ class Notifier(Component):
     Args:
         program: a command with arguments, run where the experiment file is; the notice is JSON on its standard input.
         webhook: where that JSON is posted to; "$NAME" is taken from the environment.
-        on: of what to tell: "unsolved-problem", "given-up".
+        on: of what to tell: "unsolved-problem", "given-up", "critical".
         unsolved_after: how long a problem may be flagged before it counts as unsolved, experiment time.
         folder: where the command is run; [notify] fills in that of the experiment file.
     """
 
-    listens: ClassVar = ("ControlState", "ProcessStates")
+    listens: ClassVar = ("ControlState", "ProcessStates", "LogLines")
     notifies: ClassVar[bool] = True
     period_s = 1.0
     period_time: Literal["experiment", "real"] = "real"
@@ -84,6 +86,14 @@ class Notifier(Component):
             if state.condition is ProcessCondition.GIVEN_UP:
                 how = f": {state.last_exit}" if state.last_exit else ""
                 self._tell(GIVEN_UP, f"{state.name} {state.starts}", f"{state.name} is given up{how}")
+
+    def on_log_lines(self, lines: LogLines) -> None:
+        first: dict[str, str] = {}  # of each process: what follows it belongs to it
+        for line in lines.lines:
+            if line.level == "CRITICAL" and line.name not in (SUPERVISOR, self.name):
+                first.setdefault(line.name, line.text)
+        for name, text in first.items():
+            self._tell(CRITICAL, f"{name} {text}", f"{name}: {text}")
 
     def on_tick(self) -> None:
         now_ns = self.clock.now_ns()

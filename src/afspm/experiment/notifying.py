@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from afspm.components.notices import GIVEN_UP, UNSOLVED, Targets, address
+from afspm.components.notices import END, OCCASIONS, Targets, address
 from afspm.errors import ConfigError
 from afspm.experiment.parts import Part, Role
 
@@ -28,7 +28,7 @@ def notifies(component: Any) -> bool:
 
 def implied(resolved: Resolved, section: Notify) -> Part | None:
     """The notifier as [notify] wants it; None if nobody is to be told of what happens during the experiment."""
-    told = {UNSOLVED, GIVEN_UP} & set(section.on)
+    told = (set(OCCASIONS) - {END}) & set(section.on)
     there_is_one = any(notifies(component) for component in resolved.classes.values())
     if not (section.command or section.webhook) or not told or there_is_one or not resolved.with_role(Role.SCHEDULER):
         return None

@@ -98,7 +98,9 @@ class Notify(Section):
 
     command: tuple[str, ...] = ()
     webhook: str = ""
-    on: tuple[Literal["end", "unsolved-problem", "given-up"], ...] = ("end", "unsolved-problem", "given-up")
+    on: tuple[Literal["end", "unsolved-problem", "given-up", "critical"], ...] = (
+        "end", "unsolved-problem", "given-up", "critical",
+    )  # fmt: skip
     unsolved_after: PositiveDuration = 900.0
     """Experiment time for which a problem may be flagged before it counts as unsolved."""
 

@@ -76,6 +76,7 @@ class Night:
             problems = ProblemNames()
 
         self.notifier = Notifier(**self.settings)  # type: ignore[arg-type]
+        self.notifier.name = "notifier"
         self.notifier.clock, self.notifier.log = self.clock, logging.getLogger("afspm.notifier")
         self.notifier.memory = Memory(self.folder / "notifier.json")
         self.notifier.run_dir, self.notifier.simulated, self.notifier.packet = self.folder, True, None
@@ -88,6 +89,10 @@ class Night:
     def given_up(self, name: str, last_exit: str = "") -> None:
         state = model.ProcessState(name, "component", ProcessCondition.GIVEN_UP, 1, 0.0, 3, 0, last_exit)
         self.notifier.on_process_states(model.ProcessStates(1, "lab", (state,)))
+
+    def says(self, *lines: tuple[str, str, str]) -> None:
+        told = (model.LogLine(1, name, level, text) for name, level, text in lines)
+        self.notifier.on_log_lines(model.LogLines(tuple(told)))
 
     def passes(self, seconds: int) -> None:
         """Time passes, with a tick every ten seconds."""
@@ -133,6 +138,23 @@ def test_a_component_that_is_given_up_is_told_once(tmp_path: Path, hook: Hook) -
         night.given_up("judge", "exit code 1")
         night.passes(10)
     assert [told["text"] for told in hook.got] == ["judge is given up: exit code 1"]
+
+
+def test_what_is_critical_is_told_once(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url)
+    full = ("recorder", "CRITICAL", "nothing can be recorded, the experiment goes on: No space left on device")
+    night.says(("recorder", "WARNING", "it takes long"), full, ("recorder", "CRITICAL", "what belongs to it"))
+    night.says(full)  # replayed
+    night.passes(60)
+    (told,) = hook.got
+    assert (told["what"], told["text"]) == ("critical", f"recorder: {full[2]}")
+
+
+def test_what_is_critical_to_the_supervisor_is_told_as_what_it_is(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url)
+    night.says(("afspm", "CRITICAL", "judge is given up"), ("notifier", "CRITICAL", "a restart would not know"))
+    night.passes(60)
+    assert hook.got == []
 
 
 def test_only_what_is_wanted_is_told(tmp_path: Path, hook: Hook) -> None:
