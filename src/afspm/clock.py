@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 from typing import Any, Protocol
 
 NS_PER_S = 1_000_000_000
@@ -49,11 +50,32 @@ def _anchor_s() -> float:
     return time.time() - time.monotonic()
 
 
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+
+
+@cache
+def monotonic_id() -> str:
+    """What tells apart computers, boots of one computer, and clocks of one boot, by which time.monotonic() goes.
+
+    In one boot all processes count from one zero: the function is "system-wide" by Python's documentation (since 3.5;
+    on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Elsewhere than on
+    Linux a boot has no name here: what is handed on by a run has no use after it.
+    """
+    try:
+        boot = _BOOT.read_text(encoding="ascii").strip()
+    except OSError:
+        import platform
+
+        boot = platform.node()
+    return f"{boot} {time.get_clock_info('monotonic').implementation}"
+
+
 @dataclass(frozen=True)
 class ExperimentClock:
     """experiment time = start + (real time - origin) · speed.
 
-    Every process of a run is given the same origin, start and speed, and so the same time.
+    Every process of a run is given the same origin, start and speed, and, on one computer, the same anchor of real
+    time: so all show the same time, whatever becomes of the clock on the wall and whenever they were started.
 
     Attributes:
         origin_s: real time, s since the Unix epoch, at which the run began.
@@ -82,12 +104,24 @@ class ExperimentClock:
         """The clock that `as_dict` told of; of nothing, the one on the wall."""
         if not values:
             return cls.real()
-        return cls(float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
+        told = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
+        if values.get("monotonic") != monotonic_id():  # another computer's: real time is what the wall here says
+            return cls(*told)
+        return cls(*told, float(values["wall_at_zero_s"]))
 
-    def as_dict(self) -> dict[str, float]:
-        values = asdict(self)
-        del values["_wall_at_zero_s"]
-        return values
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it, for the other processes of the run."""
+        return {
+            "origin_s": self.origin_s,
+            "start_s": self.start_s,
+            "speed": self.speed,
+            "wall_at_zero_s": self._wall_at_zero_s,
+            "monotonic": monotonic_id(),
+        }
+
+    def wall_ahead_s(self) -> float:
+        """By how much the clock on the wall is ahead, s: it was set since, or the computer was suspended."""
+        return _anchor_s() - self._wall_at_zero_s
 
     def now_s(self) -> float:
         return self.start_s + (self._wall_at_zero_s + time.monotonic() - self.origin_s) * self.speed

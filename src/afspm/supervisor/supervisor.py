@@ -11,7 +11,7 @@ import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from afspm.clock import Clock
+from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
 from afspm.experiment import Role
 from afspm.logic import supervision
@@ -24,6 +24,7 @@ from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, 
 from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter
 from afspm.supervisor.standing import Standing
 from afspm.supervisor.task import Task
+from afspm.supervisor.wall import Wall
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 from afspm.transport.wakeup import WakeUp
 
@@ -120,7 +121,7 @@ class Supervisor:
         self,
         tasks: Sequence[Task],
         log: RunLog,
-        clock: Clock,
+        clock: ExperimentClock,
         policy: supervision.Policy,
         reporter: Reporter | None = None,
     ) -> None:
@@ -129,6 +130,7 @@ class Supervisor:
         self._standing = Standing(clock, policy.liveness)
         self._looked_s = -math.inf
         self._clock = clock
+        self._wall = Wall(clock, lambda text: log.write(SUPERVISOR, logging.WARNING, text))
         self._policy = policy
         self._wakeup: WakeUp[ChildEvent | signals.Signalled | News] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
@@ -265,6 +267,7 @@ class Supervisor:
 
     def _attend(self) -> None:
         """Do what the time has come for."""
+        self._wall.look()
         now_s = self._clock.monotonic_s()
         if self._ending is not None:
             self._go_on_ending(self._ending, now_s)
