@@ -56,6 +56,7 @@ class Cause(Enum):
     MANUAL = "the mode is manual"
     DEAD = "it is dead"
     IDLE = "it did nothing for longer than its lease"
+    ENDED = "the experiment ends"
 
 
 @dataclass(frozen=True, slots=True)

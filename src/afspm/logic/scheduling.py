@@ -53,6 +53,7 @@ from afspm.model import (
     HAS_ENDED,
     RESTART_REQUEST,
     TELL_REQUEST,
+    ControlMode,
     ControlRequest,
     ControlResponse,
     ControlState,
@@ -119,6 +120,7 @@ class SchedulerCore:
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
         self._started_s = 0.0
         self._announce_at_s: float | None = None
+        self._end_by_s: float | None = None
         self._is_restarted = False
         self._held: deque[RequestIn] = deque()
         self._held_due_s: float | None = None
@@ -155,7 +157,7 @@ class SchedulerCore:
         self._cache.remember(self._recent)
         self._chronicle.at(now_s, now_ns)
         if self._control.ended:
-            self._effects.append(Kill())
+            self._end_soon(now_s, now_ns)
         else:  # first, in the order of time, what the translator published before we were there
             self._announce_at_s = now_s + self._settings.catch_up_s
             self._chronicle.began(self._control, again=self._is_restarted)
@@ -167,6 +169,7 @@ class SchedulerCore:
         self._chronicle.at(now_s, now_ns)
         self._handlers[type(event)](event, now_s, now_ns)
         self._held_due_s = now_s if self._held and self._announce_at_s is None else None
+        self._end_when_safe(now_s, now_ns)
         return self._with_forwards()
 
     def _with_forwards(self) -> list[Effect]:
@@ -181,6 +184,7 @@ class SchedulerCore:
         others_s = (
             self._holder_dead_at_s(),
             self._announce_at_s,
+            self._end_by_s,
             self._desk.unclear_until_s(),
             self._desk.mover.due_s(),
             self._held_due_s,
@@ -366,7 +370,23 @@ class SchedulerCore:
         if event is not None and row.response is not None:
             self._desk.answer(event, row.response, arbitration.reason(row, before, ask, self._rules))
         if after.ended and not before.ended:
-            self._effects += [*self._bulletin.entries(now_ns), Kill()]
+            self._end_soon(now_s, now_ns)
+
+    def _end_soon(self, now_s: float, now_ns: int) -> None:
+        self._end_by_s = now_s + self._settings.request_timeout_s + self._settings.patience_s
+        self._end_when_safe(now_s, now_ns)
+
+    def _end_when_safe(self, now_s: float, now_ns: int) -> None:
+        """The experiment that is over ends, once the tip is out of danger or that takes too long."""
+        if self._end_by_s is None or (self._watchdog.wants_retract and now_s < self._end_by_s):
+            return
+        self._end_by_s = None
+        if self._watchdog.wants_retract:
+            self._log(
+                "CRITICAL", "the experiment ends, and the tip was left in danger: the microscope did not retract it"
+            )
+        self._with_forwards()
+        self._effects += [*self._bulletin.entries(now_ns), Kill()]
 
     def _control_changed(
         self, before: Control, ask: Ask, row: arbitration.Row, now_s: float, now_ns: int, *, had_died: bool
@@ -379,17 +399,26 @@ class SchedulerCore:
         after = self._control
         self._chronicle.changed(before, after, ask, row)
         self._lease.held_by(after.holder, now_ns)
+        # a person at the microscope sees to it also when the experiment ends
+        cause = Cause.ENDED if after.ended and before.mode is not ControlMode.MANUAL else row.cause
         wanted: list[str] = []
-        if row.cause is not None and (before.holder is not None or row.cause is Cause.MANUAL):
-            wanted = self._watchdog.control_taken(row.cause, self._desk.action_in_flight(), had_died=had_died)
+        if cause is not None and (before.holder is not None or cause in (Cause.MANUAL, Cause.ENDED)):
+            if self._desk.switches_feedback_off():
+                self._watchdog.feedback_is(Feedback(on=False))
+            by_holder = ask.who == before.holder
+            in_flight = self._desk.action_in_flight()
+            wanted = self._watchdog.control_taken(cause, in_flight, had_died=had_died, by_holder=by_holder)
         publish = self._stamp_control(now_ns) if after.published() != before.published() else None
         self._effects.append(self._save())
         routine = is_routine(before, after, ask, self._holder_told)
         self._log("DEBUG" if routine else "INFO", said(before, after, ask, row, self._rules))
         self._holder_told = after.holder or self._holder_told
         for action in wanted:
-            why = f"{before.holder} had died in control" if had_died else row.cause.value if row.cause else ""
+            why = f"{before.holder} had died in control" if had_died else cause.value if cause else ""
             self._log("WARNING", f"{action} is sent to the microscope, since {why}")
+        if cause is not None and (danger := self._watchdog.left_in_danger()) is not None:
+            expected = cause in (Cause.RELEASED, Cause.SOLVED, Cause.MANUAL)
+            self._log("WARNING" if expected else "CRITICAL", f"{danger}, and nobody looks after it: {cause.value}")
         if before.holder is not None and after.holder is None:
             self._desk.call_back(before.holder, row.cause)
         self._desk.errands.send(now_s)

@@ -1,6 +1,7 @@
 """The watchdog: what the scheduler itself tells the microscope to do when control is taken from somebody.
 
-It stops the scan or spectrum that is running, and retracts the tip when its holder died in a dangerous state.
+It stops the scan or spectrum that is running, and retracts the tip where its holder did not itself give control back
+and left it in a dangerous state: it can't put that right any more, and nobody else knows of it.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ class WatchdogSettings:
 
     Attributes:
         stop_when: for which causes of losing control what is running is stopped.
-        dangerous: the states in which a dead holder's tip is retracted: names of ScopeState, and "feedback-off".
+        dangerous: the states in which the tip is retracted when its holder loses control: names of ScopeState, and
+            "feedback-off".
         retract: the action that does it; None: never.
         attempts: how often an action that gets no response is tried.
     """
@@ -62,6 +64,7 @@ class Watchdog:
         self._sent = False
         self._attempts = 0
         self._can_retract = True  # as far as we know
+        self._danger_told: str | None = None
         self._refused_at = -1  # states seen when the microscope last was not free
 
     @property
@@ -94,12 +97,34 @@ class Watchdog:
         self._state = state
         self._states_seen += 1
         self._starting = None
+        self._see_danger()
         if state is ScopeState.FREE and not self._sent:  # it ended while the translator could not be told to stop it
             self._wanted = [action for action in self._wanted if action not in _STOP.values()]
 
     def feedback_is(self, feedback: Feedback) -> None:
         if feedback.on is not None:
             self._feedback_on = feedback.on
+            self._see_danger()
+
+    @property
+    def danger(self) -> str | None:
+        """What is dangerous now, in words; None: nothing, or it was seen to."""
+        dangerous = self._settings.dangerous
+        if self._feedback_on is False and FEEDBACK_OFF in dangerous:
+            return "the feedback is off"
+        return f"the microscope is in {self._state.name}" if self._state.name in dangerous else None
+
+    def left_in_danger(self) -> str | None:
+        """The danger about which nothing is done, to be told: each once."""
+        danger = None if self.wants_retract else self.danger
+        if danger == self._danger_told:
+            return None
+        self._danger_told = danger
+        return danger
+
+    def _see_danger(self) -> None:
+        if self.danger is None:
+            self._danger_told = None
 
     def started(self, action: str, states_seen: int) -> None:
         """A start action succeeded, or may have, that was sent when `states_seen` states were known.
@@ -114,21 +139,28 @@ class Watchdog:
         if action == self._settings.retract:
             self._can_retract = False
 
-    def control_taken(self, cause: Cause, in_flight: str | None, *, had_died: bool = False) -> list[str]:
+    def control_taken(
+        self, cause: Cause, in_flight: str | None, *, had_died: bool = False, by_holder: bool = False
+    ) -> list[str]:
         """Control was taken for `cause` while the action `in_flight` was with the translator.
 
         Args:
             had_died: the process that got control has died; who gives it back is the one started in its place.
+            by_holder: it is the holder's own doing.
 
         Returns:
             What is wanted now, in order.
         """
         wanted = []
         stop = _STOP.get(self._state) or self._starting or _STARTS.get(in_flight or "")
-        if stop is not None and cause in self._settings.stop_when:
+        # whoever gives control back knows what it leaves, and so does a person who takes it
+        knows = cause in (Cause.RELEASED, Cause.MANUAL) or (cause is Cause.SOLVED and by_holder)
+        retract = self._settings.retract if self._can_retract and (had_died or not knows) else None
+        if self.danger is None:
+            retract = None
+        if stop is not None and (cause in self._settings.stop_when or retract is not None):
             wanted.append(stop)
-        died, retract = cause is Cause.DEAD or had_died, self._settings.retract
-        if died and retract is not None and self._can_retract and self._is_dangerous():
+        if retract is not None:
             wanted.append(retract)
         self._wanted += [action for action in wanted if action not in self._wanted]
         return wanted
@@ -148,6 +180,9 @@ class Watchdog:
         self._sent = False
         if code == ControlResponse.SUCCESS:
             self._starting = None
+            if self._wanted[0] == self._settings.retract:
+                self._feedback_on = None  # the tip is away: no danger, until the feedback is told of again
+                self._see_danger()
             self._forget()
             return Result.DONE
         if code == ControlResponse.NOT_FREE:
@@ -168,7 +203,3 @@ class Watchdog:
     def _forget(self) -> None:
         self._wanted.pop(0)
         self._attempts = 0
-
-    def _is_dangerous(self) -> bool:
-        dangerous = self._settings.dangerous
-        return self._state.name in dangerous or (self._feedback_on is False and FEEDBACK_OFF in dangerous)

@@ -79,12 +79,13 @@ class Lab:
         self.step(Connected(self.newest))
         return self.newest
 
-    def translator(self) -> None:
-        """The translator is there, ours, and has answered the scheduler's question."""
+    def translator(self, retracts: ControlResponse = ControlResponse.SUCCESS) -> None:
+        """The translator is there, ours, and has answered the scheduler's question, whether it retracts."""
         self.step(TranslatorUp())
         self.step(TranslatorCaughtUp())
-        question = self.forwarded.pop()
-        self.answer(question)
+        question = next(one for one in self.forwarded if one.request.kind == ControlRequest.ACTION_SUPPORT)
+        self.forwarded.remove(question)
+        self.answer(question, retracts)
 
     def answer(
         self,

@@ -72,6 +72,50 @@ def test_a_dead_holder_s_tip_is_retracted_in_a_dangerous_state_once_it_has_stopp
     assert not dog.wants_retract
 
 
+def off(*states: ScopeState, **settings: object) -> Watchdog:
+    """One that knows that the feedback is off."""
+    made = watchdog(*states, **settings)
+    made.feedback_is(Feedback(on=False))
+    return made
+
+
+@pytest.mark.parametrize("cause", [Cause.PROBLEM, Cause.IDLE, Cause.DEAD, Cause.ENDED, Cause.SOLVED])
+def test_the_tip_is_retracted_where_the_holder_could_not_put_the_danger_right(cause: Cause) -> None:
+    assert off(FREE).control_taken(cause, None) == ["x-retract"]
+    assert off(SCANNING, stop_when=()).control_taken(cause, None) == ["stop-scan", "x-retract"]
+    assert watchdog(FREE).control_taken(cause, None) == []
+
+
+@pytest.mark.parametrize("cause", [Cause.RELEASED, Cause.SOLVED, Cause.MANUAL])
+def test_what_the_holder_or_a_person_does_knowingly_is_told_once_and_left_alone(cause: Cause) -> None:
+    dog = off(FREE)
+    assert dog.control_taken(cause, None, by_holder=cause is not Cause.MANUAL) == []
+    assert dog.left_in_danger() == "the feedback is off"
+    assert dog.left_in_danger() is None
+    dog.feedback_is(Feedback(on=True))
+    assert dog.left_in_danger() is None
+    dog.feedback_is(Feedback(on=False))
+    assert dog.left_in_danger() == "the feedback is off"
+
+
+def test_a_danger_that_is_seen_to_is_not_told_nor_seen_to_again() -> None:
+    dog = off(FREE)
+    dog.control_taken(Cause.PROBLEM, None)
+    assert dog.left_in_danger() is None
+    assert dog.next_action() == "x-retract"
+    assert dog.answered(OK) is Result.DONE
+    assert dog.left_in_danger() is None
+    assert dog.control_taken(Cause.ENDED, None) == []
+
+
+def test_a_danger_that_can_not_be_seen_to_is_told() -> None:
+    dog = off(FREE, retract=None)
+    assert dog.control_taken(Cause.PROBLEM, None) == []
+    assert dog.left_in_danger() == "the feedback is off"
+    assert watchdog(ScopeState.COARSE_MOTOR).left_in_danger() == "the microscope is in COARSE_MOTOR"
+    assert off(FREE, dangerous=()).left_in_danger() is None
+
+
 def test_with_the_feedback_on_a_scan_of_the_dead_is_only_stopped() -> None:
     dog = watchdog(SCANNING)
     dog.feedback_is(Feedback(on=True))

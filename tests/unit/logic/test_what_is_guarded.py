@@ -1,4 +1,4 @@
-"""Limits, through the whole scheduler: where something is done, and over its own death."""
+"""Limits and dangers, through the whole scheduler: where something is done, what is left behind, over its own death."""
 
 from __future__ import annotations
 
@@ -7,10 +7,21 @@ import json
 import pytest
 from logic_lab import NS, Lab, replies
 
-from afspm.logic.events import Effect, Forward, SaveState
+from afspm.logic.events import Effect, Forward, Kill, Log, SaveState, Tick
 from afspm.logic.limits import Limit, Limits
 from afspm.logic.settings import SchedulerSettings
-from afspm.model import ControlRequest, ControlResponse, Parameter, ProbePosition, Region, ScanParameters
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Parameter,
+    ProbePosition,
+    Problem,
+    Region,
+    ScanParameters,
+    ScopeState,
+)
 
 ACTION, PARAM = ControlRequest.ACTION, ControlRequest.PARAM
 STAGE = Region((0.0, 0.0), (6e-6, 6e-6))
@@ -108,3 +119,141 @@ def test_the_time_of_a_use_is_that_of_the_experiment() -> None:
     lab.now_ns += 300 * NS
     forwards = lab.ask("experiment", ACTION, "x-pulse", "experiment/a/3")
     assert any(isinstance(effect, Forward) for effect in forwards)
+
+
+# --- what is left in danger ---
+
+OFF = Feedback(on=False)
+END = ControlRequest.END_EXPERIMENT
+
+
+def feedback_off(settings: SchedulerSettings | None = None) -> Lab:
+    lab = in_control(settings or SchedulerSettings())
+    lab.scope_is(ScopeState.FREE)
+    lab.publish("ZCtrlParameters", OFF)
+    lab.effects.clear()
+    return lab
+
+
+def sent(lab: Lab) -> list[object]:
+    return [forward.request.subject for forward in lab.forwarded]
+
+
+def said(lab: Lab, level: str) -> list[str]:
+    return [effect.text for effect in lab.effects if isinstance(effect, Log) and effect.level == level]
+
+
+def test_who_solves_a_problem_gets_a_microscope_that_is_safe() -> None:
+    lab = feedback_off()
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    assert sent(lab) == ["x-retract"]
+    lab.take_control("corrector", Problem.TIP_SHAPE_CHANGED)
+    assert lab.says("corrector", ACTION, "start-scan") is ControlResponse.NOT_FREE
+    lab.answer(lab.forwarded[-1])
+    lab.ask("corrector", ACTION, "start-scan", "corrector/a/2")
+    assert sent(lab) == ["x-retract", "start-scan"]
+
+
+def test_a_feedback_that_is_just_being_switched_off_counts() -> None:
+    for answered in (False, True):
+        lab = in_control(SchedulerSettings())
+        lab.ask("experiment", ControlRequest.SET_ZCTRL_PARAMS, OFF, "experiment/a/1")
+        if answered:
+            lab.answer(lab.forwarded[-1])
+        lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+        if not answered:
+            lab.answer(lab.forwarded[-1])
+        assert sent(lab)[-1] == "x-retract"
+    lab = in_control(SchedulerSettings())
+    lab.ask("experiment", PARAM, Parameter("x-feedback-on", "false"), "experiment/a/1")
+    lab.answer(lab.forwarded[-1])
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    assert sent(lab)[-1] == "x-retract"
+
+
+def test_a_solver_may_work_with_the_feedback_off_and_is_not_disturbed() -> None:
+    lab = in_control(SchedulerSettings())
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    lab.take_control("corrector", Problem.TIP_SHAPE_CHANGED)
+    lab.publish("ZCtrlParameters", OFF)
+    lab.flag("classifier", Problem.THERMAL_DRIFT)
+    assert lab.holder == "corrector"
+    lab.publish("ZCtrlParameters", Feedback(on=True))
+    lab.clear("classifier", Problem.TIP_SHAPE_CHANGED)
+    assert sent(lab) == []
+
+
+def test_a_lease_that_runs_out_leaves_no_danger() -> None:
+    lab = feedback_off(SchedulerSettings(lease_s=60.0))
+    lab.later(experiment_s=60.0)
+    lab.step(Tick())
+    assert lab.holder is None
+    assert sent(lab) == ["x-retract"]
+
+
+def test_whoever_gives_control_back_with_the_feedback_off_is_heard_of_once() -> None:
+    lab = feedback_off()
+    lab.says("experiment", ControlRequest.RELEASE_CTRL)
+    lab.take_control("experiment")
+    lab.says("experiment", ControlRequest.RELEASE_CTRL)
+    assert said(lab, "WARNING") == ["the feedback is off, and nobody looks after it: it gave control back"]
+    assert sent(lab) == []
+
+
+def test_a_person_who_takes_over_is_told_and_not_disturbed_nor_when_the_experiment_ends() -> None:
+    lab = feedback_off()
+    lab.mode("person", ControlMode.MANUAL)
+    assert said(lab, "WARNING") == ["the feedback is off, and nobody looks after it: the mode is manual"]
+    lab.effects.clear()
+    assert any(isinstance(effect, Kill) for effect in lab.ask("person", END))
+    assert sent(lab) == []
+
+
+def test_what_can_not_be_retracted_is_critical() -> None:
+    lab = Lab()
+    lab.translator(ControlResponse.ACTION_NOT_SUPPORTED)
+    lab.take_control("experiment")
+    lab.publish("ZCtrlParameters", OFF)
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    assert said(lab, "CRITICAL") == ["the feedback is off, and nobody looks after it: a problem was flagged"]
+    assert sent(lab) == []
+
+
+def test_the_experiment_ends_when_the_tip_is_out_of_danger() -> None:
+    lab = feedback_off()
+    lab.scope_is(ScopeState.SCANNING)
+    effects = lab.ask("experiment", END, None, "experiment/a/9")
+    assert replies(effects)[0].response.ok
+    assert sent(lab) == ["stop-scan"]
+    lab.answer(lab.forwarded[-1])
+    lab.scope_is(ScopeState.FREE)
+    assert sent(lab) == ["stop-scan", "x-retract"]
+    assert not any(isinstance(effect, Kill) for effect in lab.effects)
+    assert kinds(lab.answer(lab.forwarded[-1]))[-1] == "Kill"
+
+
+def test_an_experiment_that_ends_does_not_wait_for_ever() -> None:
+    lab = feedback_off()
+    lab.ask("experiment", END)
+    deadline_s = lab.core.deadline_s()
+    while not any(isinstance(effect, Kill) for effect in lab.effects):
+        assert deadline_s is not None
+        lab.now_s = max(lab.now_s, deadline_s)
+        lab.step(Tick())
+        deadline_s = lab.core.deadline_s()
+    assert lab.now_s <= 100.0 + 15.0
+    assert any("did not retract" in text for text in said(lab, "CRITICAL"))
+
+
+def test_a_scheduler_that_is_killed_while_it_ends_sees_to_the_tip_first() -> None:
+    lab = feedback_off()
+    lab.ask("experiment", END)
+    again = killed(lab, SchedulerSettings())
+    assert sent(again) == ["x-retract"]
+    assert not any(isinstance(effect, Kill) for effect in again.effects)
+    assert kinds(again.answer(again.forwarded[-1]))[-1] == "Kill"
+
+
+def test_an_experiment_without_danger_ends_at_once() -> None:
+    lab = in_control(SchedulerSettings())
+    assert kinds(lab.ask("experiment", END))[-1] == "Kill"
