@@ -121,6 +121,7 @@ class SchedulerCore:
         self._started_s = 0.0
         self._announce_at_s: float | None = None
         self._end_by_s: float | None = None
+        self._told_at_end: list[tuple[RequestIn, ControlResponse, str]] = []
         self._is_restarted = False
         self._held: deque[RequestIn] = deque()
         self._held_due_s: float | None = None
@@ -157,7 +158,8 @@ class SchedulerCore:
         self._cache.remember(self._recent)
         self._chronicle.at(now_s, now_ns)
         if self._control.ended:
-            self._end_soon(now_s, now_ns)
+            self._end_soon(now_s)
+            self._end_when_safe(now_s, now_ns)
         else:  # first, in the order of time, what the translator published before we were there
             self._announce_at_s = now_s + self._settings.catch_up_s
             self._chronicle.began(self._control, again=self._is_restarted)
@@ -314,7 +316,7 @@ class SchedulerCore:
         if kind == TELL_REQUEST:  # a supervisor's last words come after the end
             self._follow(event, self._bulletin.told(event, now_s, now_ns))
         elif self._control.ended:
-            self._desk.answer(event, ControlResponse.FAILURE, HAS_ENDED)
+            self._answer_at_end(event, ControlResponse.FAILURE, HAS_ENDED)
         elif kind == RESTART_REQUEST:
             self._follow(event, self._bulletin.ordered(event, now_s))
         elif kind == CLOCK_REQUEST:
@@ -367,14 +369,22 @@ class SchedulerCore:
         if after != before:
             had_died = None not in (token, self._granted_to) and token != self._granted_to
             self._control_changed(before, ask, row, now_s, now_ns, had_died=had_died and ask.who == before.holder)
+        has_ended = after.ended and not before.ended
+        if has_ended:
+            self._end_soon(now_s)
         if event is not None and row.response is not None:
-            self._desk.answer(event, row.response, arbitration.reason(row, before, ask, self._rules))
-        if after.ended and not before.ended:
-            self._end_soon(now_s, now_ns)
+            tell = self._answer_at_end if has_ended else self._desk.answer
+            tell(event, row.response, arbitration.reason(row, before, ask, self._rules))
 
-    def _end_soon(self, now_s: float, now_ns: int) -> None:
+    def _answer_at_end(self, event: RequestIn, code: ControlResponse, why: str) -> None:
+        """Who hears that it is over may leave, and the supervisor with it: not before the tip is seen to."""
+        if self._end_by_s is None:
+            self._desk.answer(event, code, why)
+        else:
+            self._told_at_end.append((event, code, why))
+
+    def _end_soon(self, now_s: float) -> None:
         self._end_by_s = now_s + self._settings.request_timeout_s + self._settings.patience_s
-        self._end_when_safe(now_s, now_ns)
 
     def _end_when_safe(self, now_s: float, now_ns: int) -> None:
         """The experiment that is over ends, once the tip is out of danger or that takes too long."""
@@ -385,6 +395,9 @@ class SchedulerCore:
             self._log(
                 "CRITICAL", "the experiment ends, and the tip was left in danger: the microscope did not retract it"
             )
+        for told in self._told_at_end:
+            self._desk.answer(*told)
+        self._told_at_end.clear()
         self._with_forwards()
         self._effects += [*self._bulletin.entries(now_ns), Kill()]
 

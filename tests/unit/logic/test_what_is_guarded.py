@@ -222,14 +222,16 @@ def test_what_can_not_be_retracted_is_critical() -> None:
 def test_the_experiment_ends_when_the_tip_is_out_of_danger() -> None:
     lab = feedback_off()
     lab.scope_is(ScopeState.SCANNING)
-    effects = lab.ask("experiment", END, None, "experiment/a/9")
-    assert replies(effects)[0].response.ok
+    assert not replies(lab.ask("experiment", END, None, "experiment/a/9"))
     assert sent(lab) == ["stop-scan"]
+    assert not replies(lab.ask("other", END, None, "other/a/1"))
     lab.answer(lab.forwarded[-1])
     lab.scope_is(ScopeState.FREE)
     assert sent(lab) == ["stop-scan", "x-retract"]
     assert not any(isinstance(effect, Kill) for effect in lab.effects)
-    assert kinds(lab.answer(lab.forwarded[-1]))[-1] == "Kill"
+    effects = lab.answer(lab.forwarded[-1])
+    assert [(reply.name, reply.response.ok) for reply in replies(effects)] == [("experiment", True), ("other", False)]
+    assert kinds(effects)[-1] == "Kill"
 
 
 def test_an_experiment_that_ends_does_not_wait_for_ever() -> None:
