@@ -98,6 +98,8 @@ class Translator:
                     self.look()
                 for arrived in self._port.poll(self.wait_s()):
                     if isinstance(arrived, ParentGone):
+                        with self._step():
+                            self._trusting(self._stop_measuring)
                         return ExitCode.ORPHAN
                     with self._step():
                         self.handle(arrived)
@@ -301,15 +303,19 @@ class Translator:
             self._finish(request, Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id))
 
     def _end(self) -> None:
-        """The scheduler says that the experiment is over: the tip does not go on scanning with nobody there."""
-        stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(self._sequence.said.state)
-        if stop is not None and self._connected:
-            with contextlib.suppress(*LOST):
-                self._play(self._service.answer(Request(ControlRequest.ACTION, stop)).steps)
-                self._observe()
-                self._save()
+        """The scheduler says that the experiment is over."""
+        with contextlib.suppress(*LOST):
+            self._stop_measuring()
         self._reply(Response(ControlResponse.SUCCESS))
         self._ended = True
+
+    def _stop_measuring(self) -> None:
+        """The tip does not go on scanning with nobody there."""
+        stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(self._sequence.said.state)
+        if stop is not None and self._connected:
+            self._play(self._service.answer(Request(ControlRequest.ACTION, stop)).steps)
+            self._observe()
+            self._save()
 
     def _answer(self, request: Request) -> None:
         if not self._connected:

@@ -22,7 +22,8 @@ from afspm.model import (
     ScopeState,
     names,
 )
-from afspm.transport.port import SubscriberJoined
+from afspm.runtime.exit_codes import ExitCode
+from afspm.transport.port import ParentGone, SubscriberJoined
 from afspm.wire.generated import feedback_pb2, scan_pb2
 
 ACTION, PARAM, SUPPORT = ControlRequest.ACTION, ControlRequest.PARAM, ControlRequest.ACTION_SUPPORT
@@ -107,6 +108,18 @@ def test_a_scan_without_a_file_ends_as_interrupted(bench: Any) -> None:
     bench.look()
     bench.look(after_s=10.0)
     assert bench.heard() == ["SCANNING", "INTERRUPTED", "FREE"]
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_the_tip_does_not_go_on_scanning_when_the_run_is_stopped(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, lost: bool
+) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.lost = lost
+    monkeypatch.setattr(bench.port, "poll", lambda timeout_s: [ParentGone()])
+    assert bench.translator.run() == ExitCode.ORPHAN
+    assert bench.microscope.done == (["scan"] if lost else ["scan", "stop"])
+    assert bench.heard() == (["SCANNING", "UNDEFINED"] if lost else ["SCANNING", "INTERRUPTED", "FREE"])
 
 
 def test_a_stop_interrupts_and_no_scan_comes(bench: Any, scan: Any) -> None:
