@@ -71,6 +71,11 @@ class Experiment:
         return self._document.folders
 
     @property
+    def files(self) -> list[Path]:
+        """All that it is made of, absolute, each laid over those before it."""
+        return [file.resolve() for file in self._document.files]
+
+    @property
     def component_names(self) -> list[str]:
         """All processes of the experiment: translator, scheduler and recorder too, in the order of the file."""
         self.resolved  # noqa: B018  (adds what is part of every experiment)

@@ -20,9 +20,10 @@ from afspm.record.going_on import locked
 from afspm.record.journal import open_to_read
 from afspm.record.whole import load
 from afspm.runtime.connect import find_run
+from afspm.supervisor import edited
 from afspm.supervisor import run as running
 from afspm.supervisor.ending import Why
-from afspm.supervisor.run import HOMES, HOW, ONLY, WITHOUT, Options, Run
+from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, WITHOUT, Options, Run
 
 _OVER = {Why.EXPERIMENT_ENDED.name.lower(), Why.ALL_DONE.name.lower()}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
@@ -68,7 +69,7 @@ def find(where: Path) -> Resumable:
 
     Raises:
         FileError: there is no run, or what is needed of it can't be read.
-        ConfigError: it has ended.
+        ConfigError: it has ended, or the experiment file that names it was edited since it was begun.
     """
     folder = find_run(where).resolve()
     facts = read_facts(folder)
@@ -80,7 +81,11 @@ def find(where: Path) -> Resumable:
     if not file.is_file() or not (folder / STATE_DIR).is_dir():
         raise FileError("this is not the folder of a run", where=str(folder), hint="it lacks its experiment or state")
     homes = tuple(map(Path, facts.get(HOMES, []))) or (folder,)
-    return Resumable(folder, str(facts.get("name", folder.name)), load_expanded(file, homes), facts, homes)
+    experiment = load_expanded(file, homes)
+    if where.suffix == ".toml":
+        begun_with = [Path(name) for name in facts.get(FILES, ())]
+        edited.refuse_edited(begun_with if where.resolve() in begun_with else [where], experiment, folder)
+    return Resumable(folder, str(facts.get("name", folder.name)), experiment, facts, homes)
 
 
 def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -> Run:

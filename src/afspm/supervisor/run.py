@@ -14,7 +14,7 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
 from afspm.experiment.wiring import connectable
 from afspm.record import ahead
-from afspm.record.facts import ENDED, STATE_DIR
+from afspm.record.facts import ENDED, STATE_DIR, known_facts
 from afspm.record.going_on import locked
 from afspm.runtime.connect import GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
@@ -25,7 +25,7 @@ from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.supervisor import Outcome, Supervisor
 from afspm.supervisor.task import from_start
 
-HOW, HOMES, ONLY, WITHOUT = "how", "homes", "only", "without"
+HOW, HOMES, FILES, ONLY, WITHOUT = "how", "homes", "files", "only", "without"
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,8 @@ def go(
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:
         starts = _starts(experiment, options, clock, FreePorts(), folder)
-        facts = {**run_facts(name, starts, clock), **to_resume(experiment, starts, options)}
+        files = known_facts(folder).get(FILES) or list(map(str, experiment.files))  # one that is resumed has it
+        facts = {**run_facts(name, starts, clock), **to_resume(experiment, starts, options), FILES: files}
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
             ahead.expect_record(folder / STATE_DIR)
