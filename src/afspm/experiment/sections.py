@@ -57,7 +57,7 @@ class Control(Section):
     solved_by_hand: tuple[str, ...] = ("device-malfunction",)
     """Problems that a person puts right: they may be flagged though no component solves them."""
     retract: bool = True
-    """Whether the tip is retracted when a holder dies in a dangerous state, where the microscope can."""
+    """Whether the tip is retracted when control is left in a dangerous state, where the microscope can."""
     dangerous: tuple[DangerousState, ...] | None = None
     """Those states; None: what the watchdog takes for dangerous by itself."""
     roles: Roles = Roles()
