@@ -1,4 +1,4 @@
-"""One log of a run: the lines of all processes, in the terminal with name and colour, in log.txt complete."""
+"""One log of a run: the lines of all processes, in the terminal with name and colour, and in log.txt."""
 
 from __future__ import annotations
 
