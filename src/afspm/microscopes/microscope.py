@@ -129,6 +129,7 @@ class Microscope(ABC):
         clock, log: of the experiment; given before `connect`.
         run_dir: the folder of this run.
         wake: call it, from any thread, to have the controller looked at now rather than at the next poll.
+        controller_at: where the controller is, so that one run at a time commands it; empty: nobody else can reach it.
         lacking: actions that this controller turned out not to have, and why; set it when connecting.
         memory: a dict of JSON values, kept on disk: saved with every request and result, there after a restart.
     """
@@ -150,6 +151,7 @@ class Microscope(ABC):
     log: logging.Logger
     run_dir: Path
     wake: Callable[[], None]
+    controller_at: str = ""
     lacking: Mapping[str, str] = MappingProxyType({})
     memory: dict[str, Any]
 

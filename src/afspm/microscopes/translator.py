@@ -28,6 +28,7 @@ from afspm.microscopes.parameters import Value
 from afspm.microscopes.sequence import Complain, Deliver, Discard, Say, Step
 from afspm.microscopes.sequence import Sequence as StateSequence
 from afspm.microscopes.service import Service
+from afspm.microscopes.sole import ControllerTaken, commanding
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus, names
 from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.memory import Memory
@@ -392,7 +393,18 @@ def _only_asks(request: Request) -> bool:
 
 
 def run_translator(microscope: Microscope, context: Context, make: Callable[..., Translator] = Translator) -> int:
-    """What the host runs: the sockets, the memory and the translator itself."""
+    """What the host runs. While another run commands the controller, it is said which, and the process ends."""
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(commanding(microscope.controller_at, context.launch.run_dir or ""))
+        except ControllerTaken as error:
+            context.log.error("%s", error)
+            return ExitCode.CRASHED  # to be tried again a few times: that run may be just ending
+        return _run_alone(microscope, context, make)
+
+
+def _run_alone(microscope: Microscope, context: Context, make: Callable[..., Translator]) -> int:
+    """The sockets, the memory and the translator itself."""
     from afspm.transport.launching import open_server_port
 
     launch = context.launch

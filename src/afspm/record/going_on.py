@@ -24,7 +24,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     with (folder / STATE_DIR / LOCK_FILE).open("a+b") as file:
         try:
-            _lock(file)
+            lock(file)
         except OSError as error:
             raise FileError("this run is still going on", where=str(folder), hint="`afspm status` shows it") from error
         yield
@@ -60,13 +60,13 @@ def _is_left(folder: Path) -> bool:
     """Whether somebody had the lock, and nobody has it."""
     try:
         with (folder / STATE_DIR / LOCK_FILE).open("rb") as file:
-            _lock(file, shared=True)
+            lock(file, shared=True)
     except OSError:
         return False
     return True
 
 
-def _lock(file: IO[bytes], *, shared: bool = False) -> None:
+def lock(file: IO[bytes], *, shared: bool = False) -> None:
     """Until it is closed. Raises OSError: another process has it."""
     if sys.platform == "win32":
         import msvcrt

@@ -68,6 +68,7 @@ class Asylum(Microscope):
             result_timeout_s=result_timeout_s,
         )
         self._address = address
+        self.controller_at = address
         self._folders = dict(folders or {})
         self._base_name = _checked_name(base_name)
         self._spots = spots

@@ -71,6 +71,7 @@ class Gxsm(Microscope):
         if saving not in _SAVERS:
             raise ConfigError(f"{saving!r} saves nothing", where="saving", hint=f"{' or '.join(_SAVERS)}")
         self._address = Address.parse(address)
+        self.controller_at = address
         self._saves = saving == "afspm"
         self._given_hardware = hardware
         self._scan_dir, self._probe_dir = (None if path is None else Path(path) for path in (scan_dir, probe_dir))

@@ -76,6 +76,7 @@ class Nanonis(Microscope):
             live_lines_s=live_lines_s,
         )
         self._addresses = _addresses(address)
+        self.controller_at = address
         self._session_dir = None if session_dir is None else Path(session_dir)
         self._release = release
         self._reply_timeout_s = reply_timeout_s

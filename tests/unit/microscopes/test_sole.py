@@ -1,0 +1,87 @@
+"""One run at a time commands a controller."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from afspm.clock import ExperimentClock
+from afspm.microscopes.asylum import Asylum
+from afspm.microscopes.gxsm import Gxsm
+from afspm.microscopes.nanonis import Nanonis
+from afspm.microscopes.simulator import Simulator
+from afspm.microscopes.sole import ControllerTaken, commanding
+from afspm.microscopes.translator import run_translator
+from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.launch import Launch, Sockets
+from afspm.runtime.process import Activity, Context
+
+DIES_HOLDING = """
+import os, sys
+from afspm.microscopes.sole import commanding
+with commanding(sys.argv[1], "runs/the-dead"):
+    os._exit(1)
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+
+@pytest.mark.parametrize("other", ["lab-1:6501", "LAB-1:6501"])
+def test_a_second_run_is_refused_and_told_which_has_the_controller(other: str) -> None:
+    with commanding("lab-1:6501", "runs/first"):
+        with (
+            pytest.raises(ControllerTaken, match=f"commanded by runs/first, process {os.getpid()}"),
+            commanding(other, "b"),
+        ):
+            pass
+        with commanding("lab-2:6501", "runs/second"):
+            pass
+    with commanding(other, "runs/second"):
+        pass
+
+
+def test_this_computer_is_the_same_by_name_and_number() -> None:
+    with commanding("localhost:6501", "a"), pytest.raises(ControllerTaken), commanding("127.0.0.1:6501", "b"):
+        pass
+
+
+def test_a_run_that_failed_or_was_killed_leaves_nothing_locked(tmp_path: Path) -> None:
+    with contextlib.suppress(ZeroDivisionError), commanding("lab:1", "a"):
+        raise ZeroDivisionError
+    environment = {**os.environ, "TMPDIR": str(tmp_path), "TEMP": str(tmp_path), "TMP": str(tmp_path)}
+    died = subprocess.run([sys.executable, "-c", DIES_HOLDING, "lab:1"], env=environment, check=False, timeout=60)
+    assert died.returncode == 1
+    assert "the-dead" in next(tmp_path.glob("afspm-controller-*")).read_text()
+    with commanding("lab:1", "b"):
+        pass
+
+
+def test_each_maker_says_where_its_controller_is_and_a_simulated_one_is_its_runs_own(tmp_path: Path) -> None:
+    assert Asylum(address="tcp://lab:5555").controller_at == "tcp://lab:5555"
+    assert Nanonis(address="lab:6501,6502").controller_at == "lab:6501,6502"
+    assert Gxsm(address="lab:65431").controller_at == "lab:65431"
+    assert Simulator().controller_at == ""
+    with commanding("", "a"), commanding("", "b"):
+        assert not list(tmp_path.iterdir())
+
+
+def test_the_translator_of_a_second_run_says_which_has_it_and_ends_to_be_tried_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    launch = Launch("microscope", sockets=Sockets(), run_dir="runs/second")
+    clock, log = ExperimentClock.from_dict(launch.clock), logging.getLogger("afspm.test")
+    context = Context(launch, clock, open_port=pytest.fail, log=log, activity=Activity(clock))
+    with commanding("lab:6501", "runs/first"):
+        code = run_translator(Nanonis(address="lab:6501"), context, make=pytest.fail)
+    assert code == ExitCode.CRASHED
+    assert "commanded by runs/first" in caplog.text
