@@ -18,8 +18,8 @@ from afspm.logic.moves import Mover
 from afspm.logic.once import Fate, OnceTable, fingerprint
 from afspm.logic.sessions import Hearing, Sessions
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.watchdog import Watchdog
-from afspm.model import ControlRequest, ControlResponse, Feedback, Parameter, Request, Response, component_of, names
+from afspm.logic.watchdog import Watchdog, feedback_of
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, component_of
 
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
@@ -27,7 +27,6 @@ _SENT_REMEMBERED = 100
 _UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
 OwnEnd = Callable[[Response, float, int], Iterable[Effect]]
 """Told of the answer to a request of the scheduler's own, with now_s and now_ns; what follows from it."""
-_OFF = ("0", "0.0", "false", "off")
 LATE = "late: it had been told that there was no answer"
 """Of an answer of the translator that came after all."""
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
@@ -189,7 +188,7 @@ class Desk:
     def switches_feedback_off(self) -> bool:
         """Whether what is with the translator does."""
         flight = self.forwarder.flight
-        feedback = None if flight is None else _feedback_of(flight.request)
+        feedback = None if flight is None else feedback_of(flight.request)
         return feedback is not None and feedback.on is False
 
     def forward(self, event: RequestIn, now_s: float, now_ns: int, *, command: bool) -> None:
@@ -384,7 +383,7 @@ class Desk:
                 response.payload = self._codec.encode_parameter(mapped)
         if request.kind == _ACTION:
             self._watchdog.started(str(request.subject), job.states_seen)
-        if (feedback := _feedback_of(request)) is not None:
+        if (feedback := feedback_of(request)) is not None:
             self._watchdog.feedback_is(feedback)
         if job.command and job.client == self._holder():
             self._lease.used(now_ns)
@@ -428,14 +427,6 @@ def _was_not_sent(response: Response) -> bool:
 def _unknown_fate(response: Response) -> Fate | None:
     """The controller did not answer its translator: whether it was done is for that one to say, when asked again."""
     return Fate.UNKNOWN if response.code == ControlResponse.NO_RESPONSE else None
-
-
-def _feedback_of(request: Request) -> Feedback | None:
-    """What a request sets of the feedback."""
-    subject = request.subject
-    if isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON and subject.value is not None:
-        return Feedback(on=subject.value.strip().lower() not in _OFF)
-    return subject if isinstance(subject, Feedback) else None
 
 
 def is_get(request: Request) -> bool:

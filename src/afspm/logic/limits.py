@@ -34,6 +34,7 @@ from afspm.model.names import BASE_PARAMETERS
 from afspm.units import convert
 
 _REACH = 1e-9  # relative: what lies on the border, to the precision of the arithmetic, is inside
+_TOLD_REACH = 1e-3  # the same of a place that the controller tells: in steps of its own, and in single precision
 
 
 @dataclass(frozen=True)
@@ -241,7 +242,7 @@ class Guard:
                 f" per second ({limit.source})"
             )
 
-    def _check_scan(self, wanted: ScanParameters) -> None:
+    def _check_scan(self, wanted: ScanParameters, reach: float = _REACH) -> None:
         """What is checked is the scan as it would be afterwards: a request may give only a part of it."""
         shape, region = wanted.shape, wanted.region
         if isinstance(shape, ShapeChange):
@@ -254,7 +255,7 @@ class Guard:
         if region is None or allowed is None:
             return
         for x, y in region.corners_m():
-            if not _inside(allowed, (float(x), float(y))):
+            if not _inside(allowed, (float(x), float(y)), reach):
                 raise _param_error(
                     f"the scan's corner ({x:.6g}, {y:.6g}) m lies outside the region allowed"
                     f" ({self._limits.region_source})"
@@ -274,11 +275,11 @@ class Guard:
             raise _param_error("where the scan is now is not known, so a part of its place can't be checked")
         return None
 
-    def _check_point(self, xy_m: XY) -> None:
+    def _check_point(self, xy_m: XY, reach: float = _REACH) -> None:
         if not all(map(math.isfinite, xy_m)):
             raise _param_error(f"the probe can't go to {xy_m}: not a place")
         allowed = self._limits.region
-        if allowed is not None and not _inside(allowed, xy_m):
+        if allowed is not None and not _inside(allowed, xy_m, reach):
             raise _param_error(
                 f"the probe position ({xy_m[0]:.6g}, {xy_m[1]:.6g}) m lies outside the region allowed"
                 f" ({self._limits.region_source})"
@@ -290,11 +291,11 @@ class Guard:
         if action == names.START_SCAN:
             if self._at.region is None:
                 raise _param_error("where the scan is now is not known")
-            self._check_scan(ScanParameters(self._at.region))
+            self._check_scan(ScanParameters(self._at.region), _TOLD_REACH)
         elif action in names.AT_PROBE:
             if self._at.probe is None:
                 raise _param_error("where the probe is now is not known")
-            self._check_point(self._at.probe)
+            self._check_point(self._at.probe, _TOLD_REACH)
 
     def _check_move(self, change: PositionChange) -> None:
         if self._limits.region is None:
@@ -388,6 +389,6 @@ def _is_numeric(limit: Limit) -> bool:
     return any(bound is not None for bound in (limit.low, limit.high, limit.step, limit.rate_per_s))
 
 
-def _inside(allowed: Region, xy_m: XY) -> bool:
-    grown = (allowed.size_m[0] * (1 + _REACH), allowed.size_m[1] * (1 + _REACH))
+def _inside(allowed: Region, xy_m: XY, reach: float) -> bool:
+    grown = (allowed.size_m[0] * (1 + reach), allowed.size_m[1] * (1 + reach))
     return replace(allowed, size_m=grown).contains(xy_m)

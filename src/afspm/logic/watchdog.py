@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from enum import Enum
 
 from afspm.logic.arbitration import Cause
-from afspm.model import ControlResponse, Feedback, ScopeState, names
+from afspm.model import ControlResponse, Feedback, Parameter, Request, ScopeState, names
 
 FEEDBACK_OFF = "feedback-off"
 """The name of the dangerous state in which the feedback is known to be switched off."""
 
 _STOP = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 _STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
+_OFF = ("0", "0.0", "false", "off")
 _DEFAULT_STOPS = frozenset({Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE})
 
 
@@ -203,3 +204,11 @@ class Watchdog:
     def _forget(self) -> None:
         self._wanted.pop(0)
         self._attempts = 0
+
+
+def feedback_of(request: Request) -> Feedback | None:
+    """What a request sets of the feedback."""
+    subject = request.subject
+    if isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON and subject.value is not None:
+        return Feedback(on=subject.value.strip().lower() not in _OFF)
+    return subject if isinstance(subject, Feedback) else None

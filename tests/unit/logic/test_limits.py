@@ -261,6 +261,18 @@ def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action
     assert here(g, action) == ""
 
 
+def test_a_frame_up_to_the_border_may_be_told_in_the_precision_of_the_controller() -> None:
+    g = Guard(Limits(region=STAGE))
+    assert why(g, scan(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6))))
+    g.published(ScanParameters(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6)), (8, 8)), 0)
+    g.published(ProbePosition((5.0000002e-6, 0.0)), 0)
+    assert here(g, "start-scan") == here(g, "x-pulse") == ""
+    g.published(ScanParameters(Region((4.5e-6, 0.0), (1.02e-6, 1e-6)), (8, 8)), 0)
+    g.published(ProbePosition((5.01e-6, 0.0)), 0)
+    assert here(g, "start-scan")
+    assert here(g, "x-pulse")
+
+
 def test_a_place_set_by_single_parameters_is_known_before_it_is_published() -> None:
     g = Guard(Limits(region=STAGE))
     g.published(ProbePosition((0.0, 0.0)), 0)
