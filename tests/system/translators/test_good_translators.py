@@ -41,7 +41,7 @@ heartbeats = false
 """
 SAMPLE_COORDINATES = """
 [control]
-solved_by_hand = ["thermal-drift"]
+solved_by_hand = ["thermal-drift", "device-malfunction"]
 
 [scheduler]
 component = true
