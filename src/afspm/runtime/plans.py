@@ -26,7 +26,7 @@ from afspm.runtime.view import View
 
 SAME = 1e-6  # of the size: closer than any controller positions
 FITS = 1e-2  # of the size: a controller's rounding, not another region
-SAME_PLACE_M = 1e-9
+SPOT_M = 20e-9  # a scanner with sensors tells where the tip was, which is some nanometres from where it was sent
 MOVED = 0.5  # of the size: where drift is corrected, a scan lies where it turned out to have been taken
 SHEARED = 0.1  # of the size: and is as large, and as turned, as it turned out to be
 
@@ -137,7 +137,7 @@ def _spectrum_fits(facts: dict[str, Any], spectrum: Spectrum) -> bool:
         return False
     if facts["at_m"] is None or spectrum.position_m is None or facts.get("frame") == Frame.SAMPLE.value:
         return True
-    return math.dist(facts["at_m"], spectrum.position_m) <= SAME_PLACE_M
+    return math.dist(facts["at_m"], spectrum.position_m) <= SPOT_M
 
 
 _FITS: dict[str, Callable[[dict[str, Any], Any], bool]] = {"scan": _scan_fits, "spectrum": _spectrum_fits}
