@@ -18,7 +18,7 @@ from benchmarks.processes import CLOCK, Roles, roles
 from benchmarks.roles import ANY, LAST, MARK
 from benchmarks.rows import Row, alternate, measurement
 
-SCANS = {128: (400, 15), 512: (60, 9), 2048: (8, 5)}
+SCANS = {128: (400, 31), 512: (60, 15), 2048: (8, 5)}
 """By edge in pixels: how many are published in a batch, and how many batches: a short one says little by itself. All of
 a batch may be under way, so no queue is shorter."""
 QUEUE = 1000

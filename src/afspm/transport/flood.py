@@ -6,6 +6,8 @@ REST_MS = 2
 """Then what comes within this time is handled in one go. Where many processes share a processor, to wake one of them up
 takes several times as long as what it then does with a packet: its code is in no cache."""
 FAST_PER_S = 800.0
+TOO_FAST_PER_S = 6000.0
+"""Beyond it there is always something more once one is handled."""
 _LOOKED_AT_S = 0.02
 
 
@@ -22,5 +24,5 @@ class Flood:
         self._count += packets
         lasted_s = now_s - self._since_s
         if lasted_s >= _LOOKED_AT_S:
-            self.is_on = self._count >= FAST_PER_S * lasted_s
+            self.is_on = FAST_PER_S <= self._count / lasted_s <= TOO_FAST_PER_S
             self._count, self._since_s = 0, now_s

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.transport.flood import FAST_PER_S, Flood
+from afspm.transport.flood import FAST_PER_S, TOO_FAST_PER_S, Flood
 
 
 def told(gaps_s: list[float]) -> list[bool]:
@@ -27,6 +27,10 @@ def test_a_flood_is_one_soon_and_until_it_is_over() -> None:
     assert said[:10] == [False] * 10
     assert all(said[60:-1])
     assert not said[-1]
+
+
+def test_where_there_is_always_something_nobody_rests() -> None:
+    assert not any(told([1.0 / (1.5 * TOO_FAST_PER_S)] * 1000))
 
 
 def test_packets_that_come_together_count_each() -> None:
