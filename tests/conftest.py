@@ -11,11 +11,12 @@ from typing import Any
 
 import pytest
 import zmq
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 # how long one example takes says more about how busy the computer is than about us
-settings.register_profile("repeatable", deadline=None, derandomize=True)
-settings.register_profile("explore", deadline=None)  # new examples each time: AFSPM_EXAMPLES=explore make test
+any_pace: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+settings.register_profile("repeatable", **any_pace, derandomize=True)
+settings.register_profile("explore", **any_pace)  # new examples each time: AFSPM_EXAMPLES=explore make test
 settings.load_profile(os.environ.get("AFSPM_EXAMPLES", "repeatable"))
 
 # as for a registration in an experiment: on small arrays several threads are slower than one, and take others' cores

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -40,10 +41,11 @@ class Child:
             self.tell(first_line)
 
     def tell(self, line: str) -> None:
-        """A line on its standard input."""
+        """A line on its standard input, which one that has ended already does not hear."""
         assert self.popen.stdin is not None
-        self.popen.stdin.write(line.encode() + b"\n")
-        self.popen.stdin.flush()
+        with contextlib.suppress(BrokenPipeError):
+            self.popen.stdin.write(line.encode() + b"\n")
+            self.popen.stdin.flush()
 
     def expect(self, text: str) -> str:
         """The next line on its standard output, which has to begin with `text`."""

@@ -146,6 +146,7 @@ def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment, monke
         with pytest.raises(ExperimentEnded):
             scope.wait_until(lambda: False, timeout_s=20.0)
     experiment.scheduler.exit_code()  # it stays for a moment, to tell those who come late
+    monkeypatch.setattr(connect, "JOINED_WITHIN_S", 1.0)
     with pytest.raises(NoResponse, match="nobody is there"):
         afspm.connect(experiment.folder)
 

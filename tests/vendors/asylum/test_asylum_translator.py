@@ -372,7 +372,7 @@ def test_a_force_curve_that_is_stopped_gives_none(bench: Make) -> None:
 
 
 def test_a_force_curve_that_somebody_takes_is_published_with_the_place_of_its_file(bench: Make) -> None:
-    made = bench(speed=10.0)
+    made = bench(speed=2.0)
     peer = made.start()
     peer.until(FREE)
     made.at_panel(lambda emulator: emulator.rig.move_probe((20e-9, 30e-9)))
