@@ -51,10 +51,7 @@ class DriftRecord:
 
     def __getitem__(self, part: slice) -> DriftRecord:
         """Some of the scans."""
-        return DriftRecord(
-            self.keys[part], self.time_s[part], self.center_m[part], self.drift_m[part], self.covariance_m2[part],
-            self.rate_m_s[part], self.matched[part], self.reasons[part],
-        )  # fmt: skip
+        return self.chosen(range(len(self.keys))[part])
 
     def chosen(self, which: Sequence[int]) -> DriftRecord:
         """Those of some numbers."""
