@@ -18,7 +18,7 @@ FEEDBACK_OFF = "feedback-off"
 
 _STOP = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 _STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
-_OFF = ("0", "0.0", "false", "off")
+_OFF = names.OFF_WORDS | {"0.0"}  # a translator that is not ours may take a number
 _DEFAULT_STOPS = frozenset({Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE})
 
 

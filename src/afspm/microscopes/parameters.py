@@ -22,7 +22,6 @@ Value = bool | int | float | str
 
 FEEDBACK_ON: Final = names.FEEDBACK_ON
 
-_TRUE, _FALSE = {"true", "1", "on", "yes"}, {"false", "0", "off", "no"}
 _TYPES = ("float", "int", "bool", "text")
 _LONGEST_TEXT = 200
 
@@ -193,8 +192,8 @@ class ParameterSpec:
     def _checked_word(self, text: str) -> Value:
         word = text.strip()
         if self.type == "bool":
-            if word.lower() in _TRUE | _FALSE:
-                return word.lower() in _TRUE
+            if word.lower() in names.ON_WORDS | names.OFF_WORDS:
+                return word.lower() in names.ON_WORDS
             raise refuse_value(self.name, f"{text!r} is neither true nor false")
         if self.choices and word not in self.choices:
             raise refuse_value(self.name, f"{text!r} is none of {', '.join(self.choices)}")

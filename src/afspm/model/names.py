@@ -69,6 +69,9 @@ CRASH_DEPTH: Final = "x-crash-depth"
 SPEC_KIND: Final = "x-spec-kind"
 
 FEEDBACK_ON: Final = "x-feedback-on"
+ON_WORDS: Final = frozenset({"true", "1", "on", "yes"})
+OFF_WORDS: Final = frozenset({"false", "0", "off", "no"})
+"""How a peer may say what a switch is to be, in lower case."""
 CONTROLLER: Final = "x-controller"
 """The controller's name and version, as a text that can only be read."""
 

@@ -154,7 +154,8 @@ def test_who_solves_a_problem_gets_a_microscope_that_is_safe() -> None:
     assert sent(lab) == ["x-retract", "start-scan"]
 
 
-def test_a_feedback_that_is_just_being_switched_off_counts() -> None:
+@pytest.mark.parametrize("word", ["false", "0", "0.0", "Off", "no"])
+def test_a_feedback_that_is_just_being_switched_off_counts(word: str) -> None:
     for answered in (False, True):
         lab = in_control(SchedulerSettings())
         lab.ask("experiment", ControlRequest.SET_ZCTRL_PARAMS, OFF, "experiment/a/1")
@@ -165,7 +166,7 @@ def test_a_feedback_that_is_just_being_switched_off_counts() -> None:
             lab.answer(lab.forwarded[-1])
         assert sent(lab)[-1] == "x-retract"
     lab = in_control(SchedulerSettings())
-    lab.ask("experiment", PARAM, Parameter("x-feedback-on", "false"), "experiment/a/1")
+    lab.ask("experiment", PARAM, Parameter("x-feedback-on", word), "experiment/a/1")
     lab.answer(lab.forwarded[-1])
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
     assert sent(lab)[-1] == "x-retract"
