@@ -68,10 +68,7 @@ def on_cluster(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *
     with client:
         futures = {client.submit(_done, function, index, task, pure=False): index for index, task in enumerate(tasks)}
         for future in distributed.as_completed(list(futures), loop=client.loop):
-            if future.status == "finished":
-                yield future.result()
-            else:
-                yield Outcome(futures[future], error=_told(future.exception()))
+            yield _result(future, futures[future])
             future.release()
 
 
@@ -87,6 +84,15 @@ def _until_one_dies(function: Callable[..., Any], left: dict[int, tuple[Any, ...
             return
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _result(future: Any, index: int) -> Outcome:
+    """Of a task on a cluster; done again, if the worker that had it died before it was fetched."""
+    try:
+        outcome: Outcome = future.result()
+    except Exception as error:  # of the cluster: a task tells its own
+        return Outcome(index, error=_told(error))
+    return outcome
 
 
 def _done(function: Callable[..., Any], index: int, task: tuple[Any, ...]) -> Outcome:

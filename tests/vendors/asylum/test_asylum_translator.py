@@ -116,7 +116,7 @@ def test_a_scan_that_is_stopped_gives_none_and_leaves_the_tip_withdrawn(bench: M
 
 
 def test_images_that_somebody_takes_at_the_panel_are_published_too(bench: Make) -> None:
-    made = bench(speed=20.0)
+    made = bench(speed=5.0)
     peer = made.start()
     ready(peer)
 
