@@ -7,6 +7,8 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from rich.table import Table
 
+from benchmarks.drift.bounds import unknown_rough
+from benchmarks.drift.conditions import CONDITIONS
 from benchmarks.drift.parts import Plan, Report
 from benchmarks.drift.surfaces import SURFACES
 from benchmarks.drift.trials import PUBLISHED, Cell, Outcome, Trial, geometric_mean
@@ -65,16 +67,21 @@ def report(plan: Plan, results: Sequence[Outcome]) -> Report:
 
 
 def _own_table(name: str, own: dict[tuple[str, str], Cell]) -> Table:
-    heads = "RMS px|p95|Cb|ratio|C|failed|accepted|wrong|bias x|bias y|95 %|ms"
+    heads = "RMS px|p95|Cb|ratio|Cu|C|failed|accepted|wrong|bias x|bias y|95 %|ms"
     table = _table(f"{name}: errors at the middle of the overlap", f"|surface|n|{heads}")
     for (cell, surface), c in own.items():
         table.add_row(
             cell, surface, str(c.count), _px(c.rms_px), _px(c.p95_px), _px(c.bound_px), f"{c.ratio:.2f}",
-            _px(c.white_bound_px), f"{c.failed:.1%}", f"{c.accepted:.1%}", f"{c.wrong:.1%}",
+            _unknown(cell, surface, c), _px(c.white_bound_px), f"{c.failed:.1%}", f"{c.accepted:.1%}", f"{c.wrong:.1%}",
             f"{c.bias_px[0]:+.4f}", f"{c.bias_px[1]:+.4f}", f"{c.covered:.0%}", f"{c.ms:.0f}",
             end_section=surface == list(SURFACES)[-1],
         )  # fmt: skip
     return table
+
+
+def _unknown(cell: str, surface: str, figures: Cell) -> str:
+    """Cu, the bound of who has to learn the surface from the scans; known for a Gaussian one."""
+    return _px(figures.bound_px * unknown_rough(CONDITIONS[cell.partition("+")[0]])) if surface == "rough" else ""
 
 
 def _beside_table(plan: Plan, results: Sequence[Outcome]) -> Table:

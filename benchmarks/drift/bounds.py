@@ -3,6 +3,8 @@
 With J the derivatives of the difference of both images and Q the precision of the noise of one row, the covariance of
 any unbiased estimate is at least (sum over rows of J^T Q J / f + P)^-1, f the noise of both images over that of one and
 P the precision of what is known before. Van Trees, "Detection, Estimation, and Modulation Theory", part I, 2.4.
+
+These bounds know the surface, which an estimator has to learn from the very scans: see `unknown_rough`.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from scipy import linalg
 
 from benchmarks.drift.conditions import Array, Condition, one_over_f_power
 from benchmarks.drift.pairs import Pair
+from benchmarks.drift.surfaces import rough_power
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,27 @@ def _window(pair: Pair) -> tuple[slice, slice]:
     rows = np.flatnonzero(inside.mean(axis=1) > inside.mean(axis=1).max() / 2)
     columns = np.flatnonzero(inside.mean(axis=0) > inside.mean(axis=0).max() / 2)
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def unknown_rough(how: Condition, size: int = 128) -> float:
+    """How many times its bound the error on the rough surface is at least, where nothing is known of the surface.
+
+    It is a Gaussian field, and of one that is seen twice, with power S and noise N of each, a frequency k tells
+    k² S² / (N² + 2 N S) of a displacement along it, and not k² S / 2 N as if it was known (Hannan and Thomson,
+    Biometrika 58, 77, 1971). On the other surfaces, which are not Gaussian, an estimator can know what an edge is.
+    """
+    f = np.fft.fftfreq(size)
+    power = rough_power(f[None, :] ** 2 + f[:, None] ** 2)
+    power[0, 0] = 0.0
+    power *= size**2 / power.sum()
+    waves = np.exp(2j * math.pi * np.outer(f, np.arange(size))) / math.sqrt(size)
+    precision = np.einsum("fx,xy,fy->f", waves.conj(), row_precision(how, size), waves, optimize=True).real
+    noise = 1.0 / np.maximum(precision, 1e-12)[None, :]  # of what is slower than a line in a row nothing is seen
+    variances = []
+    for told in (power / (2 * noise), power**2 / (noise**2 + 2 * noise * power)):
+        variances.append(1 / np.sum(f[None, :] ** 2 * told) + 1 / np.sum(f[:, None] ** 2 * told))
+    known, unknown = variances
+    return math.sqrt(unknown / known)
 
 
 def row_precision(how: Condition, width: int) -> Array:

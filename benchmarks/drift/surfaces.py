@@ -20,6 +20,7 @@ Random = np.random.Generator
 
 OVERSAMPLING = 4
 TIP_PX = 1.5  # so far from its apex the parabolic tip is one rms height of the sample above it
+ROUGH_PX = 40.0  # above this length `rough` is not any rougher
 BAND_PX = 0.5  # Gaussian that limits the band, as feedback and probe do
 
 
@@ -72,7 +73,12 @@ def stamper(grid: Grid, specimen: Random, place: Random) -> Array:
 
 def rough(grid: Grid, specimen: Random, place: Random) -> Array:
     """Self-affine ground of Hurst exponent 0.8 up to 40 px."""
-    return _self_affine(grid, place, longest_px=40.0)
+    return _self_affine(grid, place, longest_px=ROUGH_PX)
+
+
+def rough_power(f2: Array) -> Array:
+    """Spectral density of the image of `rough` by a sharp tip, up to a factor, at squared frequencies in 1/px²."""
+    return self_affine_amplitude(f2, longest_px=ROUGH_PX) ** 2 * np.exp(-f2 * (2 * math.pi * BAND_PX) ** 2)
 
 
 def particles(grid: Grid, specimen: Random, place: Random) -> Array:
@@ -183,9 +189,14 @@ def _around(grid: Grid, center: Array, reach_px: float) -> Iterator[tuple[tuple[
         )
 
 
-def _self_affine(grid: Grid, random: Random, *, longest_px: float, hurst: float = 0.8) -> Array:
-    """A Gaussian field of unit rms, spectral density as f^-2(hurst + 1), constant below 1 / longest_px."""
-    return _field(grid, random, lambda f2: np.maximum(f2, longest_px**-2) ** (-(hurst + 1) / 2))
+def self_affine_amplitude(f2: Array, *, longest_px: float, hurst: float = 0.8) -> Array:
+    """As f^-(hurst + 1), constant below 1 / longest_px; by the squared frequency in 1/px²."""
+    return np.asarray(np.maximum(f2, longest_px**-2) ** (-(hurst + 1) / 2))
+
+
+def _self_affine(grid: Grid, random: Random, *, longest_px: float) -> Array:
+    """A Gaussian field of unit rms."""
+    return _field(grid, random, lambda f2: self_affine_amplitude(f2, longest_px=longest_px))
 
 
 def _smooth(grid: Grid, random: Random, length_px: float) -> Array:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.drift.bounds import bounds, row_precision
+from benchmarks.drift.bounds import bounds, row_precision, unknown_rough
 from benchmarks.drift.conditions import CONDITIONS, Array, flattened, measured
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, Sampling, pair
-from benchmarks.drift.surfaces import OVERSAMPLING, SURFACES, Grid
+from benchmarks.drift.surfaces import OVERSAMPLING, SURFACES, Grid, rough_power
 from benchmarks.drift.trials import PUBLISHED, Cell, Trial
 from scipy import ndimage
 
@@ -150,6 +150,25 @@ def test_what_is_unknown_besides_makes_the_bound_larger() -> None:
     for surface in SURFACES:
         best = bounds(pair(surface, "hard", seed=2))
         assert np.trace(best.white) < np.trace(best.rows) < np.trace(best.full)
+
+
+def test_the_best_estimate_of_an_unknown_ground_is_as_much_worse_as_the_bound_says() -> None:
+    """The processor of Hannan and Thomson, on a periodic ground that is seen twice."""
+    how, size, random = CONDITIONS["white3"], 64, np.random.default_rng(8)
+    k = 2 * np.pi * np.fft.fftfreq(size)
+    power = rough_power((k[None, :] ** 2 + k[:, None] ** 2) / (2 * np.pi) ** 2)
+    power[0, 0] = 0.0
+    power *= size**2 / power.sum()
+    weight = power / (how.white**4 + 2 * how.white**2 * power)
+    errors = []
+    for _ in range(300):
+        ground, *noise = np.fft.fft2(random.standard_normal((3, size, size)))
+        one, two = (np.sqrt(power) * ground + how.white * each for each in noise)
+        across = (one.conj() * two).imag * weight
+        errors += [np.sum(q * across) / np.sum(q**2 * power * weight) / size**2 for q in (k[None, :], k[:, None])]
+    known = 1.0 / np.sqrt(np.sum(k[None, :] ** 2 * power / (2 * how.white**2)))
+    assert np.std(errors) / known == pytest.approx(unknown_rough(how, size), rel=0.06)
+    assert unknown_rough(how, size) > 1.08
 
 
 def test_the_published_estimator_is_as_inexact_and_as_trusting_as_it_was_measured() -> None:
