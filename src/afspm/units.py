@@ -212,8 +212,10 @@ def _by_pint(unit: str) -> tuple[str, Fraction]:
     import pint
 
     try:
-        quantity = pint.Quantity(1.0, unit).to_base_units()
-        base, factor = f"{quantity.units}", Fraction(float(quantity.magnitude))
+        none, one = (pint.Quantity(value, unit).to_base_units() for value in (0.0, 1.0))
+        base, factor = f"{one.units}", Fraction(float(one.magnitude))
     except Exception as error:  # pint raises many kinds, even plain AttributeError and TokenError
         raise UnitError(f"{unit!r} is not a unit that is known here", hint="e.g. nm, um, mV, nA, deg, nm/s") from error
+    if none.magnitude != 0.0:  # degrees Celsius, decibels: 20 of them are not twenty times one
+        raise UnitError(f"{unit!r} does not count from zero, and is not converted here", hint=f"give it in {base}")
     return _SI_NAMES.get(base, base), factor

@@ -39,6 +39,7 @@ def test_quantities_in_si(text: str, unit: str, expected: float) -> None:
 
 def test_other_units_are_known_as_well() -> None:
     assert si("1 inch", "m") == pytest.approx(0.0254)
+    assert si("20 mK", "K") == si("20 millikelvin", "K") == 0.02
     assert si("1 eV/nm", "N") == pytest.approx(1.602e-10, rel=1e-3)
 
 
@@ -46,6 +47,12 @@ def test_other_units_are_known_as_well() -> None:
 def test_what_is_no_length_is_refused(text: str) -> None:
     with pytest.raises(UnitError):
         si(text, "m")
+
+
+@pytest.mark.parametrize(("text", "unit"), [("20 degC", "K"), ("0 °C", "K"), ("68 degF", "K"), ("3 dB", "")])
+def test_what_does_not_count_from_zero_is_refused_and_not_multiplied(text: str, unit: str) -> None:
+    with pytest.raises(UnitError, match="does not count from zero"):
+        si(text, unit)
 
 
 def test_arrays_are_converted_as_a_whole() -> None:
