@@ -197,8 +197,9 @@ def thumbnail(values: NDArray[np.float64], largest_px: int = THUMBNAIL_PX) -> ND
     """A scan as a small grey picture: lines levelled, contrast from the 1st to the 99th percentile."""
     step = max(1, -(-max(values.shape) // largest_px))
     finite = np.where(np.isfinite(values), values, 0.0)
-    rows, columns = (n // step * step for n in values.shape)
-    blocks = finite[:rows, :columns].reshape(rows // step, step, columns // step, step)
+    across, along = (min(step, n) for n in values.shape)  # a few long lines are a picture of a line each
+    rows, columns = values.shape[0] // across, values.shape[1] // along
+    blocks = finite[: rows * across, : columns * along].reshape(rows, across, columns, along)
     small = blocks.mean(axis=(1, 3))
     small = small - np.median(small, axis=1, keepdims=True)
     low, high = np.percentile(small, (1, 99))

@@ -90,6 +90,13 @@ def test_a_thumbnail_is_small_and_shows_scans_of_any_shape_and_with_holes() -> N
     assert thumbnail(np.zeros((5, 5))).shape == (5, 5)
 
 
+@pytest.mark.parametrize("shape", [(4, 512), (512, 4), (1, 300), (1, 1)])
+def test_a_few_long_lines_have_a_thumbnail_too(shape: tuple[int, int]) -> None:
+    picture = thumbnail(np.arange(float(np.prod(shape))).reshape(shape))
+    assert min(picture.shape) == 1
+    assert max(picture.shape) <= THUMBNAIL_PX
+
+
 def test_too_many_scans_are_thinned_but_not_those_that_something_happened_to() -> None:
     record = night(scans=300)
     record.add(scan_entry(scan(1), 1501 * MINUTE_NS, 1500 * MINUTE_NS, "tip_corrector"))
