@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from afspm.logic import arbitration, chronicle
+from afspm.logic.absence import Absence
 from afspm.logic.arbitration import Do, Event, Row
 from afspm.logic.cache import Cache
 from afspm.logic.chronicle import Chronicle
@@ -90,7 +91,7 @@ def no_lease(patch: Patch) -> None:
 
 
 def nobody_is_dead(patch: Patch) -> None:
-    patch.setattr(SchedulerCore, "_holder_dead_at_s", lambda self: None)
+    patch.setattr(Absence, "dead_at_s", lambda self, holder: None)
 
 
 def an_impostor_is_let_in(patch: Patch) -> None:

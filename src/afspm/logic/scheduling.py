@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
-import math
-from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from afspm.errors import AfspmError
 from afspm.logic import arbitration
+from afspm.logic.absence import Absence
 from afspm.logic.arbitration import Ask, Cause, Control, Do, Event
 from afspm.logic.bulletin import CONTROL_STATE, Bulletin
 from afspm.logic.cache import TIME_STEP_NS, Cache
+from afspm.logic.catching_up import CatchingUp
 from afspm.logic.chronicle import Chronicle
 from afspm.logic.desk import Desk, OwnEnd, reads
+from afspm.logic.ending import Ending
 from afspm.logic.events import (
     Announced,
     Codec,
@@ -42,6 +42,7 @@ from afspm.logic.events import (
     Unreadable,
 )
 from afspm.logic.frame import CoordinateFrame
+from afspm.logic.intake import Intake
 from afspm.logic.lease import Lease
 from afspm.logic.sessions import token_of
 from afspm.logic.settings import SchedulerSettings
@@ -59,7 +60,6 @@ from afspm.model import (
     ControlState,
     Feedback,
     Packet,
-    PacketHeader,
     ProbePosition,
     Problem,
     Request,
@@ -74,7 +74,6 @@ __all__ = ["CONTROL_STATE", "SchedulerCore", "SchedulerSettings"]
 
 _TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
 """Messages from which we learn what the microscope is in. All others pass unread."""
-_MOST_HELD = 1000
 
 _CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): Event.REQUEST_CONTROL,
@@ -112,22 +111,18 @@ class SchedulerCore:
         self._watchdog = Watchdog(settings.watchdog)
         self._trust = Trust(settings.malfunction_after_s)
         self._frame = frame
-        self._chronicle = chronicle = Chronicle(self._rules.problems)
-        self._bulletin = Bulletin(codec, self._cache, chronicle, self._rules.roles, self._save)
+        self._intake = Intake(self._cache, frame)
+        self._catching_up = CatchingUp(settings.catch_up_s)
+        self._chronicle = chronicle = Chronicle(settings.rules.problems)
+        self._bulletin = Bulletin(codec, self._cache, chronicle, settings.rules.roles, self._save)
         self._desk = desk = Desk(
             settings, codec, self._watchdog, self._lease, self._holder, self._save, chronicle, frame
         )
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
-        self._started_s = 0.0
-        self._announce_at_s: float | None = None
-        self._end_by_s: float | None = None
-        self._told_at_end: list[tuple[RequestIn, ControlResponse, str]] = []
+        self._absence = Absence(desk.sessions, settings.grace_s, settings.restart_grace_s)
+        self._ending = Ending(settings, desk, self._watchdog)
         self._is_restarted = False
-        self._held: deque[RequestIn] = deque()
-        self._held_due_s: float | None = None
         self._recent: list[tuple[int, int]] = []
-        self._missed_again_s = -math.inf
-        self._told: set[str] = set()
         self._holder_told: str | None = None
         self._effects: list[Effect] = []
         self._handlers: dict[type, Callable[[Any, float, int], None]] = {
@@ -153,16 +148,16 @@ class SchedulerCore:
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
         """Begin. The control state is published as soon as the translator's packets have been caught up with."""
         self._effects = self._desk.effects = []
-        self._started_s = now_s
-        self._lease.held_by(self._control.holder, now_ns)
+        self._absence.started(now_s)
+        self._lease.held_by(self.control.holder, now_ns)
         self._cache.remember(self._recent)
         self._chronicle.at(now_s, now_ns)
-        if self._control.ended:
-            self._end_soon(now_s)
+        if self.control.ended:
+            self._ending.begin(now_s)
             self._end_when_safe(now_s, now_ns)
-        else:  # first, in the order of time, what the translator published before we were there
-            self._announce_at_s = now_s + self._settings.catch_up_s
-            self._chronicle.began(self._control, again=self._is_restarted)
+        else:
+            self._catching_up.begin(now_s, again=self._is_restarted)
+            self._chronicle.began(self.control, again=self._is_restarted)
         return self._effects
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
@@ -170,9 +165,15 @@ class SchedulerCore:
         self._effects = self._desk.effects = []
         self._chronicle.at(now_s, now_ns)
         self._handlers[type(event)](event, now_s, now_ns)
-        self._held_due_s = now_s if self._held and self._announce_at_s is None else None
         self._end_when_safe(now_s, now_ns)
         return self._with_forwards()
+
+    def _end_when_safe(self, now_s: float, now_ns: int) -> None:
+        """The experiment that is over ends, once the tip is out of danger or that takes too long."""
+        if self._ending.is_due(now_s):
+            self._ending.end()
+            self._with_forwards()
+            self._effects += [*self._bulletin.entries(now_ns), Kill()]
 
     def _with_forwards(self) -> list[Effect]:
         if self._forwarder.outbox:
@@ -184,12 +185,11 @@ class SchedulerCore:
         """When, in real monotonic time, a Tick is due at the latest; None: no deadline."""
         soonest_s = self._forwarder.deadline_s()
         others_s = (
-            self._holder_dead_at_s(),
-            self._announce_at_s,
-            self._end_by_s,
+            self._absence.dead_at_s(self.control.holder),
+            self._catching_up.due_s(),
+            self._ending.by_s,
             self._desk.unclear_until_s(),
             self._desk.mover.due_s(),
-            self._held_due_s,
             self._malfunction_at_s(),
             self._entries_due_s(),
         )
@@ -206,10 +206,10 @@ class SchedulerCore:
         """What must survive a kill, but for the cache, as plain JSON."""
         return {
             "control": self._control.to_dict(),
+            "granted_to": self._granted_to,
             "last_ns": self._cache.last_ns,
             "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
-            "granted_to": self._granted_to,
             "supervisors": self._bulletin.telling.snapshot(),
             **self._desk.snapshot(),
             **({} if self._frame is None else {"frame": self._frame.snapshot()}),
@@ -223,9 +223,9 @@ class SchedulerCore:
         """
         self._is_restarted = True
         self._control = Control.from_dict(state["control"])
+        self._granted_to = state.get("granted_to")
         self._cache.not_before(int(state["last_ns"]))
         self._watchdog.restore(map(str, state["wanted"]))
-        self._granted_to = state.get("granted_to")
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
         self._bulletin.telling.restore(state.get("supervisors", {}))
         self._desk.restore(state)
@@ -248,8 +248,7 @@ class SchedulerCore:
 
     def put_off(self, until_s: float) -> None:
         """More of what was published before a restart is to come: who is in control is told after that."""
-        if self._announce_at_s is not None:
-            self._announce_at_s = max(self._announce_at_s, until_s)
+        self._catching_up.put_off(until_s)
 
     @property
     def newest_source_ns(self) -> int:
@@ -264,7 +263,7 @@ class SchedulerCore:
     @property
     def control_state(self) -> ControlState:
         """The same as all peers are told it."""
-        return self._control.published()
+        return self.control.published()
 
     # --- peers ---
 
@@ -277,8 +276,7 @@ class SchedulerCore:
             return
         if (waiting := self._desk.clear_up(name)) is not None:
             self._on_request(waiting, now_s, now_ns)
-        elif name == self._control.holder and now_s >= self._missed_again_s:
-            self._missed_again_s = now_s + self._settings.grace_s
+        elif name == self.control.holder and self._absence.is_told(now_s):
             self._log("WARNING", f"{name} is in control and gone; it has {self._settings.grace_s:g} s to come back")
 
     def _on_greeted(self, event: Greeted, now_s: float, now_ns: int) -> None:
@@ -303,39 +301,31 @@ class SchedulerCore:
     # --- requests ---
 
     def _on_request(self, event: RequestIn, now_s: float, now_ns: int) -> None:
-        name, request = event.name, event.request
         if event.heard_s < 0.0:
             event.heard_s = now_s
-        if self._is_too_early(request):
-            self._held.append(event)
+        kind = event.request.kind
+        control_event = _CONTROL_EVENTS.get(kind)
+        if control_event is not None and self._catching_up.keeps(event):
             return
         if not self._desk.take(event, now_s):
             return
-        kind = request.kind
-        control_event = _CONTROL_EVENTS.get(kind)
         if kind == TELL_REQUEST:  # a supervisor's last words come after the end
             self._follow(event, self._bulletin.told(event, now_s, now_ns))
-        elif self._control.ended:
-            self._answer_at_end(event, ControlResponse.FAILURE, HAS_ENDED)
+        elif self.control.ended:
+            self._ending.answer(event, ControlResponse.FAILURE, HAS_ENDED)
         elif kind == RESTART_REQUEST:
             self._follow(event, self._bulletin.ordered(event, now_s))
         elif kind == CLOCK_REQUEST:
             self._tell_time(event, now_ns)
         elif control_event is not None:
-            number = int(request.subject or 0)
-            self._arbitrate(Ask(control_event, name, number), event, now_s, now_ns)
+            number = int(event.request.subject or 0)
+            self._arbitrate(Ask(control_event, event.name, number), event, now_s, now_ns)
         elif kind <= 0:
             self._desk.answer(event, ControlResponse.CMD_NOT_SUPPORTED, f"there is no request with the number {kind}")
-        elif reads(request):
-            self._arbitrate(Ask(Event.READ, name), event, now_s, now_ns)
+        elif reads(event.request):
+            self._arbitrate(Ask(Event.READ, event.name), event, now_s, now_ns)
         else:
-            self._arbitrate(Ask(Event.COMMAND, name), event, now_s, now_ns)
-
-    def _is_too_early(self, request: Request) -> bool:
-        """Whether it would change control while what was published before a restart may still come again: that would
-        get a time after the change, and be taken for something new."""
-        catching_up = self._is_restarted and self._announce_at_s is not None
-        return catching_up and request.kind in _CONTROL_EVENTS and len(self._held) < _MOST_HELD
+            self._arbitrate(Ask(Event.COMMAND, event.name), event, now_s, now_ns)
 
     def _tell_time(self, event: RequestIn, now_ns: int) -> None:
         """What time it is, and how it passes: all parts of an experiment go by the scheduler's clock."""
@@ -369,37 +359,10 @@ class SchedulerCore:
         if after != before:
             had_died = None not in (token, self._granted_to) and token != self._granted_to
             self._control_changed(before, ask, row, now_s, now_ns, had_died=had_died and ask.who == before.holder)
-        has_ended = after.ended and not before.ended
-        if has_ended:
-            self._end_soon(now_s)
+        if after.ended and not before.ended:
+            self._ending.begin(now_s)
         if event is not None and row.response is not None:
-            tell = self._answer_at_end if has_ended else self._desk.answer
-            tell(event, row.response, arbitration.reason(row, before, ask, self._rules))
-
-    def _answer_at_end(self, event: RequestIn, code: ControlResponse, why: str) -> None:
-        """Who hears that it is over may leave, and the supervisor with it: not before the tip is seen to."""
-        if self._end_by_s is None:
-            self._desk.answer(event, code, why)
-        else:
-            self._told_at_end.append((event, code, why))
-
-    def _end_soon(self, now_s: float) -> None:
-        self._end_by_s = now_s + self._settings.request_timeout_s + self._settings.patience_s
-
-    def _end_when_safe(self, now_s: float, now_ns: int) -> None:
-        """The experiment that is over ends, once the tip is out of danger or that takes too long."""
-        if self._end_by_s is None or (self._watchdog.wants_retract and now_s < self._end_by_s):
-            return
-        self._end_by_s = None
-        if self._watchdog.wants_retract:
-            self._log(
-                "CRITICAL", "the experiment ends, and the tip was left in danger: the microscope did not retract it"
-            )
-        for told in self._told_at_end:
-            self._desk.answer(*told)
-        self._told_at_end.clear()
-        self._with_forwards()
-        self._effects += [*self._bulletin.entries(now_ns), Kill()]
+            self._ending.answer(event, row.response, arbitration.reason(row, before, ask, self._rules))
 
     def _control_changed(
         self, before: Control, ask: Ask, row: arbitration.Row, now_s: float, now_ns: int, *, had_died: bool
@@ -421,7 +384,7 @@ class SchedulerCore:
             by_holder = ask.who == before.holder
             in_flight = self._desk.action_in_flight()
             wanted = self._watchdog.control_taken(cause, in_flight, had_died=had_died, by_holder=by_holder)
-        publish = self._stamp_control(now_ns) if after.published() != before.published() else None
+        publish = self._stamp_control(now_s, now_ns) if after.published() != before.published() else None
         self._effects.append(self._save())
         routine = is_routine(before, after, ask, self._holder_told)
         self._log("DEBUG" if routine else "INFO", said(before, after, ask, row, self._rules))
@@ -438,34 +401,14 @@ class SchedulerCore:
         if publish is not None:
             self._effects.append(publish)
 
-    def _holder(self) -> str | None:
-        return self._control.holder
-
-    def _save(self) -> SaveState:
-        return SaveState(self.snapshot())
-
-    def _publish_control(self, now_ns: int) -> None:
-        publish = self._stamp_control(now_ns)
+    def _publish_control(self, now_s: float, now_ns: int) -> None:
+        publish = self._stamp_control(now_s, now_ns)
         self._effects += [self._save(), publish]
 
-    def _entries_due_s(self) -> float | None:
-        """When what has happened is to be published; not while what was before a restart may still come again."""
-        return None if self._announce_at_s is not None else self._chronicle.due_s
-
-    def _stamp_control(self, now_ns: int) -> Publish:
+    def _stamp_control(self, now_s: float, now_ns: int) -> Publish:
         """The control state as a packet, which has its time before it is published: that is saved first."""
-        self._announce_at_s = None
+        self._catching_up.over(now_s)
         return self._bulletin.control(self._control.published(), now_ns)
-
-    def _holder_dead_at_s(self) -> float | None:
-        """When the holder is given up, if it does not come back; None if it is there, or nobody is in control."""
-        holder = self._control.holder
-        if holder is None or self._sessions.connection_of(holder) is not None:
-            return None
-        lost_s = self._sessions.lost_since_s(holder)
-        if lost_s is None:
-            return self._started_s + self._settings.restart_grace_s
-        return lost_s + self._settings.grace_s
 
     # --- the translator ---
 
@@ -482,30 +425,17 @@ class SchedulerCore:
         self._desk.settle_all(self._forwarder.lost(), now_s, now_ns)
 
     def _on_translator_caught_up(self, event: TranslatorCaughtUp, now_s: float, now_ns: int) -> None:
-        if self._announce_at_s is not None:
-            self._publish_control(now_ns)
+        if self._catching_up.until_s is not None:
+            self._publish_control(now_s, now_ns)
 
     def _on_packet(self, event: PacketIn, now_s: float, now_ns: int) -> None:
-        message = event.header.message
-        if message == CONTROL_STATE:
-            self._tell_once("WARNING", "the translator publishes a ControlState, which is the scheduler's: dropped")
-            return
-        packet, source_ns = event.packet, event.packet.time_ns
-        if self._frame is not None:
-            packet = self._frame.incoming(packet, event.header, now_ns)
-        taken = self._take(packet, event.header, now_ns)
+        taken = self._intake.take(event.packet, event.header, now_ns)
         if taken is None:
             return
-        self._effects.append(Publish(taken[0], source_ns, taken[1]))
-        if message in _TELLING:
+        self._effects.append(taken)
+        message = event.header.message
+        if isinstance(taken, Publish) and message in _TELLING:
             self._on_telling(self._codec.decode_packet(message, event.packet.payload), now_s, now_ns)
-
-    def _take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, bool] | None:
-        try:
-            return self._cache.take(packet, header, now_ns)
-        except AfspmError as error:
-            self._tell_once("ERROR", f"{header.message} is not published: {error}")
-            return None
 
     def _on_telling(self, told: object, now_s: float, now_ns: int) -> None:
         if isinstance(told, ScopeStatus):
@@ -522,12 +452,12 @@ class SchedulerCore:
 
     def _trust_is(self, state: ScopeState, now_s: float, now_ns: int) -> None:
         self._trust.scope_is(state, now_s)
-        if not self._trust.lost and self._control.problems.get(Problem.DEVICE_MALFUNCTION) == TRANSLATOR:
+        if not self._trust.lost and self.control.problems.get(Problem.DEVICE_MALFUNCTION) == TRANSLATOR:
             self._arbitrate(Ask(Event.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
 
     def _malfunction_at_s(self) -> float | None:
         """When a problem is made of the microscope's being lost; None if it is not, or is flagged already."""
-        return None if Problem.DEVICE_MALFUNCTION in self._control.problems else self._trust.due_s()
+        return None if Problem.DEVICE_MALFUNCTION in self.control.problems else self._trust.due_s()
 
     # --- time ---
 
@@ -537,34 +467,41 @@ class SchedulerCore:
         if entries_due_s is not None and now_s >= entries_due_s:
             self._effects += self._bulletin.entries(now_ns)
 
+    def _entries_due_s(self) -> float | None:
+        """When what has happened is to be published; not while what was before a restart may still come again."""
+        return None if self._catching_up.until_s is not None else self._chronicle.due_s
+
     def _see_to_deadlines(self, now_s: float, now_ns: int) -> None:
         # one change of control in a step: it is saved and told before the next is decided
-        if self._announce_at_s is not None and now_s >= self._announce_at_s:
-            self._publish_control(now_ns)
+        announce_at_s = self._catching_up.until_s
+        if announce_at_s is not None and now_s >= announce_at_s:
+            self._publish_control(now_s, now_ns)
             return
-        if self._held and self._announce_at_s is None:
-            self._on_request(self._held.popleft(), now_s, now_ns)
+        if (kept := self._catching_up.let_in()) is not None:
+            self._on_request(kept, now_s, now_ns)
             return
         malfunction_at_s = self._malfunction_at_s()
         if malfunction_at_s is not None and now_s >= malfunction_at_s:
             self._arbitrate(Ask(Event.FLAG, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
             return
-        dead_at_s, holder = self._holder_dead_at_s(), self._control.holder
+        holder = self.control.holder
+        dead_at_s = self._absence.dead_at_s(holder)
         if holder is not None and dead_at_s is not None and now_s >= dead_at_s:
             self._arbitrate(Ask(Event.DEAD, holder), None, now_s, now_ns)
-        lease_ns, holder = self._lease.deadline_ns(), self._control.holder
+        lease_ns, holder = self._lease.deadline_ns(), self.control.holder
         if holder is not None and lease_ns is not None and now_ns >= lease_ns:
             self._arbitrate(Ask(Event.IDLE, holder), None, now_s, now_ns)
         self._desk.refuse_unclear(now_s)
         self._desk.act_when_moved(now_s, now_ns)
         self._desk.settle_all(self._forwarder.expire(now_s), now_s, now_ns)
 
-    # --- telling people ---
+    # --- what the parts ask of the whole, and telling people ---
+
+    def _holder(self) -> str | None:
+        return self.control.holder
+
+    def _save(self) -> SaveState:
+        return SaveState(self.snapshot())
 
     def _log(self, level: str, text: str) -> None:
         self._effects.append(Log(level, text))
-
-    def _tell_once(self, level: str, text: str) -> None:
-        if text not in self._told and len(self._told) < 1000:
-            self._told.add(text)
-            self._log(level, text)
