@@ -72,6 +72,10 @@ class DriftPictures(DriftTable):
         self._pairs: dict[tuple[str, str], Registration] = {}
         self._drawing_is_loaded = self._has_told = False
 
+    def on_start(self) -> None:
+        super().on_start()
+        self._heard = {one.file: one for one in self._told()}  # not only in the table, which may have to wait for room
+
     def on_tick(self) -> None:
         if not self._drawing_is_loaded and importlib.util.find_spec("matplotlib"):
             importlib.import_module(_ALBUM)  # now, when there is time: at the end all must be quick
@@ -79,8 +83,8 @@ class DriftPictures(DriftTable):
 
     def on_drift_mapping(self, message: Any) -> None:
         super().on_drift_mapping(message)
-        told = self._told()
-        newest = next(k for k, one in enumerate(told) if one.file == message.filename)
+        self._heard.setdefault(message.filename, Told(message.filename, message.correcting))
+        told, newest = list(self._heard.values()), list(self._heard).index(message.filename)
         for _, start, stop in parts(told):
             if start < newest < stop:
                 self._compared(told[start], told[newest])
@@ -186,6 +190,7 @@ class DriftPictures(DriftTable):
         raise FileError(f"has no channel {self.channel!r}", where=told.file)
 
     def _told(self) -> list[Told]:
+        """What the table says."""
         path = Path(self.run_dir) / self.file
         if not path.exists():
             return []

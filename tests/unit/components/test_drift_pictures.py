@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from runtime_lab import Lab, context_of, run
 
 from afspm import wire
+from afspm.components import records
 from afspm.components.drift_pictures import DriftPictures, Told, parts
 from afspm.components.simulated_truth import true_drift
 from afspm.drift.record import DriftRecord
@@ -115,6 +117,27 @@ def test_scans_that_can_not_be_read_are_left_out_with_a_word(tmp_path: Path, cap
     assert run(component, lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.ENDED
     assert (tmp_path / "drift_estimates_on.png").exists()
     assert len([text for text in caplog.messages if "left out" in text]) == 1
+
+
+@pytest.mark.timeout(60)
+def test_a_table_that_can_not_be_written_for_a_while_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = night(tmp_path)
+    append, can_write = records._append, [False]
+
+    def locked(path: Path, text: str) -> None:
+        if not can_write[0]:
+            raise PermissionError(errno.EACCES, "another program has it open", str(path))
+        append(path, text)
+
+    monkeypatch.setattr(records, "_append", locked)
+    lab.at(450.0, lambda: can_write.__setitem__(0, True))
+    lab.at(1500.0, lab.kill)
+    component = DriftPictures(estimator="correlation", features="correlation")
+    assert run(component, lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.ENDED
+    assert len(DriftRecord.read(tmp_path / "drift_correction.csv")) == 9
+    assert (tmp_path / "drift_estimates_on.png").exists()
 
 
 def test_a_channel_that_is_not_there_is_told_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
