@@ -120,25 +120,27 @@ class Service:
         Raises:
             Refused: PARAM_ERROR: they do not fit together, or the controller made something else of them.
         """
+        # all of a frame: setting a part of it, a controller may change the rest
         framed = FRAME if not values.keys().isdisjoint(FRAME) else ()
-        before = self._microscope.in_force({*values, *(name for name in framed if name in self._table)})
-        check_together({**before, **values}, self._table, self._microscope.max_pixels)
-        former = {name: before[name] for name in values}
+        whole = {*values, *(name for name in framed if name in self._table)}
+        before = self._microscope.in_force(whole)
+        wanted = {**before, **values}
+        check_together(wanted, self._table, self._microscope.max_pixels)
+        former = {name: value for name, value in before.items() if not self._table[name].read_only}
         about_to_act()
         try:
             self._microscope.put_in_force(values)
-            after = self._microscope.in_force(values)
+            after = self._microscope.in_force(whole)
         except LOST:
             raise
         except Exception:
             with contextlib.suppress(Exception):  # the first error is the one to tell
                 self._microscope.put_in_force(former)
             raise
-        for name, value in values.items():
-            spec = self._table[name]
-            if not spec.same(after[name], value):
+        for name, value in wanted.items():
+            if not self._microscope.same(name, after[name], value, after):
                 self._microscope.put_in_force(former)
-                made, asked = spec.quantity(after[name]), spec.quantity(value)
+                made, asked = (self._table[name].quantity(one) for one in (after[name], value))
                 raise refuse_value(name, f"the controller made {made} of {asked}; nothing was changed")
 
     def _act(self, request: Request) -> Answer:

@@ -273,6 +273,21 @@ def test_what_the_controller_makes_something_else_of_is_refused_and_put_back(ben
     assert bench.ask(PARAM, Parameter("scan-speed", "5", "um/s")).code == OK
 
 
+def test_what_follows_in_the_rest_of_the_frame_is_refused_and_put_back(bench: Any, monkeypatch: Any) -> None:
+    plain, values = bench.microscope.set, bench.microscope.values
+
+    def square(given: Any) -> None:
+        plain(given)
+        if "H" not in given and "W" in given:
+            values["H"] = given["W"]
+
+    monkeypatch.setattr(bench.microscope, "set", square)
+    response = bench.ask(PARAM, Parameter("scan-size-x", "2", "um"))
+    assert response.code == PARAM_ERROR
+    assert response.reason == "scan-size-y: the controller made 2000 nm of 500 nm; nothing was changed"
+    assert (values["W"], values["H"]) == (1000.0, 500.0)
+
+
 def test_while_scanning_only_what_disturbs_is_refused(bench: Any) -> None:
     bench.ask(ACTION, names.START_SCAN)
     assert bench.ask(ACTION, names.START_SCAN).code == NOT_FREE

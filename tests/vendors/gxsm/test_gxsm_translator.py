@@ -263,6 +263,19 @@ def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make
     assert any(dialog.startswith("Valid Range of OffsetX") for dialog in made.emulator.program.dialogs)
 
 
+def test_a_size_beyond_the_scanner_is_refused_and_the_frame_stays_where_it_is(bench: Make) -> None:
+    made = bench(reach_m=0.5e-6)
+    peer = made.start()
+    ready(peer)
+    before = made.emulator.program.frame()
+    response = peer.set(names.SCAN_SIZE_X, 1.1e-6)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "nothing was changed" in response.reason
+    after = made.emulator.program.frame()
+    assert after.center_m == pytest.approx(before.center_m, abs=1e-15), "GXSM moves the tip with the offset at once"
+    assert after.size_m == pytest.approx(before.size_m, abs=1e-15)
+
+
 def test_other_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
     made = bench()
     peer = made.start(

@@ -134,6 +134,17 @@ def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make
     assert float(peer.get(names.SCAN_TOP_LEFT_X)) == pytest.approx(TURNED.top_left_m[0], rel=1e-13)
 
 
+def test_a_size_beyond_the_scanner_is_refused_and_the_frame_stays_where_it_is(bench: Make) -> None:
+    made = bench(range_m=2e-6)
+    peer = made.start()
+    ready(peer)
+    before = made.emulator.panel.frame
+    response = peer.set(names.SCAN_SIZE_X, 3e-6)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "nothing was changed" in response.reason
+    assert made.emulator.panel.frame == pytest.approx(before, rel=1e-6)
+
+
 def test_what_is_set_is_told_to_the_last_digit_though_nanonis_keeps_a_float32(bench: Make) -> None:
     peer = bench().start()
     peer.until(FREE)
