@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from afspm.clock import ExperimentClock
-from afspm.errors import ConfigError, ExperimentEnded, FileError, NoResponse
+from afspm.errors import ConfigError, FileError, NoResponse
 from afspm.model import Frame, ProblemNames
-from afspm.record.facts import LATEST_FILE, RUN_FILE, read_facts
+from afspm.record.facts import LATEST_FILE, RUN_FILE, STATE_DIR, known_facts, read_facts
 from afspm.record.going_on import cut_off
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
@@ -57,16 +57,14 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         log=logging.getLogger(f"afspm.{name}"),
     )
     try:
-        joined = link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S))
-    except ExperimentEnded:
+        if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
+            hint = cut_off(folder) or "is the experiment still running?"
+            raise NoResponse("nobody is there", where=str(folder), hint=hint)
+        frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
+        scope = Scope(link, ProblemNames(launch.problems), folder / STATE_DIR, frame=frame)
+    except BaseException:  # Ctrl-C in a notebook, too: a connection that is left would keep the name
         port.close()
         raise
-    if not joined:
-        port.close()
-        hint = cut_off(folder) or "is the experiment still running?"
-        raise NoResponse("nobody is there", where=str(folder), hint=hint)
-    frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
-    scope = Scope(link, ProblemNames(launch.problems), folder / "state", frame=frame)
     weakref.finalize(scope, port.close)
     return scope
 
@@ -86,10 +84,9 @@ def guest_of(folder: Path, name: str) -> Launch:
         FileError: run.json can't be read.
         ConfigError: there is no scheduler to connect to.
     """
-    facts = _facts(folder)
-    if facts is None:
+    if not (folder / RUN_FILE).exists():
         raise FileError("there is no run in this folder", where=str(folder), hint="name a folder with a run.json")
-    guest = facts.get(GUEST)
+    guest = read_facts(folder).get(GUEST)
     if not isinstance(guest, dict):
         raise ConfigError(
             "this part of the experiment has no component that could be joined",
@@ -122,13 +119,13 @@ def find_run(where: Path) -> Path:
 def _newest(runs: Path, name: str, file: Path) -> Path | None:
     """The newest run of the experiment `name` in the folder `runs`."""
     name = _name_in(file) or name
-    found = [run for run in runs.glob(f"*/{RUN_FILE}") if (_facts(run.parent) or {}).get("name") == name]
+    found = [run for run in runs.glob(f"*/{RUN_FILE}") if known_facts(run.parent).get("name") == name]
     return max(found, key=_started).parent if found else None
 
 
 def _started(run: Path) -> tuple[float, int]:
     """By what the newest run is found: when its clock was set, else when its facts were written."""
-    clock = (_facts(run.parent) or {}).get("clock") or {}
+    clock = known_facts(run.parent).get("clock") or {}
     return float(clock.get("origin_s", 0.0)), run.stat().st_mtime_ns
 
 
@@ -140,7 +137,3 @@ def _name_in(file: Path) -> str | None:
     except (OSError, ValueError) as error:
         raise FileError(f"can't be read: {error}", where=str(file)) from error
     return name if isinstance(name, str) and name else None
-
-
-def _facts(folder: Path) -> dict[str, Any] | None:
-    return read_facts(folder) if (folder / RUN_FILE).exists() else None
