@@ -59,7 +59,7 @@ class Recorder(Component):
             context.clock,
             context.log,
             step=context.activity.step,
-            wake=port.wake_up,
+            wake=lambda: port.wake_up(),  # of whichever is open then
         )
         writer.start()
         until_s = math.inf

@@ -15,7 +15,7 @@ import pytest
 import afspm
 from afspm import wire
 from afspm.clock import ExperimentClock
-from afspm.components import recording
+from afspm.components import recorder, recording
 from afspm.components.recording import Writer
 from afspm.errors import FileError
 from afspm.model import ControlMode, ControlState, Packet
@@ -23,6 +23,10 @@ from afspm.record import ahead
 from afspm.record.ahead import Ahead, expect_record, recorded_until
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.store import About, Store
+from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.launch import Launch
+from afspm.runtime.process import Activity, Context
+from afspm.transport.port import Incoming, ParentGone
 
 DEADLINE_S = 20.0
 
@@ -169,6 +173,49 @@ def test_a_packet_without_a_time_gets_that_of_now(bench: Bench) -> None:
     writer.finish(ended=True)
     row = afspm.open_run(bench.folder)._query("SELECT source, time_ns > 0 FROM packets")
     assert row == [("tcp://another", 1)]
+
+
+def test_what_wakes_the_recorder_is_the_port_that_is_open_now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ports: list[_Port] = []
+    made: list[_Writer] = []
+
+    class _Port:
+        """Brings the end, to who has been woken up often enough."""
+
+        def __init__(self) -> None:
+            self.woken = 0
+            ports.append(self)
+
+        def wake_up(self) -> None:
+            self.woken += 1
+
+        def poll(self, timeout_s: float | None) -> list[Incoming]:
+            made[0].wake()
+            return [ParentGone()] if len(ports) == 2 else []
+
+        def close(self) -> None:
+            pass
+
+    class _Writer:
+        """Wants a replay at first."""
+
+        def __init__(self, *_: object, wake: Callable[[], None], **__: object) -> None:
+            self.wake = wake
+            made.append(self)
+
+        def wants_replay(self) -> bool:
+            return len(ports) == 1
+
+        start = check = finish = lambda self, **_: None
+
+    monkeypatch.setattr(recording, "Writer", _Writer)
+    clock = ExperimentClock.real()
+    log = logging.getLogger("recorder")
+    launch = Launch("recorder", run_dir=str(tmp_path))
+    context = Context(launch, clock, open_port=_Port, log=log, activity=Activity(clock))  # type: ignore[arg-type]
+    monkeypatch.setattr(recorder, "step_back", lambda: None)
+    assert recorder.Recorder().run_process(context) == ExitCode.ORPHAN
+    assert [port.woken for port in ports] == [1, 1]
 
 
 class _Disk:
