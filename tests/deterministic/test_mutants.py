@@ -11,6 +11,7 @@ import pytest
 
 from afspm.logic import arbitration, chronicle
 from afspm.logic.absence import Absence
+from afspm.logic.arbiter import Arbiter
 from afspm.logic.arbitration import Do, Event, Row
 from afspm.logic.cache import Cache
 from afspm.logic.chronicle import Chronicle
@@ -134,13 +135,13 @@ def nothing_is_called_back(patch: Patch) -> None:
 
 
 def told_before_saved(patch: Patch) -> None:
-    real = SchedulerCore._control_changed
+    real = Arbiter._follow
 
-    def changed(self: SchedulerCore, *args: Any, **named: Any) -> None:
-        real(self, *args, **named)
-        self._effects.sort(key=lambda effect: type(effect).__name__ == "SaveState")
+    def follow(self: Arbiter, *args: Any) -> None:
+        real(self, *args)
+        self._desk.effects.sort(key=lambda effect: type(effect).__name__ == "SaveState")
 
-    patch.setattr(SchedulerCore, "_control_changed", changed)
+    patch.setattr(Arbiter, "_follow", follow)
 
 
 def times_go_back(patch: Patch) -> None:

@@ -6,14 +6,14 @@ import json
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from afspm.logic import arbitration
 from afspm.logic.absence import Absence
-from afspm.logic.arbitration import Ask, Cause, Control, Do, Event
+from afspm.logic.arbiter import CONTROL_EVENTS, Arbiter, ask_of
+from afspm.logic.arbitration import Ask, Control, Event
 from afspm.logic.bulletin import CONTROL_STATE, Bulletin
 from afspm.logic.cache import TIME_STEP_NS, Cache
 from afspm.logic.catching_up import CatchingUp
 from afspm.logic.chronicle import Chronicle
-from afspm.logic.desk import Desk, OwnEnd, reads
+from afspm.logic.desk import Desk, OwnEnd
 from afspm.logic.ending import Ending
 from afspm.logic.events import (
     Announced,
@@ -44,18 +44,14 @@ from afspm.logic.events import (
 from afspm.logic.frame import CoordinateFrame
 from afspm.logic.intake import Intake
 from afspm.logic.lease import Lease
-from afspm.logic.sessions import token_of
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.trust import TRANSLATOR, Trust
 from afspm.logic.watchdog import Watchdog
-from afspm.logic.words import is_routine, said
 from afspm.model import (
     CLOCK_REQUEST,
     HAS_ENDED,
     RESTART_REQUEST,
     TELL_REQUEST,
-    ControlMode,
-    ControlRequest,
     ControlResponse,
     ControlState,
     Feedback,
@@ -74,15 +70,6 @@ __all__ = ["CONTROL_STATE", "SchedulerCore", "SchedulerSettings"]
 
 _TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
 """Messages from which we learn what the microscope is in. All others pass unread."""
-
-_CONTROL_EVENTS = {
-    int(ControlRequest.REQUEST_CTRL): Event.REQUEST_CONTROL,
-    int(ControlRequest.RELEASE_CTRL): Event.RELEASE_CONTROL,
-    int(ControlRequest.ADD_EXP_PRBLM): Event.FLAG,
-    int(ControlRequest.RMV_EXP_PRBLM): Event.CLEAR,
-    int(ControlRequest.SET_CONTROL_MODE): Event.SET_MODE,
-    int(ControlRequest.END_EXPERIMENT): Event.END,
-}
 
 
 class SchedulerCore:
@@ -103,9 +90,6 @@ class SchedulerCore:
     def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame | None = None) -> None:
         self._settings = settings
         self._codec = codec
-        self._rules = settings.rules
-        self._control = Control()
-        self._granted_to: str | None = None  # the token of the life that got control
         self._cache = Cache(settings.envelopes, settings.cache_bytes)
         self._lease = Lease(None if settings.lease_s is None else round(settings.lease_s * 1e9))
         self._watchdog = Watchdog(settings.watchdog)
@@ -121,9 +105,12 @@ class SchedulerCore:
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
         self._absence = Absence(desk.sessions, settings.grace_s, settings.restart_grace_s)
         self._ending = Ending(settings, desk, self._watchdog)
+        self._arbiter = Arbiter(
+            settings.rules, desk, self._bulletin, chronicle, self._watchdog, self._lease,
+            self._catching_up, self._ending, self._save,
+        )  # fmt: skip
         self._is_restarted = False
         self._recent: list[tuple[int, int]] = []
-        self._holder_told: str | None = None
         self._effects: list[Effect] = []
         self._handlers: dict[type, Callable[[Any, float, int], None]] = {
             RequestIn: self._on_request,
@@ -205,8 +192,7 @@ class SchedulerCore:
     def snapshot(self) -> dict[str, Any]:
         """What must survive a kill, but for the cache, as plain JSON."""
         return {
-            "control": self._control.to_dict(),
-            "granted_to": self._granted_to,
+            **self._arbiter.snapshot(),
             "last_ns": self._cache.last_ns,
             "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
@@ -222,8 +208,7 @@ class SchedulerCore:
             KeyError, TypeError, ValueError: it is not what `snapshot` writes.
         """
         self._is_restarted = True
-        self._control = Control.from_dict(state["control"])
-        self._granted_to = state.get("granted_to")
+        self._arbiter.restore(state)
         self._cache.not_before(int(state["last_ns"]))
         self._watchdog.restore(map(str, state["wanted"]))
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
@@ -258,7 +243,7 @@ class SchedulerCore:
     @property
     def control(self) -> Control:
         """Who is in control, for what, and who flagged which problem."""
-        return self._control
+        return self._arbiter.control
 
     @property
     def control_state(self) -> ControlState:
@@ -284,11 +269,11 @@ class SchedulerCore:
             self._sessions.hear(event.connection, event.name, None, now_s)
 
     def _on_died(self, event: ComponentDied, now_s: float, now_ns: int) -> None:
-        self._arbitrate(Ask(Event.DEAD, event.name), None, now_s, now_ns)
+        self._arbiter.decide(Ask(Event.DEAD, event.name), None, now_s, now_ns)
 
     def _on_problem(self, event: ProblemSeen, now_s: float, now_ns: int) -> None:
         what = Event.FLAG if event.flagged else Event.CLEAR
-        self._arbitrate(Ask(what, event.name, event.problem), None, now_s, now_ns)
+        self._arbiter.decide(Ask(what, event.name, event.problem), None, now_s, now_ns)
 
     def _on_announced(self, event: Announced, now_s: float, now_ns: int) -> None:
         # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
@@ -304,8 +289,7 @@ class SchedulerCore:
         if event.heard_s < 0.0:
             event.heard_s = now_s
         kind = event.request.kind
-        control_event = _CONTROL_EVENTS.get(kind)
-        if control_event is not None and self._catching_up.keeps(event):
+        if kind in CONTROL_EVENTS and self._catching_up.keeps(event):
             return
         if not self._desk.take(event, now_s):
             return
@@ -317,15 +301,10 @@ class SchedulerCore:
             self._follow(event, self._bulletin.ordered(event, now_s))
         elif kind == CLOCK_REQUEST:
             self._tell_time(event, now_ns)
-        elif control_event is not None:
-            number = int(event.request.subject or 0)
-            self._arbitrate(Ask(control_event, event.name, number), event, now_s, now_ns)
         elif kind <= 0:
             self._desk.answer(event, ControlResponse.CMD_NOT_SUPPORTED, f"there is no request with the number {kind}")
-        elif reads(event.request):
-            self._arbitrate(Ask(Event.READ, event.name), event, now_s, now_ns)
         else:
-            self._arbitrate(Ask(Event.COMMAND, event.name), event, now_s, now_ns)
+            self._arbiter.decide(ask_of(event.name, event.request), event, now_s, now_ns)
 
     def _tell_time(self, event: RequestIn, now_ns: int) -> None:
         """What time it is, and how it passes: all parts of an experiment go by the scheduler's clock."""
@@ -341,74 +320,6 @@ class SchedulerCore:
         effects, response = outcome
         self._effects += effects
         self._desk.answer(event, ControlResponse(response.code), response.reason, response.payload)
-
-    # --- control ---
-
-    def _arbitrate(self, ask: Ask, event: RequestIn | None, now_s: float, now_ns: int) -> None:
-        """Apply the table; `event` is the request to be answered, if somebody asked."""
-        before = self._control
-        row = arbitration.row_for(before, ask, self._rules)
-        if Do.FORWARD in row.do:
-            assert event is not None
-            self._desk.forward(event, now_s, now_ns, command=ask.event is Event.COMMAND)
-            return
-        self._control = after = arbitration.apply(row, before, ask)
-        token = None if event is None else token_of(ask.who, event.request.id)
-        if before.holder is None and after.holder is not None:
-            self._granted_to = token
-        if after != before:
-            had_died = None not in (token, self._granted_to) and token != self._granted_to
-            self._control_changed(before, ask, row, now_s, now_ns, had_died=had_died and ask.who == before.holder)
-        if after.ended and not before.ended:
-            self._ending.begin(now_s)
-        if event is not None and row.response is not None:
-            self._ending.answer(event, row.response, arbitration.reason(row, before, ask, self._rules))
-
-    def _control_changed(
-        self, before: Control, ask: Ask, row: arbitration.Row, now_s: float, now_ns: int, *, had_died: bool
-    ) -> None:
-        """Save, act and tell, in this order, before whoever asked is answered.
-
-        Args:
-            had_died: `ask` is of a holder in another life than that in which it got control.
-        """
-        after = self._control
-        self._chronicle.changed(before, after, ask, row)
-        self._lease.held_by(after.holder, now_ns)
-        # a person at the microscope sees to it also when the experiment ends
-        cause = Cause.ENDED if after.ended and before.mode is not ControlMode.MANUAL else row.cause
-        wanted: list[str] = []
-        if cause is not None and (before.holder is not None or cause in (Cause.MANUAL, Cause.ENDED)):
-            if self._desk.switches_feedback_off():
-                self._watchdog.feedback_is(Feedback(on=False))
-            by_holder = ask.who == before.holder
-            in_flight = self._desk.action_in_flight()
-            wanted = self._watchdog.control_taken(cause, in_flight, had_died=had_died, by_holder=by_holder)
-        publish = self._stamp_control(now_s, now_ns) if after.published() != before.published() else None
-        self._effects.append(self._save())
-        routine = is_routine(before, after, ask, self._holder_told)
-        self._log("DEBUG" if routine else "INFO", said(before, after, ask, row, self._rules))
-        self._holder_told = after.holder or self._holder_told
-        for action in wanted:
-            why = f"{before.holder} had died in control" if had_died else cause.value if cause else ""
-            self._log("WARNING", f"{action} is sent to the microscope, since {why}")
-        if cause is not None and (danger := self._watchdog.left_in_danger()) is not None:
-            expected = cause in (Cause.RELEASED, Cause.SOLVED, Cause.MANUAL)
-            self._log("WARNING" if expected else "CRITICAL", f"{danger}, and nobody looks after it: {cause.value}")
-        if before.holder is not None and after.holder is None:
-            self._desk.call_back(before.holder, row.cause)
-        self._desk.errands.send(now_s)
-        if publish is not None:
-            self._effects.append(publish)
-
-    def _publish_control(self, now_s: float, now_ns: int) -> None:
-        publish = self._stamp_control(now_s, now_ns)
-        self._effects += [self._save(), publish]
-
-    def _stamp_control(self, now_s: float, now_ns: int) -> Publish:
-        """The control state as a packet, which has its time before it is published: that is saved first."""
-        self._catching_up.over(now_s)
-        return self._bulletin.control(self._control.published(), now_ns)
 
     # --- the translator ---
 
@@ -426,7 +337,7 @@ class SchedulerCore:
 
     def _on_translator_caught_up(self, event: TranslatorCaughtUp, now_s: float, now_ns: int) -> None:
         if self._catching_up.until_s is not None:
-            self._publish_control(now_s, now_ns)
+            self._arbiter.publish(now_s, now_ns)
 
     def _on_packet(self, event: PacketIn, now_s: float, now_ns: int) -> None:
         taken = self._intake.take(event.packet, event.header, now_ns)
@@ -453,7 +364,7 @@ class SchedulerCore:
     def _trust_is(self, state: ScopeState, now_s: float, now_ns: int) -> None:
         self._trust.scope_is(state, now_s)
         if not self._trust.lost and self.control.problems.get(Problem.DEVICE_MALFUNCTION) == TRANSLATOR:
-            self._arbitrate(Ask(Event.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
+            self._arbiter.decide(Ask(Event.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
 
     def _malfunction_at_s(self) -> float | None:
         """When a problem is made of the microscope's being lost; None if it is not, or is flagged already."""
@@ -475,22 +386,22 @@ class SchedulerCore:
         # one change of control in a step: it is saved and told before the next is decided
         announce_at_s = self._catching_up.until_s
         if announce_at_s is not None and now_s >= announce_at_s:
-            self._publish_control(now_s, now_ns)
+            self._arbiter.publish(now_s, now_ns)
             return
         if (kept := self._catching_up.let_in()) is not None:
             self._on_request(kept, now_s, now_ns)
             return
         malfunction_at_s = self._malfunction_at_s()
         if malfunction_at_s is not None and now_s >= malfunction_at_s:
-            self._arbitrate(Ask(Event.FLAG, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
+            self._arbiter.decide(Ask(Event.FLAG, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
             return
         holder = self.control.holder
         dead_at_s = self._absence.dead_at_s(holder)
         if holder is not None and dead_at_s is not None and now_s >= dead_at_s:
-            self._arbitrate(Ask(Event.DEAD, holder), None, now_s, now_ns)
+            self._arbiter.decide(Ask(Event.DEAD, holder), None, now_s, now_ns)
         lease_ns, holder = self._lease.deadline_ns(), self.control.holder
         if holder is not None and lease_ns is not None and now_ns >= lease_ns:
-            self._arbitrate(Ask(Event.IDLE, holder), None, now_s, now_ns)
+            self._arbiter.decide(Ask(Event.IDLE, holder), None, now_s, now_ns)
         self._desk.refuse_unclear(now_s)
         self._desk.act_when_moved(now_s, now_ns)
         self._desk.settle_all(self._forwarder.expire(now_s), now_s, now_ns)
