@@ -66,6 +66,12 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
     """
     folder = Path(folder)
     secret_file = folder / "private" / f"{_checked(name)}.key_secret"
+    if not secret_file.exists() and (folder / "public" / f"{name}.key").exists():
+        raise ConfigError(
+            f"the secret key of {name!r} is not here, only the public one",
+            where=str(secret_file),
+            hint=f"copy it from where it was made; if it is lost, delete public/{name}.key everywhere and make another",
+        )
     entries = _read(secret_file, name)
     if "secret-key" not in entries:
         raise ConfigError("there is no secret key in this file", where=str(secret_file))
@@ -93,7 +99,11 @@ def from_launch(name: str, entries: Mapping[str, str] | None) -> Keys | None:
 def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
     """Make a key pair for each of `names` that has none yet; returns the files written.
 
-    Existing keys are left alone: a new component joins without the others being told anew.
+    Existing keys are left alone: a new component joins without the others being told anew. A public key alone is that
+    of a process on another computer; where it got lost, it is in the file of the secret one.
+
+    Raises:
+        ConfigError: a name that no file can have, or a file that is no certificate.
     """
     folder = Path(folder)
     written = []
@@ -102,12 +112,16 @@ def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
     for name in names:
         public_file = folder / "public" / f"{_checked(name)}.key"
         secret_file = folder / "private" / f"{name}.key_secret"
-        if secret_file.exists() and public_file.exists():
+        if public_file.exists():
             continue
-        public, secret = zmq.curve_keypair()
-        _write(secret_file, {"public-key": public, "secret-key": secret}, mode=0o600)
+        if secret_file.exists():
+            public = _read(secret_file, name)["public-key"]
+        else:
+            public, secret = zmq.curve_keypair()
+            _write(secret_file, {"public-key": public, "secret-key": secret}, mode=0o600)
+            written.append(secret_file)
         _write(public_file, {"public-key": public}, mode=0o644)
-        written += [public_file, secret_file]
+        written.append(public_file)
     return written
 
 

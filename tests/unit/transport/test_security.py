@@ -65,13 +65,34 @@ def test_generated_keys_are_kept_and_secrets_are_for_the_owner_only(tmp_path: Pa
         "Experiment.key", "Experiment.key_secret", "Tip Corrector.key", "Tip Corrector.key_secret",
     }  # fmt: skip
     before = keys.load(tmp_path, "Experiment")
-    assert [f.name for f in keys.generate(tmp_path, ["Experiment", "New"])] == ["New.key", "New.key_secret"]
+    assert [f.name for f in keys.generate(tmp_path, ["Experiment", "New"])] == ["New.key_secret", "New.key"]
     assert keys.load(tmp_path, "Experiment").secret == before.secret
     assert before.peers[before.public] == "Experiment"
     if sys.platform != "win32":
         secret = tmp_path / "private" / "Experiment.key_secret"
         assert stat.S_IMODE(secret.stat().st_mode) == 0o600
     assert before.secret.decode() not in repr(before)
+
+
+def test_the_public_key_of_a_process_elsewhere_is_left_alone(tmp_path: Path) -> None:
+    keys.generate(tmp_path, ["here", "elsewhere"])
+    (tmp_path / "private" / "elsewhere.key_secret").unlink()  # as on the computer that public/ was copied to
+    before = keys.public_keys(tmp_path, "here")
+    assert [file.name for file in keys.generate(tmp_path, ["here", "elsewhere", "new"])] == [
+        "new.key_secret",
+        "new.key",
+    ]
+    assert before.items() <= keys.public_keys(tmp_path, "here").items()
+    with pytest.raises(ConfigError, match="only the public one"):
+        keys.load(tmp_path, "elsewhere")
+
+
+def test_a_public_key_that_got_lost_is_the_same_again(tmp_path: Path) -> None:
+    keys.generate(tmp_path, ["A"])
+    before = keys.load(tmp_path, "A")
+    (tmp_path / "public" / "A.key").unlink()
+    assert [file.name for file in keys.generate(tmp_path, ["A"])] == ["A.key"]
+    assert keys.load(tmp_path, "A") == before
 
 
 @pytest.mark.parametrize("name", ["../evil", "", "a/b", ".hidden", "x" * 200])
