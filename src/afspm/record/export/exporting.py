@@ -82,10 +82,12 @@ def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
         if match is None:
             raise InvalidValue(f"{part!r} is no number of a scan", hint="e.g. 3, 1-5,8 or 7-")
         first = int(match[1])
-        wanted += range(first, int(match[3] or last) + 1) if match[2] else [first]
-    missing = [number for number in wanted if number not in by_number]
-    if missing or not wanted:
-        raise InvalidValue(f"there is no scan {missing[0] if missing else numbers}", hint=f"there are 1 to {last}")
+        until = int(match[3] or last) if match[2] else first
+        if first not in by_number or until not in by_number or until < first:
+            raise InvalidValue(f"there is no scan {part.strip()}", hint=f"there are 1 to {last}")
+        wanted += range(first, until + 1)
+    if missing := [number for number in wanted if number not in by_number]:
+        raise InvalidValue(f"there is no scan {missing[0]}", hint=f"there are 1 to {last}")
     return [by_number[number] for number in dict.fromkeys(wanted)]
 
 
