@@ -45,6 +45,7 @@ CREATE INDEX IF NOT EXISTS entries_by_time ON entries (time_ns);
 CREATE TABLE IF NOT EXISTS processes (
   time_ns INTEGER NOT NULL, name TEXT NOT NULL, role TEXT NOT NULL, condition INTEGER NOT NULL,
   since_ns INTEGER NOT NULL, starts INTEGER NOT NULL, pid INTEGER NOT NULL, last_exit TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS processes_by_name ON processes (name);
 CREATE TABLE IF NOT EXISTS log (
   time_ns INTEGER NOT NULL, name TEXT NOT NULL, level TEXT NOT NULL, text TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS log_by_time ON log (time_ns);

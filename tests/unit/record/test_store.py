@@ -29,7 +29,7 @@ from afspm.model import (
     ProcessStates,
     ScopeState,
 )
-from afspm.record.store import About, Store
+from afspm.record.store import _PROCESS, About, Store
 
 
 def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(night: Night, store: Store, tmp_path: Path) -> None:
@@ -327,6 +327,11 @@ def test_requests_processes_and_log_lines_have_their_tables(night: Night, store:
     assert [row.starts for row in run.processes] == [1, 2]
     assert [(row.name, row.starts, row.last_exit) for row in run.restarts] == [("series", 2, "killed by SIGKILL")]
     assert [line.text for line in run.log] == ["scan 1 of 3"]
+
+
+def test_whether_a_process_has_changed_is_not_looked_for_in_the_whole_night(store: Store) -> None:
+    ((*_, plan),) = store._journal.execute(f"EXPLAIN QUERY PLAN {_PROCESS}", ("series",)).fetchall()
+    assert "processes_by_name" in plan
 
 
 def test_only_one_transaction_is_written_at_a_time_and_readers_never_wait(
