@@ -24,6 +24,8 @@ from afspm.record.facts import name_in
 from afspm.runtime.component import Component
 from afspm.units import Duration
 
+MOST_TOLD = 1000
+"""So much is remembered as told; a component that says something else each time must not fill the memory."""
 LAST_TRIES = 2  # the end of the experiment does not wait for more
 SUPERVISOR = "afspm"  # as which it writes in the log: what it says there is told of as given up, and as the end
 
@@ -118,7 +120,7 @@ class Notifier(Component):
         notice = Notice(what, name_in(run, run.name), str(run), self.clock.now_ns(), text, self.simulated)
         new = [{"notice": dict(vars(notice)), "way": way, "tries": 0} for way in self.targets.ways]
         self.memory["waiting"] = [*self.memory["waiting"], *new][-MOST_WAITING:]
-        self.memory["told"] = [*self.memory["told"], key]
+        self.memory["told"] = [*self.memory["told"], key][-MOST_TOLD:]
         self.memory.save()
 
     def _deliver_what_is_due(self) -> None:

@@ -14,7 +14,7 @@ import pytest
 from runtime_lab import FakeClock
 
 from afspm import model
-from afspm.components import notices
+from afspm.components import notices, notifier
 from afspm.components.notices import NotDelivered, Notice, Targets
 from afspm.components.notifier import Notifier
 from afspm.errors import ConfigError
@@ -148,6 +148,16 @@ def test_what_is_critical_is_told_once(tmp_path: Path, hook: Hook) -> None:
     night.passes(60)
     (told,) = hook.got
     assert (told["what"], told["text"]) == ("critical", f"recorder: {full[2]}")
+
+
+def test_a_component_that_says_something_else_each_time_does_not_fill_the_memory(
+    tmp_path: Path, hook: Hook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(notifier, "MOST_TOLD", 3)
+    night = Night(tmp_path, webhook=hook.url)
+    for number in range(5):
+        night.says(("microscope", "CRITICAL", f"{number} K in the cryostat"))
+    assert [key.split()[2] for key in night.notifier.memory["told"]] == ["2", "3", "4"]
 
 
 def test_what_is_critical_to_the_supervisor_is_told_as_what_it_is(tmp_path: Path, hook: Hook) -> None:
