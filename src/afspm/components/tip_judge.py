@@ -287,14 +287,13 @@ class TipJudge:
 
     def _faults_anywhere(self, reference: Reference, seen: TipMetrics) -> list[tuple[float, str]]:
         usual, tolerance = reference.usual_anywhere(), self.tolerance
-        left = seen.detail / usual.detail
-        worn = f"worn: {left:.0%} of the first scans' fine detail is left"
-        faults = [((1.0 - left) / (1.0 - tolerance.worn), worn)]
+        now = _relative(seen, usual)
+        worn = f"worn: {now.detail:.0%} of the first scans' fine detail is left"
+        faults = [((1.0 - now.detail) / (1.0 - tolerance.worn), worn)]
         if usual.unrest_m > 0.0:  # else no retrace is recorded
-            factor = seen.unrest_m / usual.unrest_m
             limit = 1.0 + max(tolerance.unrest - 1.0, tolerance.sigmas * reference.spread("unrest_m"))
             what = f"{seen.unrest_m * 1e9:.2f} nm instead of {usual.unrest_m * 1e9:.2f} nm"
-            faults.append(((factor - 1.0) / (limit - 1.0), f"unsteady: trace and retrace disagree by {what}"))
+            faults.append(((now.unrest_m - 1.0) / (limit - 1.0), f"unsteady: trace and retrace disagree by {what}"))
         return faults
 
     def _faults_here(self, reference: Reference, place: Place, seen: TipMetrics) -> list[tuple[float, str]]:
@@ -345,10 +344,10 @@ class Counter:
 
 
 def _relative(seen: TipMetrics, usual: TipMetrics) -> TipMetrics:
+    """Detail and unrest as parts of the usual ones, 1 where there is usually none; ghost and contrast as they are."""
     unrest = seen.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
     return TipMetrics(seen.detail / usual.detail if usual.detail > 0 else 1.0, seen.ghost, unrest, seen.contrast)
 
 
 def _summary(seen: TipMetrics, usual: TipMetrics) -> str:
-    detail = seen.detail / usual.detail if usual.detail > 0 else 1.0
-    return f"detail {detail:.0%}, ghost {seen.ghost:.2f}, unrest {seen.unrest_m * 1e9:.2f} nm"
+    return f"detail {_relative(seen, usual).detail:.0%}, ghost {seen.ghost:.2f}, unrest {seen.unrest_m * 1e9:.2f} nm"

@@ -82,6 +82,15 @@ def test_what_was_learnt_survives_a_restart() -> None:
         assert (before.opinion, before.why) == (after.opinion, after.why)
 
 
+def test_a_sample_so_smooth_that_its_first_scans_had_no_fine_detail_is_judged_by_the_rest() -> None:
+    judge, left, _ = learnt(1, "blunt")
+    state = judge.state()
+    for seen in (*state["reference"]["first"], *(place["usual"] for place in state["reference"]["places"])):
+        seen["detail"] = 0.0
+    judge.restore(state)
+    assert judged(judge, left[0]).opinion is Opinion.GOOD
+
+
 def test_without_a_retrace_a_double_tip_is_still_seen() -> None:
     pairs = channels(1, "double", 5)
     judge = TipJudge(LEARN)
