@@ -261,8 +261,17 @@ class Microscope(ABC):
         }
 
     def put_in_force(self, values: Mapping[str, Value]) -> None:
-        """`write` these, and remember them."""
-        self.write(values)
+        """`write` these, and remember them.
+
+        Feedback is switched on after all else is written, and off before: it is not to act on what was there before.
+        """
+        rest = {name: value for name, value in values.items() if name != names.FEEDBACK_ON}
+        parts = [rest] if rest else []
+        if names.FEEDBACK_ON in values:
+            on = values[names.FEEDBACK_ON]
+            parts.insert(len(parts) if on else 0, {names.FEEDBACK_ON: on})
+        for part in parts:
+            self.write(part)
         self._told.update(values)
 
     def own_actions(self) -> dict[str, Action]:

@@ -186,6 +186,19 @@ def test_feedback_is_switched_off_and_told(bench: Any) -> None:
     assert bench.microscope.values["Loop"] is True
 
 
+def test_feedback_goes_on_after_all_else_and_off_before(bench: Any, monkeypatch: Any) -> None:
+    plain, order = bench.microscope.set, []
+
+    def noted(given: Any) -> None:
+        order.append(set(given))
+        plain(given)
+
+    monkeypatch.setattr(bench.microscope, "set", noted)
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5)).code == OK
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).code == OK
+    assert order == [{"Loop"}, {"Setpoint"}, {"Setpoint"}, {"Loop"}]
+
+
 def test_a_gain_sent_as_float32_is_the_number_that_was_meant(bench: Any) -> None:
     assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(proportional_gain=0.1)).code == OK
     assert bench.microscope.values["P"] == 0.1

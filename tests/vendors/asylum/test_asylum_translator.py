@@ -230,6 +230,36 @@ def test_feedback_is_set_and_switched(bench: Make) -> None:
     assert peer.get(names.FEEDBACK_ON) == "true"
 
 
+def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench()
+    peer = made.start()
+    peer.until(FREE)
+    assert peer.set(names.FEEDBACK_ON, False).ok
+    controller, engaged_with = made.emulator.controller, []
+    plain = controller.engage
+
+    def engage() -> None:
+        engaged_with.append(controller.values.get("AmplitudeSetpointVolts"))
+        plain()
+
+    monkeypatch.setattr(controller, "engage", engage)
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(True, 0.5, 20.0, 0.625)).ok
+    assert engaged_with == [0.625], "with the setpoint of before the tip may crash"
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).ok
+    assert engaged_with == [0.625], "it is on: nobody presses Engage again"
+
+
+def test_switching_feedback_on_waits_until_the_tip_is_there(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = made.start(reply_timeout_s=5.0)
+    peer.until(FREE)
+    assert peer.act(names.RETRACT).ok
+    peer.until(FREE)
+    response = peer.set(names.FEEDBACK_ON, True)
+    assert response.ok, response.reason
+    assert made.emulator.rig.engaged
+
+
 def test_a_row_of_the_table_can_name_another_value_or_a_text(bench: Make) -> None:
     made = bench()
     rows = {

@@ -197,6 +197,24 @@ def test_feedback_is_set_switched_off_and_on(bench: Make) -> None:
     assert "I = P / T" in response.reason
 
 
+def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    panel, switched_with = made.emulator.panel, []
+    plain = panel.set_z_controller
+
+    def switch(now_s: float, *, on: bool, **settings: float) -> None:
+        switched_with.append((on, panel.rig.feedback.setpoint))
+        plain(now_s, on=on, **settings)
+
+    assert peer.set(names.ZCTRL_SETPOINT, 0.25).ok
+    monkeypatch.setattr(panel, "set_z_controller", switch)
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5)).ok
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).ok
+    assert switched_with == [(False, 0.25), (True, 0.75)]
+
+
 def test_the_probe_moves_at_its_speed_and_a_scan_does_not_tell_where_it_leads_it(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()

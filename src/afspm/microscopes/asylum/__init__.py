@@ -147,8 +147,8 @@ class Asylum(Microscope):
         place: dict[str, Value] = {name: left.pop(name) for name in POSITION if name in left}
         if place:
             self._send_probe(place)
-        if FEEDBACK_ON in left and not self._igor.do("AfspmFeedback", int(bool(left.pop(FEEDBACK_ON)))):
-            raise Refused(ControlResponse.PARAM_ERROR, "Asylum could not switch the feedback")
+        if FEEDBACK_ON in left:
+            self._switch_feedback(on=bool(left.pop(FEEDBACK_ON)))
         super().write(left)
 
     def get(self, vendor: str) -> Value:
@@ -167,6 +167,16 @@ class Asylum(Microscope):
         values = self._igor.values([self.table[name].vendor for name in numbers]) if numbers else {}
         found = {name: self.table[name].from_vendor(values[self.table[name].vendor]) for name in numbers}
         return found | super().read([name for name in wanted if name not in found])
+
+    def _switch_feedback(self, *, on: bool) -> None:
+        """If it is otherwise; until that is seen, as the tip may have a way to go."""
+        if self._igor.feedback_on() is on:
+            return
+        if not self._igor.do("AfspmFeedback", int(on)):
+            raise Refused(ControlResponse.PARAM_ERROR, "Asylum could not switch the feedback")
+        until_s = self.clock.monotonic_s() + self._reply_timeout_s
+        while self._igor.feedback_on() is not on and self.clock.monotonic_s() < until_s:
+            pass  # each question takes as long as Igor takes to answer it
 
     def _frame_in_force(self) -> Region:
         return frame(self.in_force(FRAME))[0]
