@@ -6,11 +6,12 @@ import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from afspm.clock import NS_PER_S
 from afspm.dashboard.curves import drift_html
 from afspm.dashboard.sample_map import MapContent, map_html
 from afspm.dashboard.time_line import NOT_HEARD_OF, time_line_html
 from afspm.dashboard.watch import OLD_AFTER_S, Watch
-from afspm.dashboard.words import NS_PER_S, colour_class, date_and_clock, escape, position
+from afspm.dashboard.words import colour_class, date_and_clock, escape, position
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
 from afspm.model.words import lasting, time_of_day
 from afspm.record.overview import OVER, Overview

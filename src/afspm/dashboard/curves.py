@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from afspm.clock import NS_PER_S
 from afspm.dashboard.plots import Array, Axis, Curve, plot
 from afspm.dashboard.time_line import time_ticks
-from afspm.dashboard.words import NS_PER_S, escape, position, quantity
+from afspm.dashboard.words import escape, position, quantity
 from afspm.model import Spectrum
 from afspm.model.words import time_of_day
 from afspm.record.overview import DriftPoint

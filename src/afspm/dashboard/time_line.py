@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from afspm.dashboard.words import NS_PER_S, colour_class, escape
+from afspm.clock import NS_PER_S
+from afspm.dashboard.words import colour_class, escape
 from afspm.model.words import lasting, time_of_day
 from afspm.record.overview import Lane, Overview, Span
 

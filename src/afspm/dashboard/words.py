@@ -6,9 +6,9 @@ import html
 import math
 from datetime import datetime
 
+from afspm.clock import NS_PER_S
 from afspm.model import words
 
-NS_PER_S = 1_000_000_000
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
              (1e-12, "p"), (1e-15, "f"))  # fmt: skip
 PREFIXABLE = frozenset({"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "Pa", "Ohm", "Ω", "T", "g"})

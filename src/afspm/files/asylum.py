@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.clock import NS_PER_S
 from afspm.errors import FileError
 from afspm.files import igor
 from afspm.files.content import FileContent
-from afspm.files.times import NS_PER_S, clock_ns
+from afspm.files.times import clock_ns
 from afspm.model import Region, Scan, Spectrum
 
 Note = Mapping[str, Any]

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.clock import NS_PER_S
 from afspm.errors import FileError
 from afspm.files import hdf5, netcdf, simulator
 from afspm.files.content import FileContent
-from afspm.files.times import NS_PER_S
 from afspm.model import Region, Scan
 from afspm.units import convert
 

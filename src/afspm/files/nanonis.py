@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from afspm.clock import NS_PER_S
 from afspm.errors import FileError
 from afspm.files.content import FileContent
-from afspm.files.times import NS_PER_S, local_ns
+from afspm.files.times import local_ns
 from afspm.model import Region, Scan
 
 CONTROLLER = "Nanonis"

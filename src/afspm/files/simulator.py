@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from afspm.clock import NS_PER_S
 from afspm.errors import FileError
 from afspm.files.content import FileContent
 from afspm.files.netcdf import File
-from afspm.files.times import NS_PER_S
 from afspm.model import Region, Scan, Spectrum, names
 
 CONTROLLER = "afspm simulator"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from datetime import datetime, tzinfo
 
-NS_PER_S = 1_000_000_000
-
 
 def local_ns(text: str, layout: str, zone: tzinfo | None) -> int:
     """Of a date and time of the controller's clock, ns since the Unix epoch.

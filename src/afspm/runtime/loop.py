@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from afspm import wire
-from afspm.clock import Clock
+from afspm.clock import NS_PER_S, Clock
 from afspm.errors import ConfigError, ExperimentEnded
 from afspm.model import Frame, Packet
 from afspm.runtime import failure
@@ -21,7 +21,6 @@ from afspm.runtime.process import Context
 from afspm.runtime.scope import Scope
 from afspm.runtime.stopping import StopRequested
 
-NS_PER_S = 1_000_000_000
 AFTER_THE_END_S = 30.0  # to handle what came before it
 AFTER_A_STOP_S = 0.5  # whoever stops us kills us soon
 AT_ONCE = 16  # packets handled before the port is looked at again: a KILL must not wait for a long backlog

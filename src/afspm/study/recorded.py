@@ -6,12 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from afspm.clock import NS_PER_S
 from afspm.drift.registration import DriftScan
 from afspm.errors import InvalidValue
 from afspm.files import FileContent
 from afspm.model import Scan
-
-NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,21 @@ import math
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from afspm import model
+from afspm.clock import NS_PER_S
 from afspm.errors import InvalidValue
 from afspm.units import convert
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
 LENGTH_UNIT = "m"
 ANGLE_UNIT = "deg"
-_NS = 1_000_000_000
 
 
 def timestamp(time_ns: int) -> Timestamp:
-    return Timestamp(seconds=time_ns // _NS, nanos=time_ns % _NS)
+    return Timestamp(seconds=time_ns // NS_PER_S, nanos=time_ns % NS_PER_S)
 
 
 def time_ns(stamp: Timestamp) -> int:
-    return int(stamp.seconds) * _NS + stamp.nanos
+    return int(stamp.seconds) * NS_PER_S + stamp.nanos
 
 
 def spatial_to_wire(region: model.Region | model.RegionChange) -> scan_pb2.SpatialAspects:

@@ -36,12 +36,10 @@ CLOSING: Final = b"\x01"
 LONGEST_ID = 200
 LONGEST_ENVELOPE = 1000
 
-_NS = 1_000_000_000
-
 
 def encode_time(time_ns: int) -> bytes:
     """The third frame of a packet: a serialised google.protobuf.Timestamp."""
-    return Timestamp(seconds=time_ns // _NS, nanos=time_ns % _NS).SerializeToString()
+    return convert.timestamp(time_ns).SerializeToString()
 
 
 def decode_time(frame: Buffer) -> int:
@@ -54,7 +52,7 @@ def decode_time(frame: Buffer) -> int:
         stamp = Timestamp.FromString(bytes(frame))
     except DecodeError as error:
         raise WireError(f"the bytes are no Timestamp: {error}") from None
-    return stamp.seconds * _NS + stamp.nanos
+    return convert.time_ns(stamp)
 
 
 def encode_packet(packet: Packet) -> list[Buffer]:
