@@ -327,6 +327,24 @@ def test_the_controller_and_a_base_name_of_ones_own(bench: Make) -> None:
     assert Path(scanned(peer)["HeightTrace"].filename).name == "Tuesday0000.ibw"
 
 
+@pytest.mark.parametrize("without", [(), ("archecksuffix",)])
+def test_a_base_name_of_another_night_overwrites_nothing(
+    bench: Make, monkeypatch: pytest.MonkeyPatch, without: tuple[str, ...]
+) -> None:
+    """ARCheckSuffix finds the next number that is free; a release without it would begin with 0000 again."""
+    made = bench()
+    functions = made.emulator.functions()
+    monkeypatch.setattr(made.emulator, "_functions", {k: f for k, f in functions.items() if k not in without})
+    made.data.mkdir(exist_ok=True)
+    earlier = [made.data / f"Tuesday{number:04d}.ibw" for number in range(3)]
+    for file in earlier:
+        file.write_bytes(b"of another night")
+    peer = made.start(base_name="Tuesday")
+    ready(peer)
+    assert Path(scanned(peer)["HeightTrace"].filename).name == "Tuesday0003.ibw"
+    assert [file.read_bytes() for file in earlier] == [b"of another night"] * 3
+
+
 def test_files_are_found_where_the_drive_is_mounted(bench: Make) -> None:
     made = bench(save_path="C:Users:Asylum User:Documents:240820:")
     peer = made.start(folders={"c:users:Asylum User:Documents": str(made.folder)})

@@ -210,6 +210,13 @@ class Controller:
 
     # --- files ---
 
+    def check_suffix(self) -> None:
+        """The next number of which there is no file."""
+        base, suffix = self.values.text("BaseName"), int(self.values.get("BaseSuffix"))
+        while (self._folder / f"{base}{suffix:04d}.ibw").exists():
+            suffix += 1
+        self.values.put("BaseSuffix", suffix)
+
     def _save(self, where: str, now_s: float, made: saving.Made) -> None:
         faults = self.faults
         if faults.strikes("other-name", now_s):

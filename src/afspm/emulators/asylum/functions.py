@@ -52,7 +52,7 @@ class Software:
             "DoForceFunc": Function(self._do_force, "s"),
             "GoToSpot": Function(self._go_to_spot),
             "SimpleEngageMe": Function(self._engage, "s"),
-            "ARCheckSuffix": Function(lambda: 0.0),
+            "ARCheckSuffix": Function(self._check_suffix),
         }
         if self._has_status:
             table["ARGetStatus"] = Function(self._status)
@@ -94,6 +94,10 @@ class Software:
 
     def _put_text(self, name: str, value: str) -> float:
         self._controller.values.put_text(name, value)
+        return 0.0
+
+    def _check_suffix(self) -> float:
+        self._controller.check_suffix()
         return 0.0
 
     def _look(self, names: str) -> str:

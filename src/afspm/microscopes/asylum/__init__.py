@@ -102,8 +102,7 @@ class Asylum(Microscope):
         if self._spots != "none":
             session.do("InitProbePos")
         if self._base_name and session.text("GetBaseName") != self._base_name:
-            session.do("SetBaseName", self._base_name)
-            session.put("BaseSuffix", 0)
+            self._activity.call_files(self._base_name)
 
     def close(self) -> None:
         """End the connection. What was begun goes on."""

@@ -11,8 +11,9 @@ from typing import Any, Final
 from afspm.clock import Clock
 from afspm.errors import Refused
 from afspm.microscopes.asylum.folders import local
-from afspm.microscopes.asylum.harvest import Harvest, Target
+from afspm.microscopes.asylum.harvest import Harvest, Target, free_suffix
 from afspm.microscopes.asylum.session import Session
+from afspm.microscopes.asylum.xop import MISSING, XopError
 from afspm.microscopes.measurements import SCAN, as_list, as_region
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 
@@ -116,6 +117,16 @@ class Activity:
             ConfigError: the settings don't say.
         """
         return local(self._session.text("GS", _SAVED_TO[what]), self._folders)
+
+    def call_files(self, base: str) -> None:
+        """Have files called so from now on, their numbers following those that are there: Asylum overwrites."""
+        self._session.do("SetBaseName", base)
+        self._session.put("BaseSuffix", max(free_suffix(self.folder(what), base) for what in _SAVED_TO))
+        try:
+            self._session.do("ARCheckSuffix")  # as the panel does; it sees folders that can't be seen from here, too
+        except XopError as error:
+            if error.number != MISSING:
+                raise
 
     def settle(self, what: str) -> None:
         """Until what was begun is seen running, or has ended already.

@@ -131,6 +131,13 @@ class Harvest(Measurements):
             self._log.warning("%s: it is delivered as the file says", told)
 
 
+def free_suffix(folder: Path, base: str) -> int:
+    """The first number that no file of this base name has, nor any that follows."""
+    named = re.compile(rf"{re.escape(base)}(\d{{4,}})\.ibw", re.IGNORECASE)
+    taken = [int(match[1]) for path in _files(folder) if (match := named.fullmatch(path.name))]
+    return max(taken, default=-1) + 1
+
+
 def _target(measured: Mapping[str, Any]) -> Target:
     return Target(Path(measured["folder"]), measured["base"], measured["suffix"])
 
