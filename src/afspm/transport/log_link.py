@@ -45,7 +45,7 @@ class LogSender:
 
     def send(self, level: int, time_ns: int, text: str) -> None:
         """One record."""
-        cut = text.encode()[:LONGEST_LINE_BYTES]
+        cut = text.encode(errors="backslashreplace")[:LONGEST_LINE_BYTES]  # a file may have a name that is no text
         self._socket.send_multipart([self._name, str(level).encode(), str(time_ns).encode(), cut], zmq.NOBLOCK)
 
     def close(self) -> None:

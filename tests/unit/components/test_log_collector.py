@@ -26,11 +26,11 @@ def test_what_is_sent_is_received_and_what_is_no_line_is_left_out() -> None:
     deadline_s = time.monotonic() + 10.0
     found: list[LogLine] = []
     while not found and time.monotonic() < deadline_s:  # what is said before the connection stands is lost
-        sender.send(logging.INFO, 5, "the tip is blunt: 40 % … µm")
+        sender.send(logging.INFO, 5, "the tip is blunt: 40 % … µm, \udcff.ibw")
         found = receiver.take()
     sender.close()
     receiver.close()
-    assert found[0] == LogLine("metadata", logging.INFO, 5, "the tip is blunt: 40 % … µm")
+    assert found[0] == LogLine("metadata", logging.INFO, 5, "the tip is blunt: 40 % … µm, \\udcff.ibw")
     assert read_line([b"a", b"INFO", b"5", b"text"]) is None
     assert read_line([b"a"]) is None
 
