@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Collection, Iterator
-from pathlib import Path
 from typing import Any, Final
 
 from afspm.errors import InvalidValue
@@ -16,6 +14,7 @@ from afspm.experiment.known import WIRE_SETTINGS
 from afspm.experiment.parts import Role, wire_of
 from afspm.experiment.resolved import Resolved
 from afspm.model import component_of
+from afspm.transport.network import is_local
 
 # What translators and schedulers publish by themselves; scans and spectra continue with their kind.
 PUBLISHED: Final = (
@@ -90,16 +89,12 @@ def check_names(resolved: Resolved) -> None:
 def check_commands(resolved: Resolved) -> None:
     """The program of a command can be found."""
     for part in resolved.parts.components:
-        if part.command and not _program(part.command[0], resolved.document.folders[0]):
+        if part.command and not notifying.is_program(part.command[0], resolved.document.folders[0]):
             resolved.findings.error(
                 f"[{part.name}] there is no program {part.command[0]!r}",
                 resolved.document.place(part.name, "command"),
                 "give its path, or install it",
             )
-
-
-def _program(name: str, folder: Path) -> bool:
-    return name == "python" or shutil.which(name) is not None or (folder / name).is_file()
 
 
 def check_intermediaries(resolved: Resolved) -> None:
@@ -135,7 +130,7 @@ def check_addresses(resolved: Resolved) -> None:
                     f"[{slot.owner}] and [{other.owner}] both bind {slot.address} ({slot.use}, {other.use})", slot.place
                 )
         bound[slot.address] = slot
-        if not wiring.is_loopback(slot.address) and not secure:
+        if wiring.is_address(slot.address) and not is_local(slot.address) and not secure:
             resolved.findings.error(
                 f"[{slot.owner}] binds {slot.address}, which other computers can reach, without keys",
                 slot.place,

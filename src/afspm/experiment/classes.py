@@ -119,7 +119,7 @@ def load(path: str) -> Any:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise _no_module(module_name, error) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise Unloadable(f"importing {module_name} fails: {_where(error)}") from error
     return _attribute(module, name)
 
@@ -147,11 +147,11 @@ def _attribute(module: Any, name: str) -> Any:
     try:
         return getattr(module, name)
     except AttributeError:
-        hint = nearest(name, _public_classes(module))
+        hint = nearest(name, getattr(module, "__all__", None) or _public_classes(module))
         raise Unloadable(f"{module.__name__} has no {name!r}", hint) from None
     except ModuleNotFoundError as error:
         raise _no_module(f"{module.__name__}.{name}", error) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise Unloadable(f"importing {name} fails: {_where(error)}") from error
 
 
@@ -166,7 +166,7 @@ def _no_module(module: str, error: ModuleNotFoundError) -> Unloadable:
     missing = error.name or module
     if module != missing and not module.startswith(missing + "."):
         ours = missing.partition(".")[0] == module.partition(".")[0]
-        hint = "" if ours else f"pip install {missing}"
+        hint = "" if ours else f"if it is spelt right: pip install {missing}"
         return Unloadable(f"importing {module} fails: it needs {missing!r}, which is not installed", hint)
     parent, _, last = missing.rpartition(".")
     siblings: list[str] = []
@@ -193,9 +193,10 @@ def _where(error: BaseException) -> str:
     """The last line of a traceback with file and line, in one line."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    said = str(error)
     if isinstance(error, SyntaxError) and error.filename:
-        place = f" ({Path(error.filename).name}:{error.lineno})"
-    return f"{type(error).__name__}: {error}{place}"
+        place, said = f" ({Path(error.filename).name}:{error.lineno})", error.msg
+    return f"{type(error).__name__}: {said}{place}"
 
 
 def _public_classes(module: Any) -> list[str]:

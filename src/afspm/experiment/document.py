@@ -86,21 +86,29 @@ def _parse(text: str, file: Path, findings: Findings) -> dict[str, Any] | None:
             name = twice[1].replace("'", "").replace(", ", ".")
             findings.error(f"[{name}] is there twice", Place(str(file), line), "two components need two names")
         else:
-            findings.error(f"not valid TOML: {what}", Place(str(file), line), _python_habit(text, line))
+            written = dict(enumerate(text.splitlines(), 1)).get(line, "")
+            findings.error(f"not valid TOML: {what}", Place(str(file), line), _habit(what, written))
         return None
 
 
-def _python_habit(text: str, line: int) -> str:
-    """What to write instead of a value that would be right in Python, or that lacks its quotes."""
-    written = dict(enumerate(text.splitlines(), 1)).get(line, "")
-    value = re.search(r"=\s*(.*)", written)
-    if value is None:
-        return ""
-    if re.match(r"(True|False)\b", value[1]):
-        return "true and false are written in lower case"
-    if re.match(r"None\b", value[1]):
-        return "there is no None: leave the line out"
-    return "text is written in quotes" if re.match(r"[^\W\d]", value[1]) else ""
+# what was complained of, how the line looks, and what would be right: habits from Python, YAML, JSON and Windows
+_HABITS = (
+    ("Cannot overwrite", r"", "this key is there already"),
+    ("Illegal character '\\n'", r"", "the quote that ends the text is missing"),
+    ("", r"=\s*(True|False)\b", "true and false are written in lower case"),
+    ("", r"=\s*None\b", "there is no None: leave the line out"),
+    ("", r"=\s*[-+]?\d+,\d", "a number has a decimal point, not a comma"),
+    ("", r"=\s*[^\W\d]", "text is written in quotes"),
+    ("", r'"[^"]*\\', "in double quotes a backslash begins a code: take single quotes, 'C:\\data', or C:/data"),
+    ("", r"=\s*\{[^}]*$", "a table in braces stays on one line; else it is one of its own, e.g. [limits.region]"),
+    ("", r"^\s*\w+\s*:", "a key has its value after =; a table begins with its name in brackets: [series]"),
+    ("", r"^\s*\[+\w+\s+\w", 'a name with a space is written in quotes: ["my series"]'),
+)
+
+
+def _habit(what: str, written: str) -> str:
+    """What to write instead of a line that would be right elsewhere."""
+    return next((hint for said, line, hint in _HABITS if what.startswith(said) and re.search(line, written)), "")
 
 
 def _lay_over(document: Document, data: dict[str, Any], where: dict[lines.Path, Place]) -> None:

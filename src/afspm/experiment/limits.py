@@ -153,8 +153,7 @@ class LimitsReader:
 
     def _action(self, name: str, table: Any) -> Limit | None:
         path: Path = ("limits", "actions", name)
-        known = self._actions if self._actions is not None else frozenset({*names.BASE_ACTIONS, names.PULSE,
-            names.CRASH, names.RETRACT, names.ENGAGE})  # fmt: skip
+        known = frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if self._actions is None else self._actions
         if name not in known and (self._actions is not None or not name.startswith("x-")):
             hint = nearest(name, known)
             self._findings.error(f"[limits.actions] there is no action {name!r}", self._document.place(*path), hint)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import shutil
 import sys
 from pathlib import Path
@@ -36,11 +35,7 @@ def implied(resolved: Resolved, section: Notify) -> Part | None:
     settings: dict[str, Any] = {"program": list(wanted.command)} if wanted.command else {}
     settings |= {"webhook": wanted.webhook} if wanted.webhook else {}
     settings |= {"on": list(section.on), "unsolved_after": section.unsolved_after, "folder": wanted.folder}
-    taken = {part.name.casefold() for part in resolved.parts.components}
-    taken |= {name.casefold() for name in (*resolved.parts.variables, *resolved.parts.intermediaries)}
-    names = itertools.chain([NAME], (f"{NAME}{number}" for number in itertools.count(2)))
-    name = next(name for name in names if name not in taken)
-    return Part(name, CLASS, (), settings, {}, resolved.document.place(SECTION), implied=True)
+    return Part(resolved.parts.free_name(NAME), CLASS, (), settings, {}, resolved.document.place(SECTION), implied=True)
 
 
 def targets(section: Notify, folder: Path) -> Targets:
@@ -57,7 +52,7 @@ def check(resolved: Resolved) -> None:
     place = document.place(SECTION)
     if SECTION in resolved.parts.sections and not (section.command or section.webhook):
         findings.error("[notify] nobody is told of anything", place, "give a `command` or a `webhook`")
-    if section.command and not _program(section.command[0], document.folders[0]):
+    if section.command and not is_program(section.command[0], document.folders[0]):
         findings.error(
             f"[notify] there is no program {section.command[0]!r}",
             document.place(SECTION, "command"),
@@ -72,5 +67,6 @@ def check(resolved: Resolved) -> None:
             tell(f"[notify] webhook: {error.what}", document.place(SECTION, "webhook"), error.hint)
 
 
-def _program(name: str, folder: Path) -> bool:
+def is_program(name: str, folder: Path) -> bool:
+    """Whether a command may begin with this: "python", which is ours, a program that is found, a file in a folder."""
     return name == "python" or shutil.which(name) is not None or (folder / name).is_file()

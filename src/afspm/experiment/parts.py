@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -62,6 +63,13 @@ class Parts:
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)
     intermediaries: dict[str, dict[str, Any]] = field(default_factory=dict)
     components: list[Part] = field(default_factory=list)
+
+    def free_name(self, wanted: str) -> str:
+        """A name for a component that is not in the file: `wanted`, with a number behind it where that is taken."""
+        taken = {part.name.casefold() for part in self.components}
+        taken |= {name.casefold() for name in (*self.variables, *self.intermediaries)}
+        names = itertools.chain([wanted], (f"{wanted}{number}" for number in itertools.count(2)))
+        return next(name for name in names if name not in taken)
 
 
 def sort(document: Document, findings: Findings) -> Parts:

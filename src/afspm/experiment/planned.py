@@ -64,7 +64,6 @@ def refusals(name: str, planned: Planned, limits: Limits) -> list[str]:
 
 
 def _without_changes(limits: Limits) -> Limits:
-
     parameters = {
         name: replace(limit, step=None, rate_per_s=None, interval_s=None) for name, limit in limits.parameters.items()
     }

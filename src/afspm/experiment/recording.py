@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import itertools
 from typing import TYPE_CHECKING, Any
 
 from afspm.experiment.parts import Part, Role
@@ -35,8 +34,5 @@ def implied(resolved: Resolved, section: Record) -> Part | None:
             place,
             'pip install "afspm[record]"; or say [record] scans = false',
         )
-    taken = {part.name.casefold() for part in resolved.parts.components}
-    taken |= {name.casefold() for name in (*resolved.parts.variables, *resolved.parts.intermediaries)}
-    names = itertools.chain([NAME], (f"{NAME}{number}" for number in itertools.count(2)))
-    name = next(name for name in names if name not in taken)
-    return Part(name, CLASS, (), {} if scans else {"scans": False}, {}, place, implied=True)
+    settings = {} if scans else {"scans": False}
+    return Part(resolved.parts.free_name(NAME), CLASS, (), settings, {}, place, implied=True)

@@ -130,6 +130,11 @@ def report(
         findings.error(f"{shown} is not a setting", place, nearest(str(location[-1]), known))
     elif error["type"] == "missing":
         findings.error(f"{shown} is missing", place)
+    elif error["type"] in ("tuple_type", "list_type"):
+        findings.error(f"{shown} is a list of values in brackets, not {error['input']!r}", place)
+    elif error["type"] == "too_long":
+        most, given = error["ctx"]["max_length"], error["ctx"]["actual_length"]
+        findings.error(f"{shown} has {given} values, and takes {most} at most", place)
     elif isinstance(cause := error.get("ctx", {}).get("error"), AfspmError):
         findings.error(f"{shown} = {error['input']!r}: {cause.what}", place, cause.hint)
     else:

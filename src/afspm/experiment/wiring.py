@@ -18,7 +18,6 @@ from afspm.experiment.known import WIRE_KEYS, Wire
 from afspm.experiment.parts import Part, Role, wire_of
 
 _ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+|inproc://\S+)")
-LOOPBACK = ("127.", "localhost", "[::1]", "::1")
 
 
 @dataclass(frozen=True)
@@ -151,13 +150,6 @@ def _apply_timeouts(wires: Wires, table: Mapping[str, Any]) -> None:
 def is_address(text: str) -> bool:
     """Whether this is an address as ZeroMQ writes it."""
     return _ADDRESS.fullmatch(text) is not None
-
-
-def is_loopback(address: str) -> bool:
-    """Whether only this computer can reach what is bound here."""
-    if not address.startswith("tcp://"):
-        return True
-    return address.removeprefix("tcp://").startswith(LOOPBACK)
 
 
 def reaches(connect: str, bind: str) -> bool:

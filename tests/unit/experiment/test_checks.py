@@ -91,6 +91,9 @@ BROKEN = {
         "both bind",
     ),
     "open to the network": (PEAKS + 'publisher = "tcp://192.168.1.5:9000"\n', FRAME, "without keys"),
+    "a host that only begins like this computer": (
+        PEAKS + 'publisher = "tcp://localhost.example.org:9000"\n', FRAME, "without keys"
+    ),
     "nobody binds": (ANYTHING + 'subscriber = "tcp://127.0.0.1:9009"\n', FRAME, "which nobody binds"),
     "not an address": (
         ANYTHING + 'subscriber = "s"\n[s]\nclass = "Subscriber"\nsub_url = "localhost:3"\n', FRAME, "is not an address"
