@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -93,8 +93,8 @@ def can_show_blocks() -> bool:
     return True
 
 
-def say_nothing_runs(why: str) -> None:
-    """Raises typer.Exit."""
+def say_nothing_runs(why: str) -> NoReturn:
+    """End the command: raises typer.Exit."""
     typer.echo(f"afspm: nothing runs here: {why}", err=True)
     raise typer.Exit(NOT_RUNNING)
 
@@ -109,7 +109,6 @@ def _running(where: Path) -> Path:
         folder = find_run(where)
     except FileError as error:
         say_nothing_runs(str(error))
-        raise  # not reached
     ended = read_facts(folder).get(ENDED)
     if ended:
         say_nothing_runs(f"{folder.resolve().name} has ended ({ended})")
