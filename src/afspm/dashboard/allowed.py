@@ -8,13 +8,14 @@ from typing import Any
 
 from afspm.errors import AfspmError
 from afspm.model import Region
+from afspm.record.facts import EXPERIMENT_FILE
 from afspm.units import si
 
 
 def allowed_region(folder: Path) -> Region | None:
     """The region of [limits] in the expanded experiment file, in tip coordinates; None where there is none."""
     try:
-        table = tomllib.loads((folder / "experiment.toml").read_text(encoding="utf-8"))
+        table = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
         box = table.get("limits", {}).get("region")
         return None if box is None else _region(box)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, AfspmError):

@@ -64,7 +64,7 @@ def register(message: type[Message]) -> type[Message]:
     """Make a message type of one's own known, so that it is published, cached and received by its name.
 
     Raises:
-        InvalidValue: another type has that name, or it has an underscore followed by what would be another's envelope.
+        InvalidValue: another type has that name.
     """
     name = message.DESCRIPTOR.name
     known = _messages.setdefault(name, message)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from google.protobuf.timestamp_pb2 import Timestamp
-
+from afspm.clock import NS_PER_S
 from afspm.scheduler.codec import WireCodec
 from afspm.scheduler.drift.told import Matrix, Registered, RescanWanted, ScanJob
+from afspm.wire.convert import timestamp
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
-
-_NS = 1_000_000_000
 
 
 class DriftWireCodec(WireCodec):
@@ -17,7 +15,7 @@ class DriftWireCodec(WireCodec):
 
     def encode_mapping(self, registered: Registered, scan: ScanJob, *, correcting: bool) -> bytes:
         return DriftMapping(
-            timestamp=_timestamp(round(registered.time_s * _NS)),
+            timestamp=timestamp(round(registered.time_s * NS_PER_S)),
             matrix=_flat(registered.matrix[:2]),
             covariance=_flat(registered.covariance_m2),
             rate=registered.rate_m_s,
@@ -38,17 +36,13 @@ class DriftWireCodec(WireCodec):
         if wanted.shape is not None:
             params.data.shape.y, params.data.shape.x = wanted.shape
         message = DriftRescan(
-            timestamp=_timestamp(wanted.time_ns),
+            timestamp=timestamp(wanted.time_ns),
             params=params,
             kind=int(wanted.kind),  # type: ignore[arg-type]
             reason=wanted.reason,
             upwards=wanted.upwards,
         )
         return message.SerializeToString()
-
-
-def _timestamp(time_ns: int) -> Timestamp:
-    return Timestamp(seconds=time_ns // _NS, nanos=time_ns % _NS)
 
 
 def _flat(rows: Matrix) -> list[float]:
