@@ -7,6 +7,7 @@ import errno
 import io
 import logging
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ PERIOD_S = 1.0
 _DAMAGED = (ValueError, KeyError, TypeError)
 LONGEST = 1 << 20
 """Bytes of a file with its generations, before it is begun anew."""
+_TRIES, _AGAIN_S = 50, 0.01
 
 
 def replace(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True, aside: Path | None = None) -> None:
@@ -41,11 +43,23 @@ def replace(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = T
             if synced:
                 file.flush()
                 os.fsync(file.fileno())
-        aside.replace(path)
+        _rename(aside, path)
     except OSError:
         with contextlib.suppress(OSError):
             aside.unlink()
         raise
+
+
+def _rename(aside: Path, path: Path) -> None:
+    """Give a file its name. Windows refuses that while somebody, a virus scanner say, reads what has the name now."""
+    for left in reversed(range(_TRIES)):
+        try:
+            aside.replace(path)
+            return
+        except PermissionError:
+            if sys.platform != "win32" or not left:
+                raise
+        threading.Event().wait(_AGAIN_S)  # nobody tells when the reader has closed it
 
 
 def write_whole(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:

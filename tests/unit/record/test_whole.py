@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import FileError
+from afspm.record import whole
 from afspm.record.whole import Generations, former, load
 from afspm.runtime.memory import Memory
 from afspm.scheduler.state_file import StateFile
@@ -112,6 +113,42 @@ def test_while_it_is_saved_the_generation_before_is_made_sure_of_by_itself(tmp_p
         n += 1
         kept.save(b"%d" % n)
     kept.close()
+
+
+class Reader:
+    """Has a file open, as only Windows minds, for some tries."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, tries: int) -> None:
+        self.left = tries
+        rename = Path.replace
+
+        def replace(source: Path, target: Path) -> Path:
+            self.left -= 1
+            if self.left >= 0:
+                raise PermissionError(13, "Access is denied", str(target))
+            return rename(source, target)
+
+        monkeypatch.setattr(Path, "replace", replace)
+        monkeypatch.setattr(whole, "_AGAIN_S", 0.0)
+        monkeypatch.setattr(whole.sys, "platform", "win32")
+
+
+def test_a_file_that_somebody_reads_for_a_moment_is_replaced_after_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader = Reader(monkeypatch, tries=3)
+    whole.replace(tmp_path / "x", [b"1"], synced=False)
+    assert (tmp_path / "x").read_bytes() == b"1"
+    assert reader.left == -1
+
+
+def test_a_file_that_somebody_keeps_open_is_told_and_nothing_is_left_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Reader(monkeypatch, tries=1000)
+    with pytest.raises(FileError, match="Access is denied"):
+        whole.write_whole(tmp_path / "x", [b"1"], synced=False)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("left", CUT)
