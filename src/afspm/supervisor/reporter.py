@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from afspm import wire
 from afspm.clock import Clock, ExperimentClock
-from afspm.errors import AfspmError
+from afspm.errors import AfspmError, WireError
 from afspm.logic.telling import LONGEST
 from afspm.model import (
     TELL_REQUEST,
@@ -210,7 +210,12 @@ class Reporter:
             self._closing = self._closing or response.code == ControlResponse.CMD_NOT_SUPPORTED
             self._complain(response.reason)
             return
-        for name in wire.decode_orders(response.payload):
+        try:
+            orders = wire.decode_orders(response.payload)
+        except WireError as error:
+            self._complain(str(error))
+            return
+        for name in orders:
             self.post(Ordered(name))
 
     def _complain(self, why: str) -> None:

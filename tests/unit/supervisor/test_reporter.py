@@ -8,6 +8,7 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.logic.telling import LONGEST
+from afspm.model import ControlResponse, Response
 from afspm.runtime.launch import Launch
 from afspm.supervisor import reporter as reporting
 from afspm.supervisor.reporter import Reporter
@@ -41,6 +42,15 @@ def test_a_batch_is_no_longer_than_the_scheduler_takes(reporter: Reporter) -> No
 def test_what_is_for_developers_is_left_out(reporter: Reporter) -> None:
     reporter.line("one", logging.DEBUG, "started, process 7")
     assert reporter._some_lines() == ()
+
+
+def test_orders_that_can_not_be_read_are_told_and_do_not_end_it(reporter: Reporter) -> None:
+    told: list[reporting.News] = []
+    reporter.post = told.append
+    reporter._answered(Response(ControlResponse.SUCCESS, b"\xff"))
+    (complaint,) = told
+    assert isinstance(complaint, reporting.Complaint)
+    assert "Orders" in complaint.text
 
 
 def test_one_that_was_not_started_can_be_closed(reporter: Reporter) -> None:
