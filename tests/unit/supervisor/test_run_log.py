@@ -79,7 +79,7 @@ def test_a_terminal_shows_the_name_in_its_colour(tmp_path: Path) -> None:
 
 
 def test_a_name_keeps_its_colour() -> None:
-    assert colour_of("scheduler") == colour_of("scheduler")
+    assert colour_of("scheduler") == "cyan"
     assert {colour_of(f"component {n}") for n in range(200)} == set(COLOURS)
 
 
