@@ -17,13 +17,15 @@ def told(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
     """An exception in words: its message on the first line, and below it the lines of code that led to it.
 
     How we came to call somebody's component is left out; where we refused on purpose what it asked for, how we came to
-    do that as well. An error that comes from nobody's code but ours is told whole.
+    do that as well. An error that comes from nobody's code but ours is told whole, unless it is one that we foresaw.
 
     Args:
         name: of the component, which whoever reads this knows already.
         package: the folder of the code that is ours.
     """
     trace = traceback.TracebackException.from_exception(error)
+    if isinstance(error, AfspmError) and all(_is_passage(frame, package) for frame in trace.stack):
+        return _words(error, name)  # no code of anybody's: how we came to say so helps nobody to put it right
     is_chained = False
     link: traceback.TracebackException | None = trace
     seen: set[int] = set()

@@ -99,7 +99,9 @@ class Network:
         try:
             socket.bind(address)
         except zmq.ZMQError as error:
-            raise TransportError(f"can't bind: {error}", where=address, hint=_bind_hint(error)) from error
+            raise TransportError(
+                f"can't bind: {zmq.strerror(error.errno or 0)}", where=address, hint=_bind_hint(error)
+            ) from error
         return socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
 
     def connect(self, socket: zmq.Socket[bytes], address: str) -> None:
@@ -160,4 +162,6 @@ def is_local(address: str) -> bool:
 def _bind_hint(error: zmq.ZMQError) -> str:
     if error.errno == zmq.EADDRINUSE:
         return "another program uses this port: an earlier experiment that still runs?"
+    if error.errno == zmq.EADDRNOTAVAIL:
+        return "this computer has no such address: is this process meant to run on another one (--only)?"
     return ""

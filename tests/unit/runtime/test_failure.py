@@ -88,6 +88,12 @@ def test_an_error_of_ours_alone_is_told_whole() -> None:
     assert "test_failure.py" in text
 
 
+def test_a_refusal_of_what_a_component_of_ours_asked_for_is_told_in_its_words() -> None:
+    error = raised(refuse)
+    error.__cause__ = raised(lambda: {}["of a library that we called"])
+    assert told(error, "series", package=Path(__file__).parents[3]) == "too far"
+
+
 def test_what_led_to_it_is_told_too() -> None:
     def careless() -> None:
         try:

@@ -57,6 +57,14 @@ def test_a_taken_port_is_said(open_: Any) -> None:
     with pytest.raises(TransportError, match="can't bind") as refused:
         network.bind(network.socket(zmq.PUB), address)
     assert "another program" in refused.value.hint
+    assert str(refused.value).count(address) == 1
+
+
+def test_an_address_of_another_computer_is_said(open_: Any) -> None:
+    network = open_(Network(insecure=True))
+    with pytest.raises(TransportError, match="can't bind") as refused:
+        network.bind(network.socket(zmq.PUB), "tcp://192.0.2.1:0")  # kept for documents: nobody has it
+    assert "no such address" in refused.value.hint
 
 
 def test_generated_keys_are_kept_and_secrets_are_for_the_owner_only(tmp_path: Path) -> None:
