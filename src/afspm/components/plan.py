@@ -50,7 +50,7 @@ class ScanPlan:
         if not self.regions:
             raise InvalidValue("a plan needs a region at least")
         if self.rounds is not None and self.rounds < 1:
-            raise InvalidValue(f"{self.rounds} rounds of a plan are none")
+            raise InvalidValue(f"a plan is gone through once at least, not {self.rounds} times")
 
     @property
     def total(self) -> int | None:

@@ -246,7 +246,7 @@ def check_clock(resolved: Resolved) -> None:
         resolved.findings.error(
             f"[clock] speed = {resolved.clock.speed:g} on a microscope that is not simulated",
             resolved.document.place("clock", "speed"),
-            "time can't be made faster there: leave it out",
+            "time can't be made faster there: leave it out, or set it to 1 in the file for this microscope",
         )
     if "start" in table:
         resolved.findings.error(

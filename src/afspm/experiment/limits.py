@@ -72,6 +72,7 @@ class Whole(Section):
     most_pixels: Annotated[int, Field(gt=0)] = 8192 * 8192
 
 
+LARGEST_REGION_M: Final = 0.01  # no scanner reaches as far
 _OWN: Final = (*Whole.model_fields, "actions")
 
 
@@ -226,6 +227,11 @@ class LimitsReader:
         if size[0] <= 0 or size[1] <= 0:
             self._findings.error("[limits] region is empty", place, "from the smaller to the larger value")
             return None
+        if max(size) > LARGEST_REGION_M:
+            self._findings.warning(
+                f"[limits] region is {size[0]:g} m x {size[1]:g} m: it keeps nothing safe", place,
+                'a plain number is in m: write e.g. "3 um"',
+            )  # fmt: skip
         return Region(center, size, box.angle)
 
     def _check_sizes(self, limits: Limits) -> None:

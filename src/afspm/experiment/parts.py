@@ -154,6 +154,10 @@ def _report_unused(parts: Parts, used: set[str], document: Document, findings: F
         section = closest(name, SECTIONS, 0.75)
         if section and "class" not in table:
             findings.error(f"there is no section [{name}]", document.place(name), f"did you mean [{section}]?")
+        elif within := [key for key, value in table.items() if isinstance(value, dict) and value.get("component")]:
+            whole = f"{name}.{within[0]}"
+            hint = f'a name with a dot is written in quotes: ["{whole}"]'
+            findings.error(f"[{whole}] is within a table [{name}], and no component", document.place(name), hint)
         elif "component" in table:
             continue  # switched off: component = false
         elif "class" in table or "command" in table:

@@ -59,11 +59,19 @@ def check(
             checked[name] = jsonable(value, document.folder_of(*path, name))
         else:
             unknown.append(name)
-            findings.error(
-                f"[{'.'.join(path)}] has no setting {name!r}", document.place(*path, name), nearest(name, parameters)
-            )
+            place = document.place(*path, name)
+            replaced = "" if closest(name, parameters) else _replaced(path, name, document)
+            findings.error(f"[{'.'.join(path)}] has no setting {name!r}", place, replaced or nearest(name, parameters))
     _report_missing(parameters, settings, unknown, path, document, findings)
     return checked
+
+
+def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
+    """What to do about a setting of a class that a later file has replaced; empty: none has."""
+    of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
+    if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
+        return ""
+    return f"the class is that of {of_class}: what only another class has belongs into a file laid over for that one"
 
 
 def default_of(component: type, name: str) -> Any:

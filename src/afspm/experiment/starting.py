@@ -81,7 +81,7 @@ def _require_addresses(
     Args:
         piecemeal: those that are not chosen run elsewhere; else they may just have been left out.
     """
-    missing = set()
+    missing: dict[str, set[str]] = {}
     implied = {part.name for part in resolved.parts.components if part.implied}
     for name, link in resolved.net.links.items() if piecemeal else links.items():
         if name in implied:
@@ -89,12 +89,13 @@ def _require_addresses(
         for key in (link.control, *links.get(name, link).subscribe):
             slot = resolved.net.slots.get(key or "")
             if slot is not None and slot.address is None and (slot.owner in chosen) != (name in chosen):
-                missing.add(f"where [{slot.owner}] is to be reached by [{name}] ({slot.use})")
+                missing.setdefault(f"[{slot.owner}] {slot.key}", set()).add(name)
     if missing:
+        needed = [f"{where} (for {', '.join(sorted(users))})" for where, users in sorted(missing.items())]
         raise ConfigError(
-            "a piecemeal start needs addresses in the file: " + "; ".join(sorted(missing)),
+            "where parts are started on their own, the file has to say " + "; ".join(needed),
             where=str(resolved.document.files[0]),
-            hint='e.g. publisher = "tcp://127.0.0.1:9000", see the reference on wiring',
+            hint=f'e.g. {min(missing)} = "tcp://127.0.0.1:9000", see the reference on wiring',
         )
 
 

@@ -22,11 +22,12 @@ _ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+
 
 @dataclass(frozen=True)
 class Slot:
-    """One end that a process binds: the address the file gives, or None where it is left open."""
+    """One end that a process binds: the address the file gives under `key`, or None where it is left open."""
 
     owner: str
     use: str
     address: str | None
+    key: str
     place: Place
 
 
@@ -182,7 +183,7 @@ def connect(
     above = wires[scheduler] if scheduler else Wires()
 
     def slot(owner: str, use: str, address: str | None, key: str) -> str:
-        net.slots[f"{owner}/{use}"] = Slot(owner, use, address, placed(owner, key))
+        net.slots[f"{owner}/{use}"] = Slot(owner, use, address, key, placed(owner, key))
         return f"{owner}/{use}"
 
     if translator:

@@ -29,9 +29,18 @@ WITHOUT_TRANSLATOR = FRAME[: FRAME.index("[microscope]")]
         ("a = Scheduler", "in quotes"),
         ("a = = 3", ""),
         ("a = [1", ""),
+        ("a = 1,5", "decimal point"),
+        ("a: 3", "after ="),
+        ("a:", "in brackets"),
+        ('a = "3', "quote that ends"),
+        (r'a = "C:\Users\me"', "single quotes"),
+        (r'a = ["C:\data"]', "single quotes"),
+        ("a = 1\na = 2", "there already"),
+        ("a = { x = 1,\n  y = 2 }", "stays on one line"),
+        ("[my series]", "with a space"),
     ],
 )
-def test_habits_from_python_are_told_what_toml_wants(write: Write, line: str, hint: str) -> None:
+def test_habits_from_elsewhere_are_told_what_toml_wants(write: Write, line: str, hint: str) -> None:
     (finding,) = write(f"{line}\n", frame="").check()
     assert finding.hint == hint or (hint and hint in finding.hint)
 
@@ -54,6 +63,7 @@ BROKEN = {
         FRAME,
         "a second translator",
     ),
+    "a name with a dot": (PEAKS.replace("peaks", "my.peaks", 1), FRAME, "[my.peaks] is within a table"),
     "two of one name": (CORRECTOR + CORRECTOR, FRAME, "[repair] is there twice"),
     "two of nearly one name": (CORRECTOR + CORRECTOR.replace("repair", "Repair"), FRAME, "the same name"),
     "a name with a slash": (CORRECTOR.replace("repair", '"a/b"'), FRAME, "[a/b] can't be the name"),

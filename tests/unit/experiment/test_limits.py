@@ -78,6 +78,15 @@ def test_limits_that_contradict_are_errors(write: Write, text: str, said: str) -
     assert said in only_error(write(text)).what
 
 
+@pytest.mark.parametrize(
+    ("region", "doubted"),
+    [("{ x = [-3, 3], y = [-3e-6, 3e-6] }", True), ("{ x = [-3e-6, 3e-6], y = [-3e-6, 3e-6] }", False)],
+)
+def test_a_region_of_metres_is_doubted(write: Write, region: str, doubted: bool) -> None:
+    found = [finding.what for finding in write(f"[limits]\nregion = {region}\n").check()]
+    assert found == (["[limits] region is 6 m x 6e-06 m: it keeps nothing safe"] if doubted else [])
+
+
 def test_a_limit_of_unknown_dimension_is_in_the_unit_given(write: Write) -> None:
     experiment = write('[limits.zctrl-setpoint]\nmin = "0.1 V"\nmax = "500 mV"\n')
     assert not errors(experiment)

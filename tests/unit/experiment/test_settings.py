@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from afspm.experiment import load
 from afspm.runtime import loading
 from afspm.runtime.launch import Launch
 
@@ -61,7 +62,7 @@ def test_a_relative_file_is_one_beside_the_experiment_file(write: Write) -> None
         ('count = "many"', "valid integer"),
         ("count = 2.5", "integer"),
         ('style = "fast"', "'quick' or 'slow'"),
-        ('names = "a"', "valid list"),
+        ('names = "a"', "list of values in brackets"),
     ],
 )
 def test_a_wrong_value_is_an_error_on_its_line(write: Write, setting: str, said: str) -> None:
@@ -70,6 +71,14 @@ def test_a_wrong_value_is_an_error_on_its_line(write: Write, setting: str, said:
     assert said in error.what
     assert "[scan]" in error.what
     assert error.place.line == line_of(experiment, setting.split(" ")[0])
+
+
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [('"1 um"', "is a list of values in brackets"), ('["1 um", "1 um", "1 um"]', "has 3 values, and takes 2")],
+)
+def test_a_list_of_the_wrong_length_is_an_error(write: Write, size: str, said: str) -> None:
+    assert f"[scan] size {said}" in only_error(write(scanner(size=f"size = {size}"))).what
 
 
 def test_a_wrong_element_of_a_list_is_named(write: Write) -> None:
@@ -81,6 +90,15 @@ def test_an_unknown_setting_is_an_error_with_the_nearest_name(write: Write) -> N
     error = only_error(write(scanner('evry = "15 min"')))
     assert "no setting 'evry'" in error.what
     assert "'every'" in error.hint
+
+
+def test_a_setting_of_the_class_that_a_second_file_replaces_is_told_where_it_belongs(tmp_path: Path) -> None:
+    first, second = tmp_path / "night.toml", tmp_path / "other.toml"
+    first.write_text('[a]\ncomponent = true\nclass = "ScanSeries"\nsize = ["1 um", "1 um"]\n')
+    second.write_text('[a]\nclass = "Metadata"\n')
+    (error,) = [e for e in load(first, second).check() if "'size'" in e.what]
+    assert error.place.file == str(first)
+    assert "other.toml" in error.hint
 
 
 def test_a_missing_setting_is_an_error(write: Write) -> None:
@@ -128,11 +146,14 @@ def test_findings_are_in_the_order_of_the_lines(write: Write) -> None:
         ("broken.X", "SyntaxError", ""),
         ("raising.X", "ZeroDivisionError", ""),
         ("needing.X", "needs 'not_there_at_all'", "install"),
+        ("leaving.X", "SystemExit: 3 (leaving.py:2)", ""),
+        ("afspm.components.ScanSerie", "has no 'ScanSerie'", "ScanSeries"),
     ],
 )
 def test_a_class_that_can_t_be_had_is_an_error(write: Write, tmp_path: Path, name: str, said: str, hint: str) -> None:
     (tmp_path / "broken.py").write_text("def f(:\n")
     (tmp_path / "raising.py").write_text("1 / 0\n")
+    (tmp_path / "leaving.py").write_text("import sys\nsys.exit(3)\n")
     (tmp_path / "needing.py").write_text("import not_there_at_all\n")
     experiment = write(f'[a]\ncomponent = true\nclass = "{name}"\n')
     error = only_error(experiment)

@@ -192,10 +192,10 @@ def test_nobody_listens_to_a_component_that_was_left_out(write: Write) -> None:
 
 
 def test_a_piecemeal_start_needs_the_addresses_in_the_file(write: Write) -> None:
-    with pytest.raises(ConfigError, match="needs addresses"):
-        starts(write(CORRECTOR), only=["repair"])
-    with pytest.raises(ConfigError, match="needs addresses"):
-        starts(write(CORRECTOR), only=["microscope", "scheduler"])
+    for here in (["repair"], ["microscope", "scheduler"]):
+        with pytest.raises(ConfigError, match=r"\[scheduler\] pubsubcache \(for repair\)") as refused:
+            starts(write(CORRECTOR), only=here)
+        assert "[scheduler] router (for repair)" in refused.value.what
 
 
 FIXED = FRAME.replace(
