@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from nanonis_bench import Bench
 from vendor_bench import scans, small, states
 
-from afspm.model import ControlResponse, ScopeState, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
@@ -134,6 +135,59 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
     assert found[0].filename.endswith("nanonis-0001.npz")
     # by the name that Nanonis had said, or by the folder if it had not said any in time
     made.until_said("unnamed001.sxm): it was fetched from Nanonis", "session): it was fetched from Nanonis")
+
+
+def test_a_scan_that_does_not_begin_is_refused_and_the_one_before_not_taken_for_it(
+    bench: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = bench()
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    assert scans(peer.until(FREE))
+    monkeypatch.setattr(made.emulator.panel, "start_scan", lambda upwards: None)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "was told to begin a scan, and does not" in response.reason
+    monkeypatch.undo()
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(FREE)) == ["SCANNING", "FREE"]
+
+
+def test_a_start_that_was_lost_on_its_way_gives_no_scan_of_before(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench()
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    assert scans(peer.until(FREE))
+    plain = made.emulator._answer
+
+    def lose(connection: Any, name: str, *rest: Any) -> None:
+        if name == "Scan.Action":
+            made.emulator._server.cut(connection)
+        else:
+            plain(connection, name, *rest)
+
+    monkeypatch.setattr(made.emulator, "_answer", lose)
+    assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
+    heard = peer.until(FREE)
+    made.until_said("was never seen running", "was fetched from Nanonis")
+    monkeypatch.undo()
+    assert peer.act_once_free(names.START_SCAN).ok
+    heard += peer.until(lambda one: isinstance(one, Scan) and one.filename.endswith(".sxm"))
+    heard += peer.until(FREE)
+    assert len(scans(heard)) == 8, "of the second scan alone"
+    assert all(scan.filename.endswith(".sxm") for scan in scans(heard))
+
+
+def test_retracting_withdraws_the_tip_even_if_the_scan_can_not_be_stopped(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = small(made)
+    assert peer.set(names.SCAN_SPEED, 1e-7).ok
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.strike("refused")
+    assert peer.act(names.RETRACT).ok
+    assert not made.emulator.rig.engaged
+    made.until_said("it is not possible now")
 
 
 def test_the_name_of_an_older_file_is_not_believed(bench: Make) -> None:

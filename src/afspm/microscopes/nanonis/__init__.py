@@ -213,7 +213,7 @@ class Nanonis(Microscope):
         except protocol.NanonisError:
             self._activity.forget()
             raise
-        self._activity.settle("Scan.StatusGet")
+        self._activity.settle_scan()
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
@@ -264,11 +264,14 @@ class Nanonis(Microscope):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Withdraw the tip by its piezo, whatever is going on."""
-        if self._ask("Scan.StatusGet")[0]:
-            self.stop_scan()
-        elif self._harvest.what:
-            self.stop_spec()
+        """Withdraw the tip by its piezo, whatever is going on, and whether that can be stopped or not."""
+        try:
+            if self._ask("Scan.StatusGet")[0]:
+                self.stop_scan()
+            elif self._harvest.what:
+                self.stop_spec()
+        except protocol.NanonisError as error:
+            self.log.error("what is going on can't be stopped, the tip is withdrawn all the same: %s", error)
         no_timeout = -1
         self._ask("ZCtrl.Withdraw", _AT_ONCE, no_timeout)
 

@@ -16,7 +16,7 @@ from afspm.microscopes.nanonis.listener import CurveEnded, Failed, Heard, ScanEn
 from afspm.microscopes.nanonis.session import APPROACH, MODULES, Session
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 
-_SETTLES_S: Final = 1.0
+_SETTLES_S: Final = 2.0
 """So long, in real time, what was begun may take to be seen running."""
 _LATEST_S: Final = 10.0
 """So much later than it should the tip may arrive, in experiment time."""
@@ -73,22 +73,36 @@ class Activity:
         self.curve, self._kind_asked = None, kind
         same_name = ""
         self._listener.curve(MODULES[kind], same_name)
-        self.settle(f"{MODULES[kind]}.StatusGet")
+        self._seen_running(f"{MODULES[kind]}.StatusGet")
 
-    def settle(self, status: str) -> None:
-        """Until what was begun is seen running, or has ended already.
+    def settle_scan(self) -> None:
+        """Until the scan that was begun is seen running, or has ended already.
+
+        Raises:
+            Refused: ACTION_ERROR: Nanonis does not scan; what it still has in memory is of the scan before.
+        """
+        if not self._seen_running("Scan.StatusGet") and not self._harvest.has_file():
+            self.forget()
+            raise Refused(ControlResponse.ACTION_ERROR, "Nanonis was told to begin a scan, and does not")
+        self._harvest.seen()
+
+    def _seen_running(self, status: str) -> bool:
+        """Whether what was begun is seen running, or has ended already.
 
         Raises:
             Refused: ACTION_ERROR: Nanonis would not.
         """
         until_s = self._clock.monotonic_s() + _SETTLES_S
-        while not self._ask(status)[0] and self._clock.monotonic_s() < until_s:
+        while not self._ask(status)[0]:
+            if self._clock.monotonic_s() >= until_s:
+                return False
             for heard in self._listener.heard():
                 if isinstance(heard, Failed) and not isinstance(heard.error, ControllerLost):
                     self.forget()
                     raise Refused(ControlResponse.ACTION_ERROR, str(heard.error))
                 self._take(heard)
-                return
+                return True
+        return True
 
     def forget(self) -> None:
         """Nothing comes of what was begun."""
@@ -140,6 +154,7 @@ class Activity:
         if not self.stopping:
             if self._harvest.what != SCAN:
                 self.begin_scan(frame(ScanFrame().read(self._ask))[0])
+            self._harvest.seen()
             self._listener.scan()
         return ScopeStatus(ScopeState.SCANNING)
 

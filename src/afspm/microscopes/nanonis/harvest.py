@@ -56,9 +56,15 @@ class Harvest(Measurements):
             session: Nanonis' session folder.
             taken: "frame" of a scan, "position" of a spectrum.
         """
+        taken = {"seen": what != SCAN, **taken}
         folder = self._session_dir or Path(session)
         newest = max((file.stat().st_mtime_ns for file in self._files(folder, what)), default=0)
         self._begins(what, {"folder": str(folder), "newest_ns": newest, **taken})
+
+    def seen(self) -> None:
+        """What is running was seen running."""
+        if self._kept["running"] is not None:
+            self._kept["running"]["seen"] = True
 
     def end(self, now_ns: int, now_s: float, told: str | None = None) -> None:
         """It has ended, or more is known of its end.
@@ -73,9 +79,14 @@ class Harvest(Measurements):
             self._ends({"told": told, "end_ns": now_ns, "fetch_at_s": fetch_at_s})
         ended = self._kept["ended"]
         if ended is not None and told is not None:
-            ended["told"] = told
+            ended["told"], ended["seen"] = told, True
             if not told:
                 ended["fetch_at_s"] = now_s
+
+    def has_file(self) -> bool:
+        """Whether a file of what is running has appeared."""
+        running = self._kept["running"]
+        return running is not None and self._file({**running, "told": None}) is not None
 
     def next_s(self) -> float | None:
         """When to look again at the latest."""
@@ -113,6 +124,8 @@ class Harvest(Measurements):
     def _fetch(self, fetch: Fetch, ended: Mapping[str, Any], file: Path | None) -> None:
         missed = str(file or ended["told"] or f"in {ended['folder']}")
         try:
+            if not ended.get("seen", True):  # its start was lost: in Nanonis' memory is the scan before
+                raise FileError("it was never seen running")
             content = list(fetch(ended))
             _refuse_gaps(content)
         except LOST:
