@@ -12,7 +12,7 @@ from afspm.logic.arbitration import Ask, Control, Event
 from afspm.logic.bulletin import CONTROL_STATE, Bulletin
 from afspm.logic.cache import TIME_STEP_NS, Cache
 from afspm.logic.catching_up import CatchingUp
-from afspm.logic.chronicle import Chronicle
+from afspm.logic.chronicle import SCHEDULER, Chronicle
 from afspm.logic.desk import Desk, OwnEnd
 from afspm.logic.ending import Ending
 from afspm.logic.events import (
@@ -70,6 +70,7 @@ __all__ = ["CONTROL_STATE", "SchedulerCore", "SchedulerSettings"]
 
 _TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
 """Messages from which we learn what the microscope is in. All others pass unread."""
+_AT_ONCE_S = 0.0  # in real monotonic time: always past
 
 
 class SchedulerCore:
@@ -177,7 +178,7 @@ class SchedulerCore:
             self._ending.by_s,
             self._desk.unclear_until_s(),
             self._desk.mover.due_s(),
-            self._malfunction_at_s(),
+            self._malfunction()[0],
             self._entries_due_s(),
         )
         for deadline_s in others_s:
@@ -196,6 +197,7 @@ class SchedulerCore:
             "last_ns": self._cache.last_ns,
             "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
+            "left_to_people": self._watchdog.left_to_people,
             "supervisors": self._bulletin.telling.snapshot(),
             **self._desk.snapshot(),
             **({} if self._frame is None else {"frame": self._frame.snapshot()}),
@@ -210,7 +212,8 @@ class SchedulerCore:
         self._is_restarted = True
         self._arbiter.restore(state)
         self._cache.not_before(int(state["last_ns"]))
-        self._watchdog.restore(map(str, state["wanted"]))
+        left_to_people = bool(state.get("left_to_people"))  # not in what a scheduler wrote that was older
+        self._watchdog.restore(map(str, state["wanted"]), left_to_people=left_to_people)
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
         self._bulletin.telling.restore(state.get("supervisors", {}))
         self._desk.restore(state)
@@ -366,9 +369,12 @@ class SchedulerCore:
         if not self._trust.lost and self.control.problems.get(Problem.DEVICE_MALFUNCTION) == TRANSLATOR:
             self._arbiter.decide(Ask(Event.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
 
-    def _malfunction_at_s(self) -> float | None:
-        """When a problem is made of the microscope's being lost; None if it is not, or is flagged already."""
-        return None if Problem.DEVICE_MALFUNCTION in self.control.problems else self._trust.due_s()
+    def _malfunction(self) -> tuple[float | None, str]:
+        """When a problem is made of it that the microscope can't be used, and in whose name; None: it can, or it is
+        flagged already."""
+        if Problem.DEVICE_MALFUNCTION in self.control.problems or self.control.ended:
+            return None, ""
+        return (_AT_ONCE_S, SCHEDULER) if self._watchdog.left_to_people else (self._trust.due_s(), TRANSLATOR)
 
     # --- time ---
 
@@ -391,9 +397,12 @@ class SchedulerCore:
         if (kept := self._catching_up.let_in()) is not None:
             self._on_request(kept, now_s, now_ns)
             return
-        malfunction_at_s = self._malfunction_at_s()
+        malfunction_at_s, told_by = self._malfunction()
         if malfunction_at_s is not None and now_s >= malfunction_at_s:
-            self._arbiter.decide(Ask(Event.FLAG, TRANSLATOR, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
+            if told_by == SCHEDULER:
+                self._watchdog.people_called()
+                self._log("WARNING", "the tip was in danger: bring it back to the surface, then clear device-malfunction")
+            self._arbiter.decide(Ask(Event.FLAG, told_by, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
             return
         holder = self.control.holder
         dead_at_s = self._absence.dead_at_s(holder)

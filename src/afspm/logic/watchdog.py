@@ -67,6 +67,7 @@ class Watchdog:
         self._can_retract = True  # as far as we know
         self._danger_told: str | None = None
         self._refused_at = -1  # states seen when the microscope last was not free
+        self._left_to_people = False
 
     @property
     def retract(self) -> str | None:
@@ -78,8 +79,18 @@ class Watchdog:
         """What is not done yet, to be kept over a restart of the scheduler."""
         return tuple(self._wanted)
 
-    def restore(self, wanted: Iterable[str]) -> None:
+    @property
+    def left_to_people(self) -> bool:
+        """It has retracted the tip, or could not, and nobody was called yet: to go on is for a person to decide."""
+        return self._left_to_people
+
+    def restore(self, wanted: Iterable[str], *, left_to_people: bool = False) -> None:
         self._wanted = list(wanted)
+        self._left_to_people = left_to_people
+
+    def people_called(self) -> None:
+        """The problem was flagged."""
+        self._left_to_people = False
 
     @property
     def wants_retract(self) -> bool:
@@ -202,7 +213,7 @@ class Watchdog:
         self._refused_at = -1
 
     def _forget(self) -> None:
-        self._wanted.pop(0)
+        self._left_to_people |= self._wanted.pop(0) == self._settings.retract
         self._attempts = 0
 
 

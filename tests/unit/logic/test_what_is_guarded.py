@@ -7,7 +7,7 @@ import json
 import pytest
 from logic_lab import NS, Lab, replies
 
-from afspm.logic.events import Effect, Forward, Kill, Log, SaveState, Tick
+from afspm.logic.events import ComponentDied, Effect, Forward, Kill, Log, SaveState, Tick
 from afspm.logic.limits import Limit, Limits
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
@@ -218,6 +218,30 @@ def test_what_can_not_be_retracted_is_critical() -> None:
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
     assert said(lab, "CRITICAL") == ["the feedback is off, and nobody looks after it: a problem was flagged"]
     assert sent(lab) == []
+
+
+@pytest.mark.parametrize("code", [ControlResponse.SUCCESS, ControlResponse.ACTION_ERROR])
+def test_after_the_tip_was_retracted_or_could_not_be_nobody_goes_on_until_a_person_says_so(
+    code: ControlResponse,
+) -> None:
+    lab = feedback_off()
+    lab.step(ComponentDied("experiment"))
+    lab.take_control("experiment")
+    lab.answer(lab.forwarded[-1], code)
+    assert lab.core.deadline_s() is not None
+    assert lab.core.deadline_s() <= lab.now_s
+    again = killed(lab, SchedulerSettings())  # nothing of it is lost with the scheduler
+    for one in (lab, again):
+        while Problem.DEVICE_MALFUNCTION not in one.core.control.problems:
+            one.now_s = max(one.now_s, one.core.deadline_s() or 0.0)
+            one.step(Tick())
+        assert one.holder is None
+        assert any("bring it back to the surface" in text for text in said(one, "WARNING"))
+        assert one.says("experiment", ControlRequest.REQUEST_CTRL, 0) is ControlResponse.WRONG_EXP_PROBLEM
+        one.clear("person", Problem.DEVICE_MALFUNCTION)
+        one.take_control("experiment")
+        one.step(Tick())
+        assert one.holder == "experiment"
 
 
 def test_the_experiment_ends_when_the_tip_is_out_of_danger() -> None:
