@@ -8,7 +8,7 @@ import tempfile
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from afspm.errors import FileError
 
@@ -87,13 +87,19 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
         raise FileError("there is no record in this folder", where=str(folder), hint="name the folder of a run, runs/…")
     try:
         try:
-            return _checked(f"{path.resolve().as_uri()}?mode=ro", path)
+            return _checked(read_only(path.resolve()), path)
         except sqlite3.OperationalError as error:
             if "unable to open" not in str(error) and "readonly" not in str(error):
                 raise
             return _checked_copy(path)  # what is beside it can't be made there
     except sqlite3.DatabaseError as error:
         raise damaged(path, error) from error
+
+
+def read_only(path: PurePath) -> str:
+    """An absolute path as SQLite is told to open it for reading. It knows no hosts: a share is part of the path."""
+    scheme, _, place = path.as_uri().partition("//")
+    return f"{scheme}{'//' if place.startswith('/') else '////'}{place}?mode=ro"
 
 
 def damaged(path: Path, error: Exception) -> FileError:
@@ -125,7 +131,7 @@ def _checked_copy(path: Path) -> sqlite3.Connection:
         for suffix in ("", "-wal"):
             with suppress(FileNotFoundError):
                 shutil.copy(f"{path}{suffix}", folder / f"{path.name}{suffix}")
-        connection = _checked(f"{(folder / path.name).as_uri()}?mode=ro", path, _OfCopy)
+        connection = _checked(read_only(folder / path.name), path, _OfCopy)
         assert isinstance(connection, _OfCopy)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import gc
 import sqlite3
 import tempfile
-from pathlib import Path
+from contextlib import closing
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from record_lab import ABOUT, Night
 import afspm
 from afspm.errors import FileError
 from afspm.model import ScopeState
-from afspm.record.journal import JOURNAL_FILE
+from afspm.record.journal import JOURNAL_FILE, read_only
 from afspm.record.store import Store
 
 
@@ -109,6 +110,22 @@ def test_the_newest_of_a_folder_of_runs_is_meant(night: Night, tmp_path: Path) -
     Store(tmp_path / "night-2", ABOUT).close()
     (tmp_path / "latest").write_text("night-2\n")
     assert afspm.open_run(tmp_path).folder == tmp_path / "night-2"
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        (r"C:\my runs\journal.sqlite", "file:///C:/my%20runs/journal.sqlite?mode=ro"),
+        (r"\\nas\runs\journal.sqlite", "file:////nas/runs/journal.sqlite?mode=ro"),
+    ],
+)
+def test_a_record_on_a_network_share_is_named_so_that_it_is_opened(path: str, said: str, tmp_path: Path) -> None:
+    assert read_only(PureWindowsPath(path)) == said
+    with closing(sqlite3.connect(tmp_path / JOURNAL_FILE)) as made:
+        made.execute("CREATE TABLE about (name)")
+    in_that_form = read_only(tmp_path / JOURNAL_FILE).replace("file:///", "file:////")
+    with closing(sqlite3.connect(in_that_form, uri=True)) as opened:
+        assert opened.execute("SELECT * FROM about").fetchall() == []
 
 
 def test_a_folder_without_a_record_is_named(tmp_path: Path) -> None:
