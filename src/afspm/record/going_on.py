@@ -53,7 +53,16 @@ def standing(folder: Path) -> str:
 
 def to_resume(folder: Path) -> str:
     """The command that goes on with a run."""
-    return f"`afspm run --resume {shlex.quote(str(folder))}`"
+    return f"`afspm run --resume {quoted(folder)}`"
+
+
+def quoted(path: Path) -> str:
+    """As it may be typed into a shell: that of Windows knows no single quotes, and takes a backslash as it is."""
+    if sys.platform != "win32":
+        return shlex.quote(str(path))
+    from subprocess import list2cmdline
+
+    return list2cmdline([str(path)])
 
 
 def _is_left(folder: Path) -> bool:

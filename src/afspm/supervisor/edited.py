@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, load
-from afspm.record.going_on import to_resume
+from afspm.record.going_on import quoted, to_resume
 
 
 def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> None:
@@ -25,7 +24,7 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
     """
     differs = differing(_whole(begun), _whole(load(*files)))
     if differs:
-        named = " ".join(shlex.quote(str(file)) for file in files)
+        named = " ".join(map(quoted, files))
         raise ConfigError(
             f"was edited since this run was begun, which goes on as it was: {'; '.join(differs)}",
             where=", ".join(map(str, files)),

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from afspm.record.going_on import cut_off, locked, standing
+from afspm.record import going_on
+from afspm.record.going_on import cut_off, locked, standing, to_resume
 
 
 def folder_of(tmp_path: Path, **facts: Any) -> Path:
@@ -60,3 +61,18 @@ def test_how_it_is_with_a_run_is_told_in_words(tmp_path: Path) -> None:
         assert standing(folder) == "it goes on"
     (folder / "run.json").write_text(json.dumps({"ended": "Ctrl-C"}), encoding="utf-8")
     assert standing(folder) == "Ctrl-C"
+
+
+@pytest.mark.parametrize(
+    ("system", "folder", "said"),
+    [
+        ("linux", "runs/my night", "`afspm run --resume 'runs/my night'`"),
+        ("win32", r"C:\runs\night", r"`afspm run --resume C:\runs\night`"),
+        ("win32", r"C:\my runs\night", r'`afspm run --resume "C:\my runs\night"`'),
+    ],
+)
+def test_the_command_that_resumes_can_be_typed_as_it_is_told(
+    monkeypatch: pytest.MonkeyPatch, system: str, folder: str, said: str
+) -> None:
+    monkeypatch.setattr(going_on.sys, "platform", system)
+    assert to_resume(Path(folder)) == said
