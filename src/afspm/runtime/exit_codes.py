@@ -18,12 +18,3 @@ class ExitCode(IntEnum):
     """The experiment ended (KILL)."""
     ORPHAN = 81
     """The parent went away, or asked us to stop by closing our standard input."""
-
-    @property
-    def restartable(self) -> bool:
-        return self is ExitCode.CRASHED
-
-
-def worth_restarting(code: int) -> bool:
-    """Whether a process that ended with this exit code (negative: a signal) should be started again."""
-    return code not in {ExitCode.DONE, ExitCode.CONFIG, ExitCode.ENDED, ExitCode.ORPHAN}

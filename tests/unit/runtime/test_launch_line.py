@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.errors import ConfigError
-from afspm.runtime.exit_codes import ExitCode, worth_restarting
+from afspm.logic.supervision import Policy
+from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch, Sockets
 
 FULL = Launch(
@@ -59,12 +60,5 @@ def test_a_typo_is_told_with_the_nearest_name() -> None:
         Launch.from_json('{"name": "x", "setings": {}}')
 
 
-@pytest.mark.parametrize("code", [1, 2, -9, -11, 137])
-def test_what_was_not_on_purpose_is_worth_a_restart(code: int) -> None:
-    assert worth_restarting(code)
-
-
-@pytest.mark.parametrize("code", [ExitCode.DONE, ExitCode.CONFIG, ExitCode.ENDED, ExitCode.ORPHAN])
-def test_what_was_on_purpose_is_not(code: ExitCode) -> None:
-    assert not worth_restarting(code)
-    assert not code.restartable
+def test_after_all_exits_on_purpose_and_no_others_a_process_is_not_started_again() -> None:
+    assert set(Policy().final_codes) == set(ExitCode) - {ExitCode.CRASHED}
