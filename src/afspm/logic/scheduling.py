@@ -401,7 +401,9 @@ class SchedulerCore:
         if malfunction_at_s is not None and now_s >= malfunction_at_s:
             if told_by == SCHEDULER:
                 self._watchdog.people_called()
-                self._log("WARNING", "the tip was in danger: bring it back to the surface, then clear device-malfunction")
+                self._log(
+                    "WARNING", "the tip was in danger: bring it back to the surface, then clear device-malfunction"
+                )
             self._arbiter.decide(Ask(Event.FLAG, told_by, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
             return
         holder = self.control.holder
