@@ -133,7 +133,7 @@ def _name_in(file: Path) -> str | None:
     import tomllib
 
     try:
-        name = tomllib.loads(file.read_text(encoding="utf-8")).get("name")
+        name = tomllib.loads(file.read_text(encoding="utf-8-sig")).get("name")  # as editors of Windows write it
     except (OSError, ValueError) as error:
         raise FileError(f"can't be read: {error}", where=str(file)) from error
     return name if isinstance(name, str) and name else None

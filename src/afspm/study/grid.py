@@ -91,7 +91,7 @@ def _value(text: str) -> Any:
 
 def _read(path: Path) -> Mapping[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"can't be read: {error}", where=str(path)) from error
     except tomllib.TOMLDecodeError as error:

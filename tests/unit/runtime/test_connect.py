@@ -61,6 +61,16 @@ def test_an_old_run_that_is_damaged_does_not_hide_the_newest(
     assert find_run(file).name == "night-2"
 
 
+def test_a_run_is_found_by_a_file_that_begins_as_editors_of_windows_let_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_folder(tmp_path / "runs", "night-1")
+    file = tmp_path / "other.toml"
+    file.write_text('name = "night"\n', encoding="utf-8-sig")
+    assert find_run(file).name == "night-1"
+
+
 def test_who_is_interrupted_while_joining_leaves_no_connection_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
