@@ -119,6 +119,8 @@ def parse_quantity(text: str) -> tuple[float, str]:
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise UnitError(f"{text!r} is not a number with a unit", hint='write it as "2.5 um"')
+    if match[2].startswith(","):  # else 1,5 um would be one of the unit ",5 um"
+        raise UnitError(f"{text!r} is not a number with a unit", hint="a number has a decimal point, and no commas")
     return float(match[1]), match[2]
 
 

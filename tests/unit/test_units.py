@@ -71,6 +71,13 @@ def test_kinds() -> None:
     assert parse_quantity("-1e-3 nA") == (-1e-3, "nA")
 
 
+@pytest.mark.parametrize("text", ["1,5 um", "10,000"])
+def test_a_decimal_comma_is_told(text: str) -> None:
+    with pytest.raises(UnitError) as refused:
+        parse_quantity(text)
+    assert "decimal point" in refused.value.hint
+
+
 def test_common_units_need_no_heavy_library() -> None:
     code = "import sys, afspm.units as u; u.si('2 um/s', 'm/s'); sys.exit('pint' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

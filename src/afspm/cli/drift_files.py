@@ -64,6 +64,8 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     contents, unreadable = read_all(paths)
     for told in unreadable:
         aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    if not contents:
+        raise InvalidValue("there is nothing to follow: no file was read", hint="name scans, or folders of them")
     found = series(contents, channel)
     for told in found.left_out:
         aside.print(f"left out: {told}", markup=False, soft_wrap=True)

@@ -97,5 +97,6 @@ def test_files_of_which_none_can_be_read_end_with_an_error(tmp_path: Path) -> No
     done = CliRunner().invoke(app, ["drift", "--channel", "Z", str(broken), str(tmp_path / "missing.ibw")])
     assert done.exit_code != 0
     assert isinstance(done.exception, InvalidValue)
+    assert "no file was read" in done.exception.what
     assert "a.sxm" in done.output
     assert "missing.ibw" in done.output
