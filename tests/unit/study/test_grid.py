@@ -44,7 +44,8 @@ def test_a_user_s_own_part_is_told_by_its_whole_name() -> None:
 
 def test_a_file_is_read_and_the_command_line_goes_on_top_of_it(tmp_path: Path) -> None:
     file = tmp_path / "grid.toml"
-    file.write_text('tracker = ["bank", "paper"]\nhours = 2\n[paper]\nqueue = [3, 5]\nf_min = 0.5\n', encoding="utf-8-sig")
+    text = 'tracker = ["bank", "paper"]\nhours = 2\n[paper]\nqueue = [3, 5]\nf_min = 0.5\n'
+    file.write_text(text, encoding="utf-8-sig")
     grid = Grid.of([str(file), "hours=3"])
     assert grid.values == {
         "tracker": ("bank", "paper"), "hours": (3,), "paper.queue": (3, 5), "paper.f_min": (0.5,),
