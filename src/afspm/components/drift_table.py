@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-import io
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from afspm.clock import iso_utc
-from afspm.components.records import LineFile
+from afspm.components.records import LineFile, csv_line
 from afspm.drift.record import COLUMNS as RECORD
 from afspm.drift.record import drift_at
 from afspm.runtime.component import Component
@@ -41,9 +40,7 @@ class DriftTable(Component):
         row = drift_row(message)
         if tuple(row[:2]) in self._written:
             return  # replayed after a restart
-        line = io.StringIO()
-        csv.writer(line, lineterminator="").writerow(row)
-        self._table.append([line.getvalue().replace("\n", " ")])
+        self._table.append([csv_line(row)])
         self._written.add(tuple(row[:2]))
 
 

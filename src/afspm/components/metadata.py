@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from afspm.clock import iso_utc
-from afspm.components.records import LineFile
+from afspm.components.records import LineFile, csv_line
 from afspm.model import ControlState, Region, Scan, ScopeState, ScopeStatus, Spectrum
 from afspm.runtime.component import Component
 
@@ -96,10 +95,18 @@ class Metadata(Component):
 
     def on_scan(self, scan: Scan) -> None:
         if scan.values.size:
-            self._write("scan", scan.time_ns, lambda at: scan_row(scan, at))
+            timed = replace(scan, time_ns=self._time_ns(scan))
+            self._write("scan", scan.time_ns, lambda at: scan_row(timed, at))
 
     def on_spectrum(self, spectrum: Spectrum) -> None:
-        self._write("spectrum", spectrum.time_ns, lambda at: spectrum_row(spectrum, at))
+        timed = replace(spectrum, time_ns=self._time_ns(spectrum))
+        self._write("spectrum", spectrum.time_ns, lambda at: spectrum_row(timed, at))
+
+    def _time_ns(self, measured: Scan | Spectrum) -> int | None:
+        """When it was finished; where it does not say so itself, when it was sent: rows are told apart by it."""
+        if measured.time_ns is None and self.packet is not None:
+            return self.packet.time_ns
+        return measured.time_ns
 
     def _circumstances(self, what: str, time_ns: int | None) -> Circumstances:
         """Those noted when it began, if it is the measurement that they were noted for."""
@@ -117,9 +124,7 @@ class Metadata(Component):
         identity = _identity(row_at(Circumstances()))
         if identity in self._written:
             return  # replayed after a restart
-        line = io.StringIO()
-        csv.writer(line, lineterminator="").writerow(row_at(self._circumstances(what, time_ns)))
-        self._table.append([line.getvalue().replace("\n", " ")])
+        self._table.append([csv_line(row_at(self._circumstances(what, time_ns)))])
         self._written.add(identity)
 
 

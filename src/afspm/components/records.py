@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 import os
 from collections.abc import Iterable
@@ -41,7 +43,7 @@ class LineFile:
             return []
         except OSError as error:
             raise FileError(f"can't be read: {error}", where=str(self.path)) from error
-        whole = text[: text.rfind("\n") + 1].splitlines()
+        whole = text.split("\n")[:-1]  # splitlines would cut names that hold other ends of lines
         return whole[1:] if self._header else whole
 
     def append(self, lines: Iterable[str]) -> None:
@@ -76,6 +78,13 @@ class LineFile:
             with self.path.open("r+b") as file:
                 file.truncate(whole)
         return f"{self._header}\n" if self._header and whole == 0 else ""
+
+
+def csv_line(row: Iterable[str]) -> str:
+    """A row of a table as one line."""
+    line = io.StringIO()
+    csv.writer(line, lineterminator="").writerow(row)
+    return line.getvalue().replace("\n", " ")
 
 
 def _append(path: Path, text: str) -> None:

@@ -15,7 +15,7 @@ from afspm.clock import iso_utc
 from afspm.components.metadata import COLUMNS, Metadata
 from afspm.components.records import LineFile
 from afspm.logic import arbitration as a
-from afspm.model import ControlMode, Problem, ScopeState, Spectrum
+from afspm.model import ControlMode, Problem, Scan, ScopeState, Spectrum
 from afspm.runtime.exit_codes import ExitCode
 
 
@@ -104,6 +104,30 @@ def test_a_scan_whose_beginning_nobody_saw_says_nothing_of_who_took_it(tmp_path:
     lab.at(10.0, lab.kill)
     run(Metadata(), lab, run_dir=str(tmp_path))
     assert {row["in_control"] for row in rows(tmp_path)} == {""}
+
+
+def test_scans_that_say_neither_when_nor_in_which_file_have_a_row_each(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    for at_s in (5.0, 6.0):
+        lab.at(at_s, lambda: lab.publish(Scan(REGION, "Height", "m", np.zeros((8, 8)))))
+        lab.at(at_s, lambda: lab.publish(Spectrum(None, "IV", ("U",), ("V",), np.zeros((5, 1)))))
+    lab.at(10.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    assert [row["measurement"] for row in rows(tmp_path)] == ["scan", "spectrum"] * 2
+    assert all(row["time"] for row in rows(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["a\u2028b.nc", "a\x85b.nc", 'a"b,c.nc'])
+def test_after_a_restart_a_file_of_whatever_name_is_not_there_twice(tmp_path: Path, name: str) -> None:
+    lab = Lab("metadata")
+    lab.publish(Scan(REGION, "Height", "m", np.zeros((8, 8)), 1_700_000_000_000_000_000, name))
+    first_life = context_of(lab, tmp_path / "state", run_dir=str(tmp_path))
+    lab.at(5.0, lab.parent_goes)
+    assert Metadata().run_process(first_life) == ExitCode.ORPHAN
+    lab.restart_component()
+    lab.at(20.0, lab.kill)
+    run(Metadata(), lab, tmp_path / "state", run_dir=str(tmp_path))
+    assert [row["filename"] for row in rows(tmp_path)] == [name]
 
 
 def test_a_row_that_a_kill_cut_in_two_is_taken_away(tmp_path: Path) -> None:
