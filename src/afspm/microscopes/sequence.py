@@ -54,6 +54,7 @@ class Sequence:
         self.said = said
         self._timeout_s = result_timeout_s
         self._waiting_since_s: float | None = None
+        self._broken_off = ScopeState.UNDEFINED
 
     def begin(self, state: ScopeState) -> list[Step]:
         """A request was accepted that leads to `state`, seen at the controller already or not."""
@@ -103,6 +104,8 @@ class Sequence:
             return []
         if seen.state not in MEASURING:
             return [Discard(), *self._say(seen)]
+        if self._broken_off in MEASURING and seen.state is not self._broken_off:
+            return [Discard(), *self._say(seen)]  # of the other kind: somebody began it
         if not self._timed_out(now_s):
             return []
         return [Complain("the controller goes on in spite of being stopped"), *self._say(seen)]
@@ -120,5 +123,7 @@ class Sequence:
         self._waiting_since_s = None
         if status == self.said:
             return []
+        if status == _INTERRUPTED:
+            self._broken_off = self.said.state
         self.said = status
         return [Say(status)]

@@ -61,3 +61,11 @@ def test_the_deadline_is_told_while_something_is_waited_for() -> None:
     assert sequence.deadline_s() is None
     assert sequence.observe(ScopeStatus(ScopeState.FREE), False, 5.0) == []
     assert sequence.deadline_s() == 15.0
+
+
+def test_what_somebody_begins_after_something_was_broken_off_is_another_story() -> None:
+    sequence = Sequence(ScopeStatus(ScopeState.SPEC), result_timeout_s=10.0)
+    broken_off, scanning = ScopeStatus(ScopeState.INTERRUPTED), ScopeStatus(ScopeState.SCANNING)
+    assert sequence.observe(broken_off, False, 1.0) == [Say(broken_off)]
+    assert sequence.observe(ScopeStatus(ScopeState.SPEC), False, 2.0) == [], "it has not stopped yet"
+    assert sequence.observe(scanning, False, 3.0) == [Discard(), Say(scanning)]

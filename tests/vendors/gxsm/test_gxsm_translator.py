@@ -400,6 +400,26 @@ def test_a_spectrum_is_stopped_while_the_tip_is_on_its_way_to_it(bench: Make) ->
     assert made.emulator.rig.spectrum is None
 
 
+@pytest.mark.parametrize("settings", [{}, {"card": "RPSPMC"}], ids=["sranger", "rpspmc"])
+def test_a_spectrum_is_not_taken_into_a_scan_that_somebody_began_meanwhile(
+    bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = bench(speed=20.0, **settings)
+    peer = made.start()
+    ready(peer, shape=(40, 32))
+    moved(peer, 100e-9, 10e-9)
+    began: list[str] = []
+    monkeypatch.setattr(made.emulator.program, "take_curve", began.append)
+    assert peer.set(names.MOVE_SPEED, "50", "nm/s").ok
+    assert peer.act(names.START_SPEC).ok
+    made.at_panel(lambda emulator: emulator.program.start_scan())
+    heard = peer.until(ScopeState.SCANNING) + peer.until(FREE)
+    assert "INTERRUPTED" in states(heard)
+    assert {scan.region for scan in scans(heard)} == {TURNED}, "the scan is published"
+    assert began == []
+    made.until_said("somebody began to measure")
+
+
 def test_the_approach_is_a_coarse_motor(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start()

@@ -124,6 +124,10 @@ class Activity:
     def status(self) -> ScopeStatus:
         """What GXSM is doing now; what has ended is awaited from here on."""
         doing, now_s = self.doing(), self._clock.now_s()
+        # a RedPitaya does not tell measuring from a program of its own that may lead the tip
+        led = self._hardware is Hardware.RPSPMC and now_s < self._arrives_s
+        if self._execute and doing.measuring and not led:
+            return self._forestalled()
         if self._execute:
             if not doing.moving and now_s >= self._arrives_s:
                 self._take_curve(now_s)
@@ -154,6 +158,13 @@ class Activity:
                 self._begin_curve("VP", self._frame.tip())
         curve = doing.probing and (self._harvest.what not in ("", SCAN) or not doing.scanning)
         return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
+
+    def _forestalled(self) -> ScopeStatus:
+        """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
+        self._log.error("no spectrum is taken: somebody began to measure while the tip was on its way to it")
+        self._execute, self._arrives_s = "", 0.0
+        self._harvest.forget()
+        return ScopeStatus(ScopeState.INTERRUPTED)
 
     def _take_curve(self, now_s: float) -> None:
         action, self._execute = self._execute, ""
