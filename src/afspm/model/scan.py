@@ -46,6 +46,11 @@ class ScanParameters:
     unit: str | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.region, Region | RegionChange | None):
+            raise InvalidValue(
+                f"the region of a scan is a Region, not {self.region!r}",
+                hint="e.g. Region(center_m=(0, 0), size_m=(1e-6, 1e-6))",
+            )
         if self.shape is None:
             return
         if isinstance(self.shape, ShapeChange):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from afspm.errors import InvalidValue
 from afspm.model import (
     ControlRequest,
     Frame,
@@ -48,7 +49,7 @@ class Plans:
         self._set: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def scan(self, region: Region | None, shape: tuple[int, int] | None) -> Plan:
-        if region is not None and self._frame is Frame.SAMPLE:
+        if isinstance(region, Region) and self._frame is Frame.SAMPLE:
             region = replace(region, frame=Frame.SAMPLE)
         wanted = ScanParameters(region, shape)
         facts = {"what": "scan", "region": _region_facts(region), "shape": list(shape) if shape else None}
@@ -65,8 +66,8 @@ class Plans:
         )
 
     def spectrum(self, at_m: tuple[float, float] | None, kind: str | None) -> Plan:
-        facts: dict[str, Any] = {"what": "spectrum", "at_m": [float(at_m[0]), float(at_m[1])] if at_m else None}
-        facts["kind"] = kind
+        at_m = None if at_m is None else _place(at_m)
+        facts: dict[str, Any] = {"what": "spectrum", "at_m": None if at_m is None else list(at_m), "kind": kind}
         if self._frame is Frame.SAMPLE:
             facts["frame"] = self._frame.value
 
@@ -90,6 +91,7 @@ class Plans:
 
     def move_probe(self, xy_m: tuple[float, float], until_s: float | None) -> None:
         """Move the probe, unless it stands there."""
+        xy_m = _place(xy_m)
         now = self._view.probe_position
         if now is not None and now.xy_m == xy_m:
             return
@@ -112,6 +114,15 @@ class Plans:
         # a controller may round: then this is what our wish looks like when it is set; what lies elsewhere is another's
         now = self._view.scan_parameters
         self._set = (wanted, now) if _is_set(wanted, now, FITS) else None
+
+
+def _place(xy_m: Any) -> tuple[float, float]:
+    """(x, y) of two numbers, in whatever they come (an array of numpy is not compared as a tuple is)."""
+    try:
+        x, y = xy_m
+        return float(x), float(y)
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"a place is (x, y) in metres, not {xy_m!r}", hint="e.g. (1e-7, 0)") from error
 
 
 def fits(facts: dict[str, Any], result: Any) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -172,7 +173,7 @@ class Scope:
         with self._call():
             until_s = self._link.until(timeout_s)
             with self._holding.hold(until_s=until_s):
-                self._plans.move_probe((float(xy_m[0]), float(xy_m[1])), until_s)
+                self._plans.move_probe(xy_m, until_s)
 
     def action(self, name: str, *, timeout_s: float | None = None) -> None:
         """Have the microscope do something by its name; returns when it has accepted it."""
@@ -302,8 +303,8 @@ class Scope:
 
     def sleep(self, experiment_s: float) -> None:
         """Let time pass in the experiment. Unlike `time.sleep` it ends with the experiment, and keeps its clock."""
-        if not experiment_s >= 0.0:
-            raise InvalidValue(f"can't wait for {experiment_s} s")
+        if not (isinstance(experiment_s, Real) and experiment_s >= 0.0):
+            raise InvalidValue(f"can't wait for {experiment_s!r}", hint="a number of seconds, zero or more")
         clock = self._link.clock
         end_s = clock.now_s() + experiment_s
         with self._call():

@@ -429,6 +429,26 @@ def test_the_probe_stands_where_it_was_moved_to_when_the_call_returns(lab: Lab, 
     assert scope.state is ScopeState.FREE
 
 
+def test_a_place_may_be_an_array(lab: Lab, scope: Scope) -> None:
+    place = np.array([2e-7, 3e-7])
+    scope.move_probe(place)  # type: ignore[arg-type]
+    assert scope.spectrum(place).position_m == (2e-7, 3e-7)  # type: ignore[arg-type]
+
+
+def test_what_is_no_place_region_or_time_is_told_with_what_would_be_right(lab: Lab, scope: Scope) -> None:
+    for wrong, hint in (
+        (lambda: scope.spectrum(0), "(1e-7, 0)"),  # type: ignore[arg-type]
+        (lambda: scope.move_probe((0.0, 0.0, 0.0)), "(1e-7, 0)"),  # type: ignore[arg-type]
+        (lambda: scope.scan(1e-6), "Region("),  # type: ignore[arg-type]
+        (lambda: scope.sleep("1 min"), "seconds"),  # type: ignore[arg-type]
+        (lambda: scope.sleep(math.nan), "seconds"),
+    ):
+        with pytest.raises(InvalidValue) as refused:
+            wrong()
+        assert hint in refused.value.hint
+    assert lab.executed == []
+
+
 def test_parameters_have_units_both_ways(lab: Lab, scope: Scope) -> None:
     assert scope.set("tip-bias-voltage", 250.0, "mV") == pytest.approx(250.0)
     assert scope.get("tip-bias-voltage", "mV") == pytest.approx(250.0e3)  # the laboratory told V
