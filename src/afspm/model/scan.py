@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -56,12 +57,16 @@ class ScanParameters:
         if isinstance(self.shape, ShapeChange):
             ScanParameters(shape=self.shape.onto((1, 1)))
             return
-        if not (isinstance(self.shape, tuple | list) and len(self.shape) == 2):
+        try:
+            rows, columns = map(operator.index, self.shape)
+        except (TypeError, ValueError) as error:
             raise InvalidValue(
-                f"the shape of a scan is (rows, columns), not {self.shape!r}", hint="e.g. shape=(128, 128)"
-            )
-        if min(self.shape) < 1:
-            raise InvalidValue(f"a scan of {self.shape[0]} rows and {self.shape[1]} columns has no pixels")
+                f"the shape of a scan is (rows, columns), not {self.shape!r}",
+                hint="two whole numbers, e.g. shape=(128, 128)",
+            ) from error
+        if min(rows, columns) < 1:
+            raise InvalidValue(f"a scan of {rows} rows and {columns} columns has no pixels")
+        object.__setattr__(self, "shape", (rows, columns))
 
     def onto(self, current: ScanParameters) -> ScanParameters:
         """What is in force after these were asked for while `current` were.

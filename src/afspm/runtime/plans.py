@@ -52,7 +52,11 @@ class Plans:
         if isinstance(region, Region) and self._frame is Frame.SAMPLE:
             region = replace(region, frame=Frame.SAMPLE)
         wanted = ScanParameters(region, shape)
-        facts = {"what": "scan", "region": _region_facts(region), "shape": list(shape) if shape else None}
+        facts = {
+            "what": "scan",
+            "region": _region_facts(region),
+            "shape": None if shape is None else [int(n) for n in shape],
+        }
         return Plan(
             what="scan",
             action=names.START_SCAN,

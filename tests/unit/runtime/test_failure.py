@@ -124,6 +124,8 @@ def test_asking_for_the_scope_too_early_is_told_at_the_line_that_did() -> None:
         lambda: Region(0, 1e-6),
         lambda: ScanParameters(shape=64),
         lambda: ScanParameters(shape=(1, 2, 3)),
+        lambda: ScanParameters(shape=(64.0, 64.0)),
+        lambda: ScanParameters(shape=("64", 64)),
     ],
 )
 def test_values_of_the_wrong_kind_are_told_with_what_would_be_right(wrong: Callable[[], object]) -> None:

@@ -429,6 +429,11 @@ def test_the_probe_stands_where_it_was_moved_to_when_the_call_returns(lab: Lab, 
     assert scope.state is ScopeState.FREE
 
 
+@pytest.mark.parametrize("shape", [np.array([4, 6]), (np.int64(4), np.int64(6)), [4, 6]])
+def test_a_shape_may_be_of_numpy(lab: Lab, scope: Scope, shape: tuple[int, int]) -> None:
+    assert scope.scan(REGION, shape=shape, key="once").first.shape == (4, 6)
+
+
 def test_a_place_may_be_an_array(lab: Lab, scope: Scope) -> None:
     place = np.array([2e-7, 3e-7])
     scope.move_probe(place)  # type: ignore[arg-type]
