@@ -137,20 +137,34 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
     made.until_said("unnamed001.sxm): it was fetched from Nanonis", "session): it was fetched from Nanonis")
 
 
-def test_a_scan_that_does_not_begin_is_refused_and_the_one_before_not_taken_for_it(
-    bench: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = bench()
+def test_a_scan_that_does_not_begin_is_broken_off_and_the_one_before_not_taken_for_it(bench: Make) -> None:
+    made = bench(speed=20.0)
     peer = small(made)
     assert peer.act(names.START_SCAN).ok
     assert scans(peer.until(FREE))
-    monkeypatch.setattr(made.emulator.panel, "start_scan", lambda upwards: None)
-    response = peer.act(names.START_SCAN)
-    assert response.code == ControlResponse.ACTION_ERROR
-    assert "was told to begin a scan, and does not" in response.reason
-    monkeypatch.undo()
+    made.strike("no-start")
     assert peer.act(names.START_SCAN).ok
-    assert states(peer.until(FREE)) == ["SCANNING", "FREE"]
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(heard)
+    made.until_said("it was never seen running")
+
+
+@pytest.mark.parametrize("kinds", [("late-start",), ("ends-at-once",), ("ends-at-once", "late-start")])
+def test_a_scan_that_begins_late_is_the_one_that_is_published(bench: Make, kinds: tuple[str, ...]) -> None:
+    """It is asked for the end of the scan before that has begun: what it hears of another, or of none, is no end."""
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    first = scans(peer.until(FREE))
+    for kind in kinds:
+        made.strike(kind, duration_s=40.0)
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "FREE"]
+    second = scans(heard)
+    assert len(second) == len(first)
+    assert all(scan.filename.endswith("unnamed002.sxm") for scan in second)
 
 
 def test_a_start_that_was_lost_on_its_way_gives_no_scan_of_before(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:

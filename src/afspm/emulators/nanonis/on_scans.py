@@ -18,7 +18,7 @@ def _action(panel: Panel, action: int, direction: int) -> Answer:
         if panel.scanning is not None:  # it begins anew
             panel.rig.stop_scan()
             panel.advance(now_s)
-        panel.start_scan(bool(direction))
+        panel.begin_scan(bool(direction))
     elif action == 1:
         panel.rig.stop_scan()
     elif action == 2 and scan is not None:
@@ -39,6 +39,8 @@ def _scan_status(panel: Panel) -> Answer:
 @answers("Scan.WaitEndOfScan")
 def _wait_end_of_scan(panel: Panel, timeout_ms: int) -> Answer:
     """Of the next end: one that has been is none."""
+    if panel.scanning is None and panel.faults.lasts("ends-at-once", panel.clock.now_s()):
+        return 0, ""
     ends = panel.ends
     return Later(lambda _: (0, panel.last_path) if panel.ends > ends else None, deadline_s(panel, timeout_ms), (1, ""))
 

@@ -24,6 +24,9 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
     "file-missing": "a file is announced and never written",
     "stale-name": "the file of the scan before is announced for a scan",
     "autosave-off": "scans and spectra are not saved for the duration, whatever is set",
+    "late-start": "a scan begins only after the duration, and is not told as running until then",
+    "no-start": "a scan does not begin, and nobody is told",
+    "ends-at-once": "for the duration, who waits for the end of a scan while there is none is answered at once",
     "safe-tip": "the safe tip withdraws the tip and ends the scan",
     "panel-stop": "somebody stops the scan at the panel",
 }
@@ -94,6 +97,7 @@ class Panel:
         self.own_speed, self.own_speed_m_s = True, rig.move_speed_m_s
         self.registers: dict[str, tuple[Any, ...]] = {}
         self._late: list[tuple[float, Path, bytes]] = []
+        self._starts: tuple[float, bool] | None = None
         self._saved = {".sxm": 0, ".dat": 0}
         self.release, self.rows_as_recorded = release, rows_as_recorded
 
@@ -102,6 +106,9 @@ class Panel:
     def advance(self, now_s: float) -> float | None:
         """Up to now; returns when a file is to be written."""
         self._go_wrong(now_s)
+        if self._starts is not None and now_s >= self._starts[0]:
+            (_, upwards), self._starts = self._starts, None
+            self.start_scan(upwards)
         if self.scanning is not None and not self.scanning.scan.running(now_s):
             self._end_scan(self.scanning, now_s)
         if self.curve is not None and not self.curve.running(now_s):
@@ -110,7 +117,8 @@ class Panel:
         self._late = [late for late in self._late if late[0] > now_s]
         for _, path, content in due:
             path.write_bytes(content)
-        return min((late[0] for late in self._late), default=None)
+        starts = [] if self._starts is None else [self._starts[0]]
+        return min((*starts, *(late[0] for late in self._late)), default=None)
 
     def _go_wrong(self, now_s: float) -> None:
         if self.scanning is not None and self.faults.strikes("panel-stop", now_s):
@@ -119,8 +127,17 @@ class Panel:
             self.rig.withdraw()
             self.z_controller = "safe"
 
+    def begin_scan(self, upwards: bool) -> None:
+        """As somebody asks for it. Raises RigBusy."""
+        now_s = self.clock.now_s()
+        late = self.faults.strikes("late-start", now_s)
+        if late is not None:
+            self._starts = (now_s + late.duration_s, upwards)
+        elif not self.faults.strikes("no-start", now_s):
+            self.start_scan(upwards)
+
     def start_scan(self, upwards: bool) -> None:
-        """Raises RigBusy."""
+        """At once. Raises RigBusy."""
         x, y, width, height, clockwise_deg = self.frame
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
         self.rig.region = Region((x, y), size_m, -math.radians(clockwise_deg))

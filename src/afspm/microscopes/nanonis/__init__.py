@@ -213,7 +213,6 @@ class Nanonis(Microscope):
         except protocol.NanonisError:
             self._activity.forget()
             raise
-        self._activity.settle_scan()
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
@@ -266,7 +265,7 @@ class Nanonis(Microscope):
     def retract(self) -> None:
         """Withdraw the tip by its piezo, whatever is going on, and whether that can be stopped or not."""
         try:
-            if self._ask("Scan.StatusGet")[0]:
+            if self._harvest.what == SCAN or self._ask("Scan.StatusGet")[0]:
                 self.stop_scan()
             elif self._harvest.what:
                 self.stop_spec()

@@ -16,8 +16,10 @@ from afspm.microscopes.nanonis.listener import CurveEnded, Failed, Heard, ScanEn
 from afspm.microscopes.nanonis.session import APPROACH, MODULES, Session
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 
-_SETTLES_S: Final = 2.0
-"""So long, in real time, what was begun may take to be seen running."""
+_SETTLES_S: Final = 1.0
+"""So long, in real time, a spectrum may take to be seen running."""
+_SHOWS_S: Final = 10.0
+"""The same of a scan, which may have to go to its first line."""
 _LATEST_S: Final = 10.0
 """So much later than it should the tip may arrive, in experiment time."""
 _SAFE_TIP, _WITHDRAWING = 5, 6
@@ -46,6 +48,7 @@ class Activity:
         self._occupied = (ScopeState.FREE, 0.0)
         self._arrives_s = 0.0
         self._was_safe = False
+        self._shows_until_s = 0.0
 
     # --- what is begun ---
 
@@ -55,6 +58,7 @@ class Activity:
         self._listener.scan()
         taken = {"frame": as_list(region)}
         self._harvest.begin(SCAN, self._session_folder(), taken)
+        self._shows_until_s = self._clock.monotonic_s() + _SHOWS_S
 
     def begin_curve(self, kind: str) -> None:
         """A spectrum begins, or was found running."""
@@ -73,36 +77,22 @@ class Activity:
         self.curve, self._kind_asked = None, kind
         same_name = ""
         self._listener.curve(MODULES[kind], same_name)
-        self._seen_running(f"{MODULES[kind]}.StatusGet")
+        self._settle(f"{MODULES[kind]}.StatusGet")
 
-    def settle_scan(self) -> None:
-        """Until the scan that was begun is seen running, or has ended already.
-
-        Raises:
-            Refused: ACTION_ERROR: Nanonis does not scan; what it still has in memory is of the scan before.
-        """
-        if not self._seen_running("Scan.StatusGet") and not self._harvest.has_file():
-            self.forget()
-            raise Refused(ControlResponse.ACTION_ERROR, "Nanonis was told to begin a scan, and does not")
-        self._harvest.seen()
-
-    def _seen_running(self, status: str) -> bool:
-        """Whether what was begun is seen running, or has ended already.
+    def _settle(self, status: str) -> None:
+        """Until what was begun is seen running, or has ended already.
 
         Raises:
             Refused: ACTION_ERROR: Nanonis would not.
         """
         until_s = self._clock.monotonic_s() + _SETTLES_S
-        while not self._ask(status)[0]:
-            if self._clock.monotonic_s() >= until_s:
-                return False
+        while not self._ask(status)[0] and self._clock.monotonic_s() < until_s:
             for heard in self._listener.heard():
                 if isinstance(heard, Failed) and not isinstance(heard.error, ControllerLost):
                     self.forget()
                     raise Refused(ControlResponse.ACTION_ERROR, str(heard.error))
                 self._take(heard)
-                return True
-        return True
+                return
 
     def forget(self) -> None:
         """Nothing comes of what was begun."""
@@ -137,6 +127,11 @@ class Activity:
         told, self._told = self._told, None
         if scanning:
             return self._scanning(told)
+        if self._harvest.what == SCAN and not self._harvest.was_seen and not self._harvest.has_file():
+            if self._clock.monotonic_s() < self._shows_until_s:
+                self._listener.scan()  # what it has heard was not of this one
+                return ScopeStatus(ScopeState.SCANNING)
+            told = None
         if self._harvest.what == SCAN or told is not None:
             self._end(told)
         state = self._besides_scans()

@@ -61,6 +61,11 @@ class Harvest(Measurements):
         newest = max((file.stat().st_mtime_ns for file in self._files(folder, what)), default=0)
         self._begins(what, {"folder": str(folder), "newest_ns": newest, **taken})
 
+    @property
+    def was_seen(self) -> bool:
+        """Whether what is running was ever seen running: if not, what Nanonis has in memory is of the scan before."""
+        return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
+
     def seen(self) -> None:
         """What is running was seen running."""
         if self._kept["running"] is not None:
@@ -79,7 +84,7 @@ class Harvest(Measurements):
             self._ends({"told": told, "end_ns": now_ns, "fetch_at_s": fetch_at_s})
         ended = self._kept["ended"]
         if ended is not None and told is not None:
-            ended["told"], ended["seen"] = told, True
+            ended["told"] = told
             if not told:
                 ended["fetch_at_s"] = now_s
 
@@ -124,7 +129,7 @@ class Harvest(Measurements):
     def _fetch(self, fetch: Fetch, ended: Mapping[str, Any], file: Path | None) -> None:
         missed = str(file or ended["told"] or f"in {ended['folder']}")
         try:
-            if not ended.get("seen", True):  # its start was lost: in Nanonis' memory is the scan before
+            if not ended.get("seen", True):
                 raise FileError("it was never seen running")
             content = list(fetch(ended))
             _refuse_gaps(content)
