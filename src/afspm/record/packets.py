@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -19,6 +18,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+Query = Callable[[str, Sequence[Any]], list[Any]]
+"""Asks the journal; raises FileError where it is damaged."""
+
 _AT_ONCE = 500
 _FILES_KEPT = 4
 _LAST = chr(0x10FFFF)  # after every envelope
@@ -26,15 +28,15 @@ _COLUMNS = "time_ns, envelope, message, payload, scan, spectrum, channel, first_
 
 
 def packets(
-    journal: sqlite3.Connection,
+    query: Query,
     folder: Path,
     since_ns: int,
     messages: Sequence[str] | None,
     tell: Callable[[str], None] | None,
 ) -> Iterator[Packet]:
     """Packets of the scheduler as they were published, oldest first."""
-    values = _Values(journal, folder)
-    for time_ns, envelope, message, payload, *place in _rows(journal, since_ns, messages):
+    values = _Values(query, folder)
+    for time_ns, envelope, message, payload, *place in _rows(query, since_ns, messages):
         try:
             found = values.of(*place)
         except FileError as error:
@@ -46,13 +48,13 @@ def packets(
 
 
 def without_reading_files(
-    journal: sqlite3.Connection, frame: Frame, messages: Sequence[str] | None
+    query: Query, frame: Frame, messages: Sequence[str] | None
 ) -> Iterator[tuple[Packet, str, Any]]:
     """Packets, names of their messages, and what is in them: scans of the right shape, but with NaN for values.
 
     Lines of running scans and what can't be read are left out.
     """
-    for time_ns, envelope, message, payload, scan, _, _, _, _ in _rows(journal, -1, messages):
+    for time_ns, envelope, message, payload, scan, _, _, _, _ in _rows(query, -1, messages):
         if not message or message == "ScanLines":
             continue
         try:
@@ -64,13 +66,13 @@ def without_reading_files(
         yield Packet(envelope, payload, time_ns), message, _placed(thing, frame)
 
 
-def _rows(journal: sqlite3.Connection, since_ns: int, messages: Sequence[str] | None) -> Iterator[Any]:
+def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterator[Any]:
     """Some at a time, so that a reader that takes its time holds up nobody, and what is written meanwhile comes too."""
     wanted = "" if messages is None else f" AND message IN ({', '.join('?' * len(messages))})"
     sql = f"SELECT {_COLUMNS} FROM packets WHERE source = ? AND (time_ns, envelope) > (?, ?){wanted}"
     sql += f" ORDER BY time_ns, envelope LIMIT {_AT_ONCE}"
     after = (since_ns, _LAST)
-    while rows := journal.execute(sql, (SCHEDULER, *after, *(messages or ()))).fetchall():
+    while rows := query(sql, (SCHEDULER, *after, *(messages or ()))):
         yield from rows
         after = rows[-1][:2]
 
@@ -92,8 +94,8 @@ def _placed(thing: Any, frame: Frame) -> Any:
 class _Values:
     """The values of packets, from the files that they are in; a few files are kept, since channels come together."""
 
-    def __init__(self, journal: sqlite3.Connection, folder: Path) -> None:
-        self._journal = journal
+    def __init__(self, query: Query, folder: Path) -> None:
+        self._query = query
         self._folder = folder
         self._kept: OrderedDict[str, Any] = OrderedDict()
 
@@ -115,7 +117,7 @@ class _Values:
     def _content(self, table: str, number: int) -> Any:
         from afspm.files import read
 
-        (file,) = self._journal.execute(f"SELECT file FROM {table} WHERE number = ?", (number,)).fetchone()
+        ((file,),) = self._query(f"SELECT file FROM {table} WHERE number = ?", (number,))
         if file not in self._kept:
             self._kept[file] = read(self._folder / file)
             if len(self._kept) > _FILES_KEPT:

@@ -184,7 +184,7 @@ class Run:
         Raises:
             FileError: a file is missing or damaged.
         """
-        yield from packets(self._journal, self.folder, since_ns, messages, tell)
+        yield from packets(self._query, self.folder, since_ns, messages, tell)
 
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:
         """What it came to, as the dashboard shows it. Files of scans are not read for it.
@@ -196,7 +196,7 @@ class Run:
         from afspm.record.overview import Overview
 
         overview = Overview(problems or self.problem_names)
-        for packet, message, thing in without_reading_files(self._journal, self.frame, messages):
+        for packet, message, thing in without_reading_files(self._query, self.frame, messages):
             overview.take(message, thing, packet.time_ns or 0, packet.envelope)
         return overview
 

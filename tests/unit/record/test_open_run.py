@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import sqlite3
 import tempfile
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -17,6 +18,7 @@ import afspm
 from afspm.errors import FileError
 from afspm.model import ScopeState
 from afspm.record.journal import JOURNAL_FILE, read_only
+from afspm.record.run import Run
 from afspm.record.store import Store
 
 
@@ -149,7 +151,17 @@ class _nothing:  # noqa: N801 - an empty file is a new journal to whoever writes
     def __exit__(self, *_: object) -> None: ...
 
 
-def test_a_journal_that_is_damaged_inside_is_named_when_that_is_read(night: Night, tmp_path: Path) -> None:
+READINGS: dict[str, Callable[[Run], object]] = {
+    "scans": lambda run: list(run.scans),
+    "packets": lambda run: list(run.packets()),
+    "overview": lambda run: run.overview(),
+}
+
+
+@pytest.mark.parametrize("reading", READINGS.values(), ids=READINGS)
+def test_a_journal_that_is_damaged_inside_is_named_when_that_is_read(
+    night: Night, tmp_path: Path, reading: Callable[[Run], object]
+) -> None:
     store = Store(tmp_path, ABOUT)
     for number in range(1, 40):
         store.take(night.whole_scan(number))
@@ -158,13 +170,12 @@ def test_a_journal_that_is_damaged_inside_is_named_when_that_is_read(night: Nigh
     data[8192:] = np.random.default_rng(1).bytes(len(data) - 8192)
     (tmp_path / JOURNAL_FILE).write_bytes(data)
     with pytest.raises(FileError, match=r"journal\.sqlite"):
-        _read_all(tmp_path)
+        _open_and_read(tmp_path, reading)
 
 
-def _read_all(folder: Path) -> None:
+def _open_and_read(folder: Path, reading: Callable[[Run], object]) -> None:
     with afspm.open_run(folder) as run:
-        list(run.scans)
-        list(run.packets())
+        reading(run)
 
 
 def test_the_journal_of_a_version_to_come_is_refused(tmp_path: Path) -> None:
