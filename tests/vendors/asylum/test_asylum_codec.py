@@ -263,7 +263,16 @@ def test_a_folder_that_can_not_be_seen_from_here_is_asked_for(monkeypatch: pytes
 
 
 @pytest.mark.parametrize(
-    "setting", [{"base_name": "1st"}, {"base_name": "MyMask"}, {"base_name": "x" * 18}, {"spots": "?"}]
+    "setting",
+    [
+        {"base_name": "1st"},
+        {"base_name": "MyMask"},
+        {"base_name": "x" * 18},
+        {"base_name": "a night"},
+        {"base_name": "a/../b"},
+        {"base_name": "a:b"},
+        {"spots": "?"},
+    ],
 )
 def test_settings_that_can_not_be(setting: dict[str, str]) -> None:
     with pytest.raises(ConfigError):

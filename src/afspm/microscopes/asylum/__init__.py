@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -25,7 +26,8 @@ ENGAGED: Final = "x-engaged"
 
 _AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC_KIND: FORCE}
 _SPOTS: Final = ("image", "scanner", "none")
-_LONGEST_NAME: Final = 17
+_NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
+"""Of a wave of Igor's, with room for the number; it is a file's name, too."""
 
 
 class Asylum(Microscope):
@@ -288,10 +290,8 @@ class Asylum(Microscope):
 
 def _checked_name(name: str) -> str:
     """What Asylum takes for a base name."""
-    fits = (
-        len(name) <= _LONGEST_NAME and name.isascii() and (not name or name[0].isalpha()) and "mask" not in name.lower()
-    )
+    fits = not name or (re.fullmatch(_NAME, name) and "mask" not in name.lower())
     if not fits:
-        hint = f'up to {_LONGEST_NAME} letters and digits, a letter first, no "Mask"'
+        hint = 'up to 17 letters, digits and "_", a letter first, no "Mask"'
         raise ConfigError(f"Asylum does not take {name!r}", where="base_name", hint=hint)
     return name
