@@ -95,6 +95,7 @@ class Gxsm(Microscope):
         self._frame = Frame(ask, user_unit_m(ask))
         if self._saves and AUTOSAVE_OFF in self._actions:
             ask.call("action", AUTOSAVE_OFF)
+            self.log.info("GXSM's Auto Save of scans is off from now on, and stays off: see the setting saving")
         self._kept: dict[str, Any] = self.memory.setdefault("kept", {names.SPEC_KIND: "IV", "probe": None})
         self._harvest = Harvest(
             self.memory,
