@@ -55,7 +55,8 @@ class Component:
         clock: the time in the experiment. Never use `time.time()`.
         log: a `logging.Logger`.
         name: of this component in the experiment file.
-        memory: a dict kept on disk: it is there again after a restart.
+        memory: a dict kept on disk, written when a handler has returned (in `run`: by its `save`): it is there again
+            after a restart.
         run_dir: the folder of this run.
         simulated: whether the microscope is a simulated one; say so in what you write.
         packet: the packet that is being handled (its envelope, its time), None between handlers.

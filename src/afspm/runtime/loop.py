@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from afspm import wire
@@ -87,7 +87,7 @@ class ComponentLoop:
         return code
 
     def _begin(self) -> None:
-        with self._activity.step():
+        with self._handler():
             self._component.on_start()
         if not self._is_script:  # a script may go on with what it held control for
             self._scope.give_back_inherited()
@@ -98,7 +98,7 @@ class ComponentLoop:
         while True:
             due_s = self._ticker.due_in_s() if self._ticker else None
             if due_s is not None and due_s <= 0.0 and self._ticker:
-                with self._activity.step():
+                with self._handler():
                     self._component.on_tick()
                 self._ticker.done()
                 due_s = 0.0
@@ -107,7 +107,7 @@ class ComponentLoop:
 
     def _handle_what_came(self, at_most: int | None = None) -> None:
         while (at_most is None or at_most > 0) and (packet := self._backlog.take()) is not None:
-            with self._activity.step():
+            with self._handler():
                 self._dispatcher.give(packet)
             at_most = None if at_most is None else at_most - 1
 
@@ -123,12 +123,20 @@ class ComponentLoop:
     def _end(self) -> None:
         """Say good-bye to the component. What it can't do any more must not hide why we ended."""
         try:
-            with self._activity.step():
+            with self._handler():
                 self._component.on_end()
         except (ExperimentEnded, StopRequested):
             self._context.log.debug("on_end asked for something after the end")
         except Exception as error:
             self._context.log.error("on_end failed: %s", failure.told(error, self._context.name))
+
+    @contextlib.contextmanager
+    def _handler(self) -> Iterator[None]:
+        """One of the component's handlers: what it has put into memory is kept, unless it fails."""
+        with self._activity.step():
+            yield
+            if not self._is_script:  # a script says itself when what it remembers belongs together
+                self._component.memory.save_changes()
 
     def _keep(self, packet: Packet, ours: bool) -> None:
         if self._dispatcher.wants(packet):

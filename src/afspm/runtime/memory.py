@@ -38,6 +38,7 @@ class Memory(MutableMapping[str, Any]):
         if path is not None:
             values, self.damage = load(path, _read)
             self._values = values or {}
+        self._saved = json.dumps(self._values, ensure_ascii=False)
 
     def save(self) -> bool:
         """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
@@ -52,19 +53,28 @@ class Memory(MutableMapping[str, Any]):
             InvalidValue: a value is not of JSON's types.
             FileError: the folder is gone …
         """
-        try:
-            text = json.dumps(self._values, ensure_ascii=False)
-        except (TypeError, ValueError) as error:
-            raise InvalidValue(
-                f"a value can't be kept: {error}", where="memory", hint="keep numbers, texts, lists and dicts"
-            ) from error
+        text = self._text()
         with self._told.trying():
             if self._generations is not None:
                 self._generations.save(text.encode())
             elif self._path is not None:
                 write_whole(self._path, [text.encode(), b"\n"])
+            self._saved = text
             return True
         return False
+
+    def save_changes(self) -> None:
+        """`save`, if anything is other than it was saved last, however deep within."""
+        if self._text() != self._saved:
+            self.save()
+
+    def _text(self) -> str:
+        try:
+            return json.dumps(self._values, ensure_ascii=False, default=_number)
+        except (TypeError, ValueError) as error:
+            raise InvalidValue(
+                f"a value can't be kept: {error}", where="memory", hint="keep numbers, texts, lists and dicts"
+            ) from error
 
     def __getitem__(self, key: str) -> Any:
         return self._values[key]
@@ -85,6 +95,13 @@ class Memory(MutableMapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"<Memory {self._values!r}>"
+
+
+def _number(value: Any) -> Any:
+    """A number of numpy as one of Python's."""
+    if getattr(value, "shape", None) == ():
+        return value.item()
+    raise TypeError(f"it is of the type {type(value).__name__}")
 
 
 def _read(content: bytes) -> dict[str, Any]:

@@ -334,6 +334,35 @@ def test_what_is_given_by_the_runtime_is_missed_in_words_in_the_constructor() ->
         _ = Sharpness().skope  # type: ignore[attr-defined]
 
 
+class Counts(Component):
+    """Counts scans, and fails at those of one channel."""
+
+    def on_scan(self, scan: Scan) -> None:
+        self.memory.setdefault("seen", []).append(scan.channel)
+        if scan.channel == "Phase":
+            raise ValueError("I can't read that")
+
+
+def test_what_a_handler_remembers_is_kept_when_it_returns_and_not_when_it_fails(tmp_path: Path) -> None:
+    lab = Lab("counts")
+    lab.at(10.0, lambda: lab.publish_scan(REGION))
+    with pytest.raises(ValueError, match="read that"):
+        run(Counts(), lab, tmp_path)
+    assert json.loads((tmp_path / "counts.json").read_text()) == {"seen": ["Height"]}
+
+
+def test_a_script_says_itself_when_it_has_remembered_all(tmp_path: Path) -> None:
+    class Script(Counts):
+        def on_scan(self, scan: Scan) -> None:
+            self.memory["half"] = True
+
+        def run(self) -> None:
+            self.scope.scan(REGION)
+
+    run(Script(), Lab("script"), tmp_path)
+    assert not (tmp_path / "script.json").exists()
+
+
 def test_everything_promised_is_there_at_the_start(tmp_path: Path) -> None:
     class Looks(Component):
         def on_start(self) -> None:

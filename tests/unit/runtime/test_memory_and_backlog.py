@@ -8,6 +8,7 @@ import os
 from collections import deque
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -36,6 +37,31 @@ def test_nothing_is_left_of_a_value_that_can_not_be_kept(tmp_path: Path) -> None
         memory.save()
     assert dict(Memory(tmp_path / "x.json")) == {"a": 1}
     assert [path.name for path in tmp_path.iterdir()] == ["x.json"]
+
+
+def test_numbers_of_numpy_are_kept_and_arrays_are_not(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "x.json")
+    memory["n"], memory["sharpness"] = np.int64(3), [np.float32(0.5)]
+    memory.save()
+    assert dict(Memory(tmp_path / "x.json")) == {"n": 3, "sharpness": [0.5]}
+    memory["scan"] = np.zeros((2, 2))
+    with pytest.raises(InvalidValue, match="ndarray"):
+        memory.save()
+
+
+def test_changes_are_written_however_deep_they_are_and_nothing_else(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "x.json")
+    memory.save_changes()
+    assert not (tmp_path / "x.json").exists()
+    memory["places"] = [1]
+    memory.save_changes()
+    memory["places"].append(2)
+    memory.save_changes()
+    (tmp_path / "x.json").unlink()
+    memory.save_changes()
+    assert not (tmp_path / "x.json").exists()
+    memory.save()
+    assert dict(Memory(tmp_path / "x.json")) == {"places": [1, 2]}
 
 
 def test_a_key_that_would_come_back_as_another_is_refused(tmp_path: Path) -> None:
