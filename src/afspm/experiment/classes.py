@@ -147,12 +147,22 @@ def _attribute(module: Any, name: str) -> Any:
     try:
         return getattr(module, name)
     except AttributeError:
-        hint = nearest(name, getattr(module, "__all__", None) or _public_classes(module))
+        hint = _hidden(module) or nearest(name, getattr(module, "__all__", None) or _public_classes(module))
         raise Unloadable(f"{module.__name__} has no {name!r}", hint) from None
     except ModuleNotFoundError as error:
         raise _no_module(f"{module.__name__}.{name}", error) from error
     except (Exception, SystemExit) as error:
         raise Unloadable(f"importing {name} fails: {_where(error)}") from error
+
+
+def _hidden(module: Any) -> str:
+    """What to do where a file of the user's has the name of a module that Python has already; "" where none has."""
+    for folder in sys.path:
+        file = Path(folder, f"{module.__name__}.py")
+        if file.exists():
+            own = getattr(module, "__file__", None)
+            return "" if own and file.samefile(own) else f"another module is called so: give {file.name} another name"
+    return ""
 
 
 def _import(package: str) -> Any:

@@ -57,11 +57,17 @@ def _check_signature(
 ) -> None:
     base = getattr(Component, name, None)
     wanted = list(inspect.signature(base).parameters) if base is not None else ["self", "message"]
-    try:
-        inspect.signature(method).bind(*wanted)
-    except TypeError as error:
+    wrong = ""
+    if inspect.iscoroutinefunction(method) or inspect.isgeneratorfunction(method):
+        wrong = "calling it does nothing yet, since it is async or has a yield"
+    else:
+        try:
+            inspect.signature(method).bind(*wanted)
+        except TypeError as error:
+            wrong = str(error)
+    if wrong:
         resolved.findings.error(
-            f"[{part.name}] {component.__name__}.{name} can't be called as it will be: {error}",
+            f"[{part.name}] {component.__name__}.{name} can't be called as it will be: {wrong}",
             resolved.document.place(part.name, "class"),
             f"write `def {name}({', '.join(wanted)})`",
         )

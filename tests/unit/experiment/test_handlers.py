@@ -53,3 +53,11 @@ def test_one_that_can_not_be_called_is_an_error(tmp_path: Path, method: str) -> 
     (told,) = findings(tmp_path, method)
     assert told.startswith("error: [mine] Mine.")
     assert "write `def " in told
+
+
+@pytest.mark.parametrize(("old", "new"), [("def on", "async def on"), ("pass", "yield scan")])
+def test_one_that_would_be_called_and_never_run_is_an_error(tmp_path: Path, old: str, new: str) -> None:
+    (tmp_path / "mine.py").write_text(COMPONENT.format(method="on_scan(self, scan)").replace(old, new, 1))
+    (tmp_path / "experiment.toml").write_text(FRAME + TABLE)
+    (error,) = load(tmp_path / "experiment.toml").check()
+    assert "async or has a yield" in error.what

@@ -146,6 +146,7 @@ def test_findings_are_in_the_order_of_the_lines(write: Write) -> None:
         ("broken.X", "SyntaxError", ""),
         ("raising.X", "ZeroDivisionError", ""),
         ("needing.X", "needs 'not_there_at_all'", "install"),
+        ("time.X", "time has no 'X'", "give time.py another name"),
         ("leaving.X", "SystemExit: 3 (leaving.py:2)", ""),
         ("afspm.components.ScanSerie", "has no 'ScanSerie'", "ScanSeries"),
     ],
@@ -153,6 +154,7 @@ def test_findings_are_in_the_order_of_the_lines(write: Write) -> None:
 def test_a_class_that_can_t_be_had_is_an_error(write: Write, tmp_path: Path, name: str, said: str, hint: str) -> None:
     (tmp_path / "broken.py").write_text("def f(:\n")
     (tmp_path / "raising.py").write_text("1 / 0\n")
+    (tmp_path / "time.py").write_text("class X: ...\n")
     (tmp_path / "leaving.py").write_text("import sys\nsys.exit(3)\n")
     (tmp_path / "needing.py").write_text("import not_there_at_all\n")
     experiment = write(f'[a]\ncomponent = true\nclass = "{name}"\n')
