@@ -50,6 +50,7 @@ CREATE TABLE IF NOT EXISTS log (
   time_ns INTEGER NOT NULL, name TEXT NOT NULL, level TEXT NOT NULL, text TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS log_by_time ON log (time_ns);
 """
+_DAMAGE = (sqlite3.DatabaseError, UnicodeDecodeError)  # SQLite quotes what it can't make sense of
 
 
 def open_to_write(folder: Path) -> sqlite3.Connection:
@@ -70,7 +71,7 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
     except sqlite3.OperationalError:
         connection.close()
         raise
-    except (sqlite3.DatabaseError, FileError) as error:
+    except (*_DAMAGE, FileError) as error:
         connection.close()
         raise damaged(path, error) from error
     return connection
@@ -92,7 +93,7 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
             if "unable to open" not in str(error) and "readonly" not in str(error):
                 raise
             return _checked_copy(path)  # what is beside it can't be made there
-    except sqlite3.DatabaseError as error:
+    except _DAMAGE as error:
         raise damaged(path, error) from error
 
 

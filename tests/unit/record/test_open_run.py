@@ -17,7 +17,7 @@ from record_lab import ABOUT, Night
 import afspm
 from afspm.errors import FileError
 from afspm.model import ScopeState
-from afspm.record.journal import JOURNAL_FILE, read_only
+from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
 from afspm.record.run import Run
 from afspm.record.store import Store
 
@@ -149,6 +149,16 @@ def test_a_damaged_journal_is_named(tmp_path: Path, content: bytes) -> None:
 class _nothing:  # noqa: N801 - an empty file is a new journal to whoever writes
     def __enter__(self) -> None: ...
     def __exit__(self, *_: object) -> None: ...
+
+
+def test_a_journal_whose_tables_are_named_by_no_text_is_damaged_to_readers_and_writers(tmp_path: Path) -> None:
+    Store(tmp_path, ABOUT).close()
+    data = (tmp_path / JOURNAL_FILE).read_bytes()
+    (tmp_path / JOURNAL_FILE).write_bytes(data.replace(b"CREATE TABLE packets", b"CREATE TABL\x98 packets"))
+    with pytest.raises(FileError, match="is damaged"):
+        afspm.open_run(tmp_path)
+    with pytest.raises(FileError, match="is damaged"):
+        open_to_write(tmp_path)
 
 
 READINGS: dict[str, Callable[[Run], object]] = {
