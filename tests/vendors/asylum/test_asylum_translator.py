@@ -11,6 +11,7 @@ import pytest
 from asylum_bench import Bench, Emulated
 from vendor_bench import FLAT, SHAPE, TURNED, Peer, moved, ready, scanned, states
 
+from afspm.emulators.asylum.wire import Failed
 from afspm.files import read
 from afspm.model import (
     ControlRequest,
@@ -377,6 +378,43 @@ def test_the_probe_goes_where_it_is_sent_also_on_a_turned_image(bench: Make) -> 
     scanned(peer)
     moved_exactly(peer, 70e-9, 10e-9)
     assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
+
+
+def test_before_the_first_scan_spots_count_on_the_image_that_is_open(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved_exactly(peer, 70e-9, 10e-9)
+    assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
+
+
+@pytest.mark.parametrize("kind", ["scan-refused", "aborted"])
+def test_after_a_scan_that_did_not_begin_spots_count_on_the_image_of_before(bench: Make, kind: str) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    scanned(peer)
+    moved_exactly(peer, 70e-9, 10e-9)
+    ready_again = Region((900e-9, 0.0), (500e-9, 500e-9))
+    assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(ready_again, SHAPE, "")).ok
+    peer.until(FREE)
+    plain = made.emulator.controller.scan
+    if kind == "aborted":
+
+        def abort(now_s: float, down: bool | None) -> None:
+            made.emulator.controller.scan = plain  # type: ignore[method-assign]
+            raise Failed(107, "User abort.")
+
+        made.emulator.controller.scan = abort  # type: ignore[method-assign]
+    else:
+        made.strike(kind)
+    assert peer.act(names.START_SCAN).code == ControlResponse.ACTION_ERROR
+    assert float(peer.get(names.PROBE_POS_X)) == pytest.approx(70e-9)
+    moved_exactly(peer, 50e-9, 20e-9)
+    assert made.emulator.rig.probe_m == pytest.approx((50e-9, 20e-9), abs=1e-16)
+    scanned(peer)
+    moved_exactly(peer, 800e-9, 20e-9)
+    assert made.emulator.rig.probe_m == pytest.approx((800e-9, 20e-9), abs=1e-16)
 
 
 def test_the_probe_stays_where_it_is_when_the_image_changes(bench: Make) -> None:

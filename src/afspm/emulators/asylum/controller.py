@@ -65,8 +65,8 @@ class Controller:
         self._disk = saving.Disk()
         self._starts_at_s = math.inf
         self._curve_running = self._engages = False
-        self._image: Region | None = None
-        # the first is the middle of the frame
+        # somebody has scanned once, and left the image open; the first spot is in its middle
+        self._image = self._frame()
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
 
@@ -139,9 +139,7 @@ class Controller:
 
     def _start(self) -> None:
         values, rig = self.values, self.rig
-        fast, slow = values.size()
-        center = (values.get("XOffset"), values.get("YOffset"))
-        rig.region = Region(center, (fast, slow), math.radians(values.get("ScanAngle")))
+        rig.region = self._frame()
         rig.shape = (round(values.get("ScanLines")), round(values.get("ScanPoints")))
         rig.line_s = 1.0 / values.get("ScanRate")
         rig.upwards = not values.get("ScanDown")
@@ -154,6 +152,11 @@ class Controller:
         )
         rig.start_scan()
         self._image = rig.region
+
+    def _frame(self) -> Region:
+        """Of the next image."""
+        center = (self.values.get("XOffset"), self.values.get("YOffset"))
+        return Region(center, self.values.size(), math.radians(self.values.get("ScanAngle")))
 
     def _image_done(self, now_s: float) -> None:
         scan = self.rig.scan
@@ -194,10 +197,6 @@ class Controller:
         """Send the tip to the spot that ForceSpotNumber says, on the last image."""
         number = int(self.values.get("ForceSpotNumber"))
         image = self._image
-        if image is None:
-            fast, slow = self.values.size()
-            center = (self.values.get("XOffset"), self.values.get("YOffset"))
-            image = Region(center, (fast, slow), math.radians(self.values.get("ScanAngle")))
         x, y = (along - size / 2 for along, size in zip(self.spots_m[number], image.size_m, strict=True))
         cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
         self.rig.move_probe((image.center_m[0] + cos * x - sin * y, image.center_m[1] + sin * x + cos * y))

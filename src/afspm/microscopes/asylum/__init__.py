@@ -103,6 +103,7 @@ class Asylum(Microscope):
             self._activity.folder(what)
         if self._spots != "none":
             session.do("InitProbePos")
+            self._activity.find_image()
         if self._base_name and session.text("GetBaseName") != self._base_name:
             self._activity.call_files(self._base_name)
 
@@ -223,13 +224,16 @@ class Asylum(Microscope):
         self._activity.saves(SCAN)
         probe_m = self._probe_m() if self._spots == "image" else None
         self._activity.begin(SCAN)
-        if probe_m is not None:  # it stays where it is, on another image
-            self._put_spot(probe_m)
         up = self._kept[names.SCAN_DIRECTION] == names.UP
         self._igor.put("LastScan", 1)
         self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
         self._igor.put("LastScan", 1)  # also where beginning to scan puts it back
         self._activity.settle(SCAN)
+        if probe_m is not None:  # it stays where it is, on another image
+            try:
+                self._put_spot(probe_m)
+            except (XopError, Refused) as error:
+                self.log.error("it scans, but the spot can't be put where it was: %s", error)
 
     def _begin(self, what: str, function: str, button: str) -> None:
         try:

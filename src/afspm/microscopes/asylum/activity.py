@@ -66,6 +66,8 @@ class Activity:
             self._harvest.end(self._clock.now_ns())
         if what and not self._stopping and self._harvest.what != what:
             self.begin(what)
+        if what == SCAN:
+            self._image_begins()
         if state is ScopeState.FREE and self._clock.now_s() < self._moving_until_s:
             return ScopeStatus(ScopeState.MOVING)
         if state is ScopeState.FREE and self._harvest.broken_off:
@@ -78,9 +80,17 @@ class Activity:
 
     @property
     def image(self) -> Region:
-        """The frame of the last image, which Asylum counts spots on; that in force if nothing was scanned yet."""
-        kept = self._kept.get("image")
-        return self._frame_in_force() if kept is None else as_region(kept)
+        """The frame of the last image that was begun, which Asylum counts spots on."""
+        return as_region(self._kept["image"])
+
+    def find_image(self) -> None:
+        """Before anything was scanned, and another frame set: that of the image that is open is in force."""
+        self._kept.setdefault("image", as_list(self._frame_in_force()))
+
+    def _image_begins(self) -> None:
+        """A scan is seen running: not before, as one that does not begin leaves the image of before."""
+        if (frame := self._harvest.frame) is not None:
+            self._kept["image"] = frame
 
     def begin(self, what: str, position_m: tuple[float, float] | None = None) -> None:
         """A measurement begins, with what is in force now.
@@ -90,9 +100,7 @@ class Activity:
         """
         taken: dict[str, Any] = {"position": position_m and list(position_m)}
         if what == SCAN:
-            region = self._frame_in_force()
-            taken = {"frame": as_list(region)}
-            self._kept["image"] = taken["frame"]
+            taken = {"frame": as_list(self._frame_in_force())}
         self._harvest.begin(what, self._target(what), taken)
 
     def saves(self, what: str) -> None:
@@ -138,6 +146,7 @@ class Activity:
         until_s = self._clock.monotonic_s() + _SETTLES_S
         while self._clock.monotonic_s() < until_s:
             if self._session.doing().state is state or self._harvest.has_file():
+                self._image_begins()
                 return
         self.forget()
         raise Refused(ControlResponse.ACTION_ERROR, f"Asylum was told to begin a {what}, and does not")

@@ -54,6 +54,12 @@ class Harvest(Measurements):
         self._read: dict[str, Content] = {}
         kept.setdefault("taken", 0)
 
+    @property
+    def frame(self) -> list[float] | None:
+        """Of the scan that is running (`as_list`); None: none is."""
+        running = self._kept["running"]
+        return None if running is None else running.get("frame")
+
     def begin(self, what: str, target: Target, taken: Mapping[str, Any]) -> None:
         """A measurement begins.
 
