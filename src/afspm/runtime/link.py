@@ -58,6 +58,7 @@ class Link:
         self.log = log or logging.getLogger(f"afspm.{name}")
         self.ended = False
         self.stopping = False
+        self._left = False
         self.connections = 0
         self.connected = False
         self.request_timeout_s = request_timeout_s
@@ -112,11 +113,20 @@ class Link:
         self.check()
 
     def check(self) -> None:
-        """Raises ExperimentEnded or StopRequested if it is so."""
+        """Raises ExperimentEnded or StopRequested if it is so; NoResponse if we have left."""
+        if self._left:
+            raise NoResponse(
+                "the experiment was left, by close()", where=self.name, hint="afspm.connect() joins it again"
+            )
         if self.stopping:
             raise StopRequested
         if self.ended:
             raise ExperimentEnded(HAS_ENDED, where=self.name)
+
+    def leave(self) -> None:
+        """Close the port: nothing is heard any more, and nobody can be asked."""
+        self._left = True
+        self.port.close()
 
     def wait_caught_up(self, until_s: float | None = None) -> None:
         """Wait until everything the scheduler has cached is here; once that is so, returns at once.

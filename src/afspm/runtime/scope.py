@@ -319,7 +319,7 @@ class Scope:
         In a component this is done for you.
         """
         self._holding.leave()
-        self._link.port.close()
+        self._link.leave()
 
     def __enter__(self) -> Scope:
         return self

@@ -434,6 +434,14 @@ def test_a_shape_may_be_of_numpy(lab: Lab, scope: Scope, shape: tuple[int, int])
     assert scope.scan(REGION, shape=shape, key="once").first.shape == (4, 6)
 
 
+def test_after_it_was_closed_a_scope_says_that_it_was(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    scope.close()
+    for call in (lambda: scope.scan(REGION), lambda: scope.state, lambda: next(scope.events())):
+        with pytest.raises(NoResponse, match=r"left, by close\(\)"):
+            call()
+
+
 def test_a_place_may_be_an_array(lab: Lab, scope: Scope) -> None:
     place = np.array([2e-7, 3e-7])
     scope.move_probe(place)  # type: ignore[arg-type]
