@@ -100,6 +100,7 @@ class LimitsReader:
         self._components = components
         self._parameters = parameters
         self._actions = actions
+        self._known_actions = frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if actions is None else actions
         self._certain = certain
 
     def read(self, table: Mapping[str, Any]) -> Limits:
@@ -126,6 +127,8 @@ class LimitsReader:
         path: Path = ("limits", name)
         if name not in self._parameters:
             hint = nearest(name, [*self._parameters, *_OWN])
+            if name in self._known_actions:
+                hint = f"it is an action: [limits.actions.{name}]"
             if self._certain or not name.startswith("x-"):
                 self._findings.error(f"[limits] there is no parameter {name!r}", self._document.place(*path), hint)
                 return None
@@ -154,7 +157,7 @@ class LimitsReader:
 
     def _action(self, name: str, table: Any) -> Limit | None:
         path: Path = ("limits", "actions", name)
-        known = frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if self._actions is None else self._actions
+        known = self._known_actions
         if name not in known and (self._actions is not None or not name.startswith("x-")):
             hint = nearest(name, known)
             self._findings.error(f"[limits.actions] there is no action {name!r}", self._document.place(*path), hint)

@@ -132,6 +132,8 @@ def report(
         findings.error(f"{shown} is missing", place)
     elif error["type"] in ("tuple_type", "list_type"):
         findings.error(f"{shown} is a list of values in brackets, not {error['input']!r}", place)
+    elif error["type"] in ("model_type", "dict_type"):
+        findings.error(f"{shown} is a table of keys and values, not {error['input']!r}", place)
     elif error["type"] == "too_long":
         most, given = error["ctx"]["max_length"], error["ctx"]["actual_length"]
         findings.error(f"{shown} has {given} values, and takes {most} at most", place)

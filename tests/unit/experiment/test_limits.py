@@ -64,6 +64,7 @@ def test_a_region_may_be_turned(write: Write) -> None:
         (BIAS + 'only = ["repiar"]\n', "there is no component 'repiar'"),
         ("[limits]\ntip-bias-voltage = 3\n", "[limits] tip-bias-voltage"),
         ('[limits.scan-sped]\nmax = "1 um/s"\n', "there is no parameter 'scan-sped'"),
+        ('[limits]\nregion = [["0 um", "1 um"], ["0 um", "1 um"]]\n', "region is a table of keys and values"),
         ("[limits.actions.strat-scan]\nonly = []\n", "there is no action 'strat-scan'"),
         ('[limits]\nregion = { x = ["5 um", "-5 um"], y = ["0 um", "1 um"] }\n', "region is empty"),
         ('[limits]\nregion = { x = ["0 um", "1 um"] }\n', "either x and y, or center and size"),
@@ -85,6 +86,10 @@ def test_limits_that_contradict_are_errors(write: Write, text: str, said: str) -
 def test_a_region_of_metres_is_doubted(write: Write, region: str, doubted: bool) -> None:
     found = [finding.what for finding in write(f"[limits]\nregion = {region}\n").check()]
     assert found == (["[limits] region is 6 m x 6e-06 m: it keeps nothing safe"] if doubted else [])
+
+
+def test_an_action_among_the_parameters_is_told_where_it_belongs(write: Write) -> None:
+    assert "[limits.actions.start-scan]" in only_error(write("[limits.start-scan]\nonly = []\n")).hint
 
 
 def test_a_limit_of_unknown_dimension_is_in_the_unit_given(write: Write) -> None:
