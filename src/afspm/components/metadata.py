@@ -65,6 +65,7 @@ class Metadata(Component):
         self.file = file
         self._control: ControlState | None = None
         self._saw_begin = False
+        self._under_way: str | None = None
 
     def on_start(self) -> None:
         self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
@@ -76,9 +77,12 @@ class Metadata(Component):
     def on_state(self, status: ScopeStatus) -> None:
         what = _BUSY.get(status.state)
         now_ns = self.packet.time_ns if self.packet else None
+        goes_on, self._under_way = what == self._under_way, what
         if what is None:
             self._saw_begin = self._saw_begin and status.state is not ScopeState.FREE
             return
+        if goes_on:
+            return  # it was paused, or goes on after that: it began before
         if now_ns is not None and now_ns <= self.memory.get("began_ns", -1):
             return  # replayed after a restart: what was noted then is what holds
         self._saw_begin = True
@@ -121,6 +125,7 @@ class Metadata(Component):
         return Circumstances(*self.memory["circumstances"])
 
     def _write(self, what: str, time_ns: int | None, row_at: Callable[[Circumstances], list[str]]) -> None:
+        self._under_way = None  # should it scan on without another state between them, that is the next one
         identity = _identity(row_at(Circumstances()))
         if identity in self._written:
             return  # replayed after a restart

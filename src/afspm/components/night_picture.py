@@ -34,6 +34,7 @@ class NightPicture(Component):
         self.channel, self.file, self.title = channel, file, title
         self._control: ControlState | None = None
         self._begin: tuple[int | None, str | None] = (None, None)
+        self._is_scanning = False
         self._drawing_is_loaded = False
 
     def on_start(self) -> None:
@@ -51,7 +52,8 @@ class NightPicture(Component):
         self._add(control_entry(control_state, self._packet_ns()))
 
     def on_state(self, status: ScopeStatus) -> None:
-        if status.state is ScopeState.SCANNING:
+        goes_on, self._is_scanning = self._is_scanning, status.state is ScopeState.SCANNING
+        if self._is_scanning and not goes_on:  # else it was paused: it began before
             self._begin = (self._packet_ns(), self._control.holder if self._control else None)
         elif status.state is ScopeState.INTERRUPTED:
             self._add({"kind": "interrupted", "time_ns": self._packet_ns()})
@@ -61,6 +63,7 @@ class NightPicture(Component):
             start_ns, holder = self._begin
             self._add(scan_entry(scan, scan.time_ns or self._packet_ns(), start_ns, holder))
             self._begin = (None, None)
+            self._is_scanning = False  # should it scan on without another state between them, that is the next one
 
     def on_message(self, envelope: str, message: Any) -> None:
         by = envelope.partition("_")[2]

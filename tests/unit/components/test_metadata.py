@@ -15,7 +15,7 @@ from afspm.clock import iso_utc
 from afspm.components.metadata import COLUMNS, Metadata
 from afspm.components.records import LineFile
 from afspm.logic import arbitration as a
-from afspm.model import ControlMode, Problem, Scan, ScopeState, Spectrum
+from afspm.model import ControlMode, ControlState, Problem, Scan, ScopeState, ScopeStatus, Spectrum
 from afspm.runtime.exit_codes import ExitCode
 
 
@@ -62,6 +62,19 @@ def test_mode_and_problems_are_those_of_the_beginning(tmp_path: Path) -> None:
     assert {(r["in_control"], r["mode"], r["problems"]) for r in rows(tmp_path)} == {
         ("", "manual", "tip-shape-changed")
     }
+
+
+def test_a_person_who_pauses_a_scan_has_not_begun_it(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    held_by(lab, "series", 5.0)
+    scanned(lab, 10.0)
+    lab.at(40.0, lambda: lab.publish(ControlState(ControlMode.MANUAL)))  # not every microscope stops then
+    lab.at(50.0, lambda: lab.publish(ScopeStatus(ScopeState.SCANNING, paused=True)))
+    lab.at(60.0, lambda: lab.publish(ScopeStatus(ScopeState.SCANNING)))
+    scanned(lab, 200.0)
+    lab.at(400.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    assert [(r["in_control"], r["mode"]) for r in rows(tmp_path)[::2]] == [("series", "automated"), ("", "manual")]
 
 
 def test_a_spectrum_has_a_row_with_its_position(tmp_path: Path) -> None:

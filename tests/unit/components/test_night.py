@@ -13,7 +13,7 @@ from runtime_lab import REGION, Lab, context_of, run
 from afspm import wire
 from afspm.components.night_picture import NightPicture
 from afspm.components.verdicts import BAD, MESSAGE, verdict_message
-from afspm.model import ControlMode, ControlState, Problem, Region, Scan, ScopeState
+from afspm.model import ControlMode, ControlState, Problem, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.night_record import (
     THUMBNAIL_PX,
     NightRecord,
@@ -144,6 +144,17 @@ def test_the_component_draws_when_the_experiment_ends(tmp_path: Path) -> None:
         ("tip_corrector", "x-pulse"),
     }
     assert (tmp_path / "night.png").exists()
+
+
+def test_a_scan_that_was_paused_began_before_that(tmp_path: Path) -> None:
+    lab = _lab()
+    for at_s, is_paused in ((110.0, True), (130.0, None)):
+        lab.at(at_s, lambda is_paused=is_paused: lab.publish(ScopeStatus(ScopeState.SCANNING, is_paused)))
+    lab.at(500.0, lab.kill)
+    component = NightPicture()
+    run(component, lab, tmp_path / "state", run_dir=str(tmp_path))
+    lasted_s = [(shot.time_ns - (shot.start_ns or 0)) / 1e9 for shot in component.record.shots]
+    assert lasted_s == pytest.approx([50.0] * 3, abs=0.1)
 
 
 def test_a_restart_loses_nothing_and_doubles_nothing(tmp_path: Path) -> None:
