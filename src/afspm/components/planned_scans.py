@@ -32,6 +32,8 @@ class PlannedScans(Component):
         keep_control: whether to keep control between the scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last scan.
         parameters: set before the first scan, e.g. {"scan-speed": "2 um/s"}.
+        missed_count: whether rounds that are left out, because one takes longer than the period or control was lost,
+            count as taken, so that the plan ends when it should. Those while nothing ran, before a restart, don't.
     """
 
     needs_actions = (names.START_SCAN,)
@@ -44,7 +46,9 @@ class PlannedScans(Component):
         keep_control: bool = False,
         end_when_done: bool = False,
         parameters: Mapping[str, str | float] | None = None,
+        missed_count: bool = False,
     ) -> None:
+        self.missed_count = missed_count
         self.keep_control = keep_control
         self.plan = plan
         self.beat_s = period_s
@@ -53,18 +57,20 @@ class PlannedScans(Component):
         self.needs_parameters = (*_FRAME, *self.parameters)
 
     def run(self) -> None:
-        self.memory.setdefault("start_s", self.clock.now_s())
+        self._began_s = self.clock.now_s()
+        self.memory.setdefault("start_s", self._began_s)
         rhythm = Rhythm(float(self.memory["start_s"]), self.beat_s)
         self.memory.save()
         self._set_parameters()
         done = int(self.memory.get("done", 0))
-        if done and done != self.plan.total:
+        if done and done != self._total:
             self.log.info("going on with scan %d%s", done + 1, self._of_total())
         with self.scope.control() if self.keep_control else nullcontext():
             for step in self.plan.steps(done):
-                self._await(step, rhythm)
+                if not self._await(step, rhythm):
+                    break
                 self._take(step)
-        self.log.info("all %d scans are taken", self.plan.total)
+        self.log.info("all %d scans are taken", self._total)
         if self.end_when_done:
             self.scope.end_experiment()
 
@@ -73,18 +79,27 @@ class PlannedScans(Component):
             for name, quantity in self.parameters.items():
                 self.scope.set(name, quantity)
 
-    def _await(self, step: Step, rhythm: Rhythm) -> None:
+    def _await(self, step: Step, rhythm: Rhythm) -> bool:
+        """Until it is due; False: the rounds that were left out were the last."""
         if not step.starts_round or self.memory.get("begun") == step.index:
-            return
+            return True
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
-        if left_out := rhythm.left_out(self.memory.get("due_s", due_s), due_s):
+        before_s = float(self.memory.get("due_s", due_s))
+        if left_out := rhythm.left_out(before_s, due_s):
             count = left_out * len(self.plan.regions)
             said = "a scan was due meanwhile; it is" if count == 1 else f"{count} scans were due meanwhile; they are"
             self.log.warning("%s not made up for", said)
-        self.scope.sleep(max(0.0, due_s - self.clock.now_s()))
+        if self.missed_count:
+            missed = rhythm.left_out(max(before_s, self._began_s), due_s)
+            self.memory["missed"] = int(self.memory.get("missed", 0)) + missed
+        is_left = self._total is None or step.index < self._total
+        if is_left:
+            self.scope.sleep(max(0.0, due_s - self.clock.now_s()))
+            self.memory["begun"] = step.index
         # before it is asked for: a scan that a kill interrupts belongs to the beat that it was begun on
-        self.memory["begun"], self.memory["due_s"] = step.index, due_s
+        self.memory["due_s"] = due_s
         self.memory.save()
+        return is_left
 
     def _take(self, step: Step) -> None:
         scans = self.scope.scan(step.region, shape=step.shape, key=step.key)
@@ -92,8 +107,8 @@ class PlannedScans(Component):
         self.memory.save()
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted and taken again: %s", step.key, interruption)
-        if self.plan.total is not None:
-            self.scope.progress(step.index + 1, self.plan.total, left_s=self._left_s(step.index + 1, self.plan.total))
+        if (total := self._total) is not None:
+            self.scope.progress(step.index + 1, total, left_s=self._left_s(step.index + 1, total))
         self.log.info("scan %d%s %s", step.index + 1, self._of_total(), _told(scans.time))
 
     def _left_s(self, done: int, total: int) -> float:
@@ -101,8 +116,14 @@ class PlannedScans(Component):
         per_scan_s = (self.clock.now_s() - float(self.memory["start_s"])) / done
         return (total - done) * max(per_scan_s, self.beat_s / len(self.plan.regions))
 
+    @property
+    def _total(self) -> int | None:
+        """How many scans it will be, as far as is known; None: without end."""
+        missed = int(self.memory.get("missed", 0)) * len(self.plan.regions)
+        return None if self.plan.total is None else max(self.plan.total - missed, int(self.memory.get("done", 0)))
+
     def _of_total(self) -> str:
-        return "" if self.plan.total is None else f" of {self.plan.total}"
+        return "" if self._total is None else f" of {self._total}"
 
 
 class ScanSeries(PlannedScans):
@@ -143,7 +164,12 @@ class ScanSeries(PlannedScans):
             raise ConfigError("`end_when_done` without an end", hint="give `scans` or `duration`")
         plan = _plan((Region(pair(center), pair(size), angle),), pixels, rounds)
         super().__init__(
-            plan, period_s=every, keep_control=keep_control, end_when_done=end_when_done, parameters=parameters
+            plan,
+            period_s=every,
+            keep_control=keep_control,
+            end_when_done=end_when_done,
+            parameters=parameters,
+            missed_count=duration is not None,
         )
 
 

@@ -70,6 +70,37 @@ def test_rounds_missed_while_control_was_lost_are_not_made_up_for(caplog: pytest
     assert "2 scans were due meanwhile; they are not made up for" in caplog.text
 
 
+def lasting(duration_s: float, every_s: float) -> ScanSeries:
+    return ScanSeries(size=(1e-6, 1e-6), pixels=(8, 8), every=every_s, duration=duration_s, end_when_done=True)
+
+
+def test_a_series_for_a_time_ends_then_however_long_a_scan_takes(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("series")
+    with caplog.at_level("INFO"):
+        assert run(lasting(600.0, every_s=60.0), lab) == ExitCode.ENDED  # each takes longer than that
+    assert len(lab.finished) == 6  # at 0, 120, 240 … 600 s
+    assert lab.clock.passed_s < 600.0 + 2 * SCAN_S
+    assert "all 6 scans are taken" in caplog.text
+
+
+def test_a_series_for_a_time_ends_then_though_a_problem_kept_it_from_scanning() -> None:
+    lab = Lab("series")
+    lab.at(150.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(3000.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    run(lasting(4 * 900.0, every_s=900.0), lab)
+    assert len(lab.finished) == 3  # at 0, 3000 and 3600 s
+
+
+def test_time_in_which_nothing_ran_is_not_that_of_a_series_for_a_time(tmp_path: Path) -> None:
+    lab = Lab("series")
+    lab.at(1000.0, lab.parent_goes)
+    lasting(4 * 900.0, every_s=900.0).run_process(context_of(lab, tmp_path))
+    lab.clock.passed_s += 20_000.0
+    lab.restart_component()
+    run(lasting(4 * 900.0, every_s=900.0), lab, tmp_path)
+    assert len(lab.finished) == 5
+
+
 def test_one_missed_scan_is_told_as_one(caplog: pytest.LogCaptureFixture) -> None:
     lab = Lab("series")
     lab.at(150.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
