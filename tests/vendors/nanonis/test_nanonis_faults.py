@@ -228,6 +228,20 @@ def test_a_spectrum_that_is_not_saved_is_fetched(bench: Make) -> None:
     assert spectrum.filename.endswith(".npz")
 
 
+def test_a_spectrum_that_somebody_takes_unsaved_is_not_that_of_before(bench: Make) -> None:
+    made = bench(speed=3.0)
+    peer = small(made)
+    assert peer.act(names.START_SPEC).ok
+    assert [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
+    made.at_panel(lambda emulator: setattr(emulator.panel.sweeps["BiasSpectr"], "saves", False))
+    made.at_panel(lambda emulator: emulator.panel.start_curve("BiasSpectr", ""))
+    peer.until(ScopeState.SPEC)
+    heard = peer.until(FREE)
+    assert not [one for one in heard if isinstance(one, Spectrum)], "nobody has its data"
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    made.until_said("Nanonis was not asked for its data")
+
+
 def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made, result_timeout_s=1e6)  # whoever waits for a file waits longer than this test does

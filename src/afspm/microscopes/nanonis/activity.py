@@ -62,7 +62,7 @@ class Activity:
 
     def begin_curve(self, kind: str) -> None:
         """A spectrum begins, or was found running."""
-        self.stopping = False
+        self.stopping, self.curve = False, None
         position = self._probe.read(self._ask)
         taken = {"position": [float(position[name]) for name in self._probe.names]}
         self._harvest.begin(kind, self._session_folder(), taken)
@@ -74,7 +74,7 @@ class Activity:
             Refused: ACTION_ERROR: Nanonis would not.
         """
         self.begin_curve(kind)
-        self.curve, self._kind_asked = None, kind
+        self._kind_asked = kind
         same_name = ""
         self._listener.curve(MODULES[kind], same_name)
         self._settle(f"{MODULES[kind]}.StatusGet")
