@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import tzinfo
 from importlib import import_module
 from pathlib import Path
@@ -27,7 +28,7 @@ FORMATS = {
 
 def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     """The scans and spectra of a file: Asylum (.ibw, NSID .h5), Nanonis (.sxm, .dat), GXSM (.nc, .vpdata), Gwyddion's
-    simple fields (.gsf) and those of the simulated microscope (.nc).
+    simple fields (.gsf) and those of the simulated microscope (.nc). Of channels of one name, the second is "name #2".
 
     Args:
         zone: of the clock of the controller, which most write without saying which it was; None: that of this computer.
@@ -48,7 +49,7 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     module, _, function = name.partition(":")
     reader: Reader = getattr(import_module(f"afspm.files.{module}"), function)
     try:
-        return reader(path, zone)
+        return _told_apart(reader(path, zone))
     except FileError as error:
         if error.where:
             raise
@@ -56,3 +57,17 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     except Exception as error:  # a reader may stumble in any way over a broken file
         why = f"{type(error).__name__}: {error}"
         raise FileError(f"is not readable as {path.suffix}: {why}", where=str(path)) from error
+
+
+def _told_apart(content: FileContent) -> FileContent:
+    """With a name of its own for each channel: users may give two signals of a controller the same."""
+    taken: set[str] = set()
+    scans = []
+    for scan in content.scans:
+        name, number = scan.channel, 1
+        while name in taken:
+            number += 1
+            name = f"{scan.channel} #{number}"
+        taken.add(name)
+        scans.append(scan if name == scan.channel else replace(scan, channel=name))
+    return replace(content, scans=tuple(scans))

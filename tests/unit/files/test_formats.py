@@ -56,6 +56,14 @@ def test_an_image_has_its_pixels_where_they_were_measured(name: str, tmp_path: P
     assert list(content) == list(content.scans)
 
 
+def test_channels_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "two.sxm"
+    path.write_bytes(sxm().replace(b"\t0\tCurrent\tA\tforward", b"\t0\tZ\tm\tforward"))
+    first, _, second = afspm.read(path, zone=UTC).scans
+    assert (first.channel, second.channel) == ("Z Forward", "Z Forward #2")
+    np.testing.assert_allclose(second.values, OTHER, rtol=1e-6)
+
+
 TIMES = {
     "up.sxm": (80.0, True), "down.sxm": (80.0, False), "scan.ibw": (2.0, False), "nsid.h5": (2.0, False),
     "simulated.nc": (4 * 2 * 50e-9 / 1e-8, False), "gxsm3.nc": (80.0, False), "gxsm4.nc": (80.0, False),
