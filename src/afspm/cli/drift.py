@@ -25,7 +25,8 @@ app = typer.Typer(
     cls=FilesUnlessNamed,
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Follow drift in recorded scans (afspm drift FILE…), or study settings in simulated nights (… study).",
+    help="Follow drift in recorded scans (afspm drift FILE…; its options: afspm drift files --help), or study settings "
+    "in simulated nights (afspm drift study).",
 )
 Jobs = Annotated[
     int | None, typer.Option("--jobs", "-j", min=1, help="Processes. Default: the cores.", show_default=False)

@@ -21,12 +21,14 @@ class Document:
     Attributes:
         homes: the folders that relative file names are meant from, and where modules are found; empty: those of the
             files. (An expanded file is in the folder of its run, and speaks of files beside the one it was made of.)
+        is_whole: whether all files could be read.
     """
 
     files: tuple[Path, ...]
     data: dict[str, Any] = field(default_factory=dict)
     places: dict[lines.Path, Place] = field(default_factory=dict)
     homes: tuple[Path, ...] = ()
+    is_whole: bool = True
 
     def place(self, *path: str | int) -> Place:
         """Where `path` was set: its own line, or that of the nearest thing around it."""
@@ -53,6 +55,7 @@ def read(files: Sequence[Path], findings: Findings, homes: Sequence[Path] = ()) 
         text = _text(file, findings)
         data = None if text is None else _parse(text, file, findings)
         if text is None or data is None:
+            document.is_whole = False
             continue
         where = {path: Place(str(file), line) for path, line in lines.locate(text).items()}
         _lay_over(document, data, where)

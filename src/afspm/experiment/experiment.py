@@ -103,7 +103,7 @@ class Experiment:
         from afspm.experiment.resolved import resolve
 
         resolved = resolve(self.parts, self._document, self._found)
-        if self._document.data:  # a file that can't be read has been reported, and has no parts that could be missing
+        if self._document.is_whole:  # what is missing may be in a file that can't be read, which has been reported
             checks.check(resolved)
         return resolved
 

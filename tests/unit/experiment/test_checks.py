@@ -222,6 +222,13 @@ def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
     assert "can't be read" in error.what
 
 
+def test_of_files_that_can_not_all_be_read_no_part_is_missed(tmp_path: Path) -> None:
+    (tmp_path / "night.toml").write_text("a = [1\n")
+    (tmp_path / "other.toml").write_text("[clock]\nspeed = 2.0\n")
+    (finding,) = load(tmp_path / "night.toml", tmp_path / "other.toml").check()
+    assert "not valid TOML" in finding.what
+
+
 def test_a_file_that_is_no_text_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "night.toml"
     file.write_bytes(b"\xff\xfe\x00")
