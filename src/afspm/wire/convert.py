@@ -17,6 +17,7 @@ from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectrosco
 
 LENGTH_UNIT = "m"
 ANGLE_UNIT = "deg"
+_TIMES = 2**63
 
 
 def timestamp(time_ns: int) -> Timestamp:
@@ -24,7 +25,11 @@ def timestamp(time_ns: int) -> Timestamp:
 
 
 def time_ns(stamp: Timestamp) -> int:
-    return int(stamp.seconds) * NS_PER_S + stamp.nanos
+    """Raises InvalidValue: 64 bits, the years 1678 to 2261, don't hold it; no record could keep it."""
+    found = int(stamp.seconds) * NS_PER_S + stamp.nanos
+    if not -_TIMES <= found < _TIMES:
+        raise InvalidValue(f"a time {stamp.seconds} s from 1970")
+    return found
 
 
 def spatial_to_wire(region: model.Region | model.RegionChange) -> scan_pb2.SpatialAspects:

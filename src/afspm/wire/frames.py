@@ -9,7 +9,7 @@ from typing import Any, Final
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from afspm.errors import AfspmError, WireError
+from afspm.errors import AfspmError, InvalidValue, WireError
 from afspm.model import (
     CLOCK_REQUEST,
     RESTART_REQUEST,
@@ -49,10 +49,9 @@ def decode_time(frame: Buffer) -> int:
         WireError: it is none.
     """
     try:
-        stamp = Timestamp.FromString(bytes(frame))
-    except DecodeError as error:
+        return convert.time_ns(Timestamp.FromString(bytes(frame)))
+    except (DecodeError, InvalidValue) as error:
         raise WireError(f"the bytes are no Timestamp: {error}") from None
-    return convert.time_ns(stamp)
 
 
 def encode_packet(packet: Packet) -> list[Buffer]:

@@ -32,6 +32,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.wire.frames import decode_time, encode_subject, encode_time
+from afspm.wire.generated import journal_pb2
 
 SCAN = Scan(
     Region((1e-6, -2e-6), (2e-6, 1e-6), 0.25), "Height", "m", np.arange(12.0).reshape(3, 4), 1_700_000_000_000_000_001
@@ -225,11 +226,20 @@ def test_what_is_no_message_cannot_be_sent() -> None:
         wire.encode({})
 
 
-@given(st.integers(-(10**18), 10**19))
+@given(st.integers(-(10**18), 2**63 - 1))
 def test_a_time_is_the_timestamp_that_the_library_makes(time_ns: int) -> None:
     library = Timestamp(seconds=time_ns // 10**9, nanos=time_ns % 10**9).SerializeToString(deterministic=True)
     assert encode_time(time_ns) == library
     assert decode_time(library) == decode_time(memoryview(library)) == time_ns
+
+
+def test_a_time_that_no_record_could_keep_is_refused() -> None:
+    late = Timestamp(seconds=2**40)
+    with pytest.raises(WireError, match="1099511627776 s"):
+        decode_time(late.SerializeToString())
+    line = journal_pb2.LogLines(lines=[{"timestamp": late, "name": "series", "level": "INFO", "text": "?"}])
+    with pytest.raises(WireError, match="1099511627776 s"):
+        wire.decode("LogLines", line.SerializeToString())
 
 
 @given(st.binary(max_size=24))
