@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import importlib
 import importlib.util
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 import numpy as np
 
@@ -37,6 +38,27 @@ def parts(told: Sequence[Told]) -> list[tuple[str, int, int]]:
     first_on = next((k for k, one in enumerate(told) if one.correcting), len(told))
     found = [("off", 0, first_on), ("on", first_on + 1 if first_on else 0, len(told))]
     return [part for part in found if part[2] > part[1]]
+
+
+class _AsSaved(Sequence["DriftScan"]):
+    """Scans that are read whenever they are asked for."""
+
+    def __init__(self, told: Sequence[Told], read: Callable[[Told], DriftScan]) -> None:
+        self._told, self._read = told, read
+
+    def __len__(self) -> int:
+        return len(self._told)
+
+    @overload
+    def __getitem__(self, which: int) -> DriftScan: ...
+
+    @overload
+    def __getitem__(self, which: slice) -> Sequence[DriftScan]: ...
+
+    def __getitem__(self, which: int | slice) -> DriftScan | Sequence[DriftScan]:
+        if isinstance(which, slice):
+            return _AsSaved(self._told[which], self._read)
+        return self._read(self._told[which])
 
 
 class DriftPictures(DriftTable):
@@ -74,12 +96,16 @@ class DriftPictures(DriftTable):
 
     def on_start(self) -> None:
         super().on_start()
-        self._heard = {one.file: one for one in self._told()}  # not only in the table, which may have to wait for room
+        told = self._told()
+        self._heard = {one.file: one for one in told}  # not only in the table, which may have to wait for room
+        self._again = deque((told[start], one) for _, start, stop in parts(told) for one in told[start + 1 : stop])
 
     def on_tick(self) -> None:
         if not self._drawing_is_loaded and importlib.util.find_spec("matplotlib"):
             importlib.import_module(_ALBUM)  # now, when there is time: at the end all must be quick
         self._drawing_is_loaded = True
+        if self._again:
+            self._compared(*self._again.popleft())  # before a restart it was, and at the end there is no time for it
 
     def on_drift_mapping(self, message: Any) -> None:
         super().on_drift_mapping(message)
@@ -104,25 +130,26 @@ class DriftPictures(DriftTable):
         from afspm.drift.record import DriftRecord
 
         folder = Path(self.run_dir)
-        readable = {number: scan for number, one in enumerate(told) if (scan := self._scan_of(one)) is not None}
+        readable = {number: scan for number, one in enumerate(told) if (scan := self._frame_of(one)) is not None}
         if len(readable) < 2:
             self.log.error("no pictures: only %d of %d scans can be read", len(readable), len(told))
             return
         record = DriftRecord.read(folder / self.file).chosen(list(readable))
-        told, scans = [told[number] for number in readable], list(readable.values())
+        told, frames = [told[number] for number in readable], list(readable.values())
+        scans = _AsSaved(told, self._scan)
         truth = true_drift(folder) if self.simulated else None
         run = album.Run(
             scans=scans,
             record=record,
-            parts=self._parts(told, record, scans),
+            parts=self._parts(told, record, frames),
             matched=self._matched(told, scans),
-            truth_m=None if truth is None else truth(np.array([scan.mid_s for scan in scans])),
+            truth_m=None if truth is None else truth(np.array([frame.mid_s for frame in frames])),
         )
         title = f"{self.title} (simulated)".strip() if self.simulated else self.title
         for path in album.write(run, folder, title=title):
             self.log.info("drawn: %s", path)
 
-    def _parts(self, told: list[Told], record: DriftRecord, scans: list[DriftScan]) -> list[Part]:
+    def _parts(self, told: list[Told], record: DriftRecord, frames: list[DriftScan]) -> list[Part]:
         """With what was estimated off-line."""
         from afspm.drift.figures.album import Part
         from afspm.drift.offline import against_first
@@ -130,11 +157,11 @@ class DriftPictures(DriftTable):
         made = []
         for name, start, stop in parts(told):
             pairs = [self._compared(told[start], one) for one in told[start + 1 : stop]]
-            estimates = against_first(record[start:stop], scans[start:stop], pairs)
+            estimates = against_first(record[start:stop], frames[start:stop], pairs)
             made.append(Part(name, f"correction {name}", start, stop, estimates))
         return made
 
-    def _matched(self, told: list[Told], scans: list[DriftScan]) -> tuple[int, int, Registration] | None:
+    def _matched(self, told: list[Told], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:
         """The first scan and the last without correction that has features in common with it: drift is seen best."""
         from afspm.drift.estimators import estimator
 
@@ -164,10 +191,12 @@ class DriftPictures(DriftTable):
                 self._pairs[pair] = Registration.refused(str(error))
         return self._pairs[pair]
 
-    def _scan_of(self, told: Told) -> DriftScan | None:
-        """The same; None: it can't be had."""
+    def _frame_of(self, told: Told) -> DriftScan | None:
+        """Where and when it was taken, without the values, of a night's worth of which there may be too many to be
+        kept; None: it can't be had."""
         try:
-            return self._scan(told)
+            scan = self._scan(told)
+            return replace(scan, values=np.broadcast_to(np.nan, scan.values.shape))
         except (AfspmError, OSError) as error:
             self._tell(error)
             return None

@@ -108,6 +108,35 @@ def test_a_restart_loses_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(60)
+def test_what_was_compared_before_a_restart_is_not_left_to_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = night(tmp_path)
+    lab.at(850.0, lab.parent_goes)
+    DriftPictures(estimator="correlation").run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
+    lab.restart_component()
+    component, left = DriftPictures(estimator="correlation"), list[int]()
+    pairs_at_end = DriftPictures.on_end
+    monkeypatch.setattr(DriftPictures, "on_end", lambda self: left.append(6 - len(self._pairs)) or pairs_at_end(self))
+    lab.at(1500.0, lab.kill)
+    run(component, lab, tmp_path / "state", run_dir=str(tmp_path))
+    assert left == [0]
+
+
+@pytest.mark.timeout(60)
+def test_not_all_scans_of_a_night_are_in_the_memory_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = night(tmp_path)
+    drawn = []
+    monkeypatch.setattr("afspm.drift.figures.album.write", lambda run, *_, **__: drawn.append(run) or [])
+    lab.at(1500.0, lab.kill)
+    run(DriftPictures(estimator="correlation"), lab, tmp_path / "state", run_dir=str(tmp_path))
+    (album,) = drawn
+    assert len(album.scans) == 9
+    assert album.scans[3] is not album.scans[3]
+    assert [scan.key for scan in album.scans[2:4]] == [scan.key for scan in album.scans][2:4]
+
+
+@pytest.mark.timeout(60)
 def test_scans_that_can_not_be_read_are_left_out_with_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     lab = night(tmp_path)
     for gone in (2, 7):
