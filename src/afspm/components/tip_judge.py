@@ -15,6 +15,7 @@ Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan ju
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
@@ -31,6 +32,7 @@ MAD_TO_SIGMA = 1.4826  # of normally distributed values
 SAME_SIZE = 0.02  # relative difference of sizes that are still called the same
 SAME_PLACE = 0.2  # of the size: how far a place may have moved and still be the same
 MOST_PLACES = 16
+MOST_KINDS = 4  # of scans that are learnt from side by side, until one kind is known
 FOLLOW = 0.25  # weight of a new good scan in what is known of its place
 FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # spreads that few scans can't be better than
 
@@ -130,7 +132,8 @@ class Reference:
         """Whether a scan can be compared at all."""
         sizes = zip(region.size_m, self.size_m, strict=True)
         same_size = all(abs(a / b - 1.0) < SAME_SIZE for a, b in sizes)
-        return same_size and abs(region.angle_rad - self.angle_rad) < SAME_SIZE and shape == self.shape
+        turned_rad = math.remainder(region.angle_rad - self.angle_rad, math.tau)
+        return same_size and abs(turned_rad) < SAME_SIZE and shape == self.shape
 
     def place(self, region: Region) -> Place | None:
         """What is known of where a scan was taken."""
@@ -197,7 +200,8 @@ class TipJudge:
     """Learns from the first scans, then judges.
 
     Args:
-        reference_scans: how many are learnt from. The tip has to be good by then: nobody can tell from inside.
+        reference_scans: how many are learnt from. The tip has to be good by then: nobody can tell from inside. They are
+            those of the first size that there are so many of.
         tolerance: see there.
     """
 
@@ -207,6 +211,7 @@ class TipJudge:
         self.reference_scans = reference_scans
         self.tolerance = tolerance or Tolerance()
         self.reference: Reference | None = None
+        self._others: list[Reference] = []  # begun, of scans of other sizes: an overview may come first
         self._suspect = False
 
     @property
@@ -215,11 +220,13 @@ class TipJudge:
 
     def state(self) -> dict[str, Any]:
         """What must survive a restart, JSON-able."""
-        return {"reference": self.reference.to_dict() if self.reference else None, "suspect": self._suspect}
+        reference = self.reference.to_dict() if self.reference else None
+        return {"reference": reference, "others": [one.to_dict() for one in self._others], "suspect": self._suspect}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take up what `state` gave."""
         self.reference = Reference.from_dict(state["reference"]) if state["reference"] else None
+        self._others = [Reference.from_dict(one) for one in state.get("others", ())]
         self._suspect = state["suspect"]
 
     def judge(self, trace: Array, retrace: Array | None, region: Region) -> Verdict:
@@ -230,14 +237,14 @@ class TipJudge:
             region: where they were taken.
         """
         shape = (trace.shape[0], trace.shape[1])
-        if self.reference is not None and not self.reference.fits(region, shape):
+        if self.reference is not None and self.has_learnt and not self.reference.fits(region, shape):
             return Verdict(Opinion.UNCLEAR, "of another size than the reference")
         try:
             seen_slopes = slopes(trace, retrace)
         except InvalidValue as error:
             return Verdict(Opinion.UNCLEAR, error.what)
-        if self.reference is None:
-            self.reference = Reference(region.size_m, region.angle_rad, shape)
+        if self.reference is None or not self.reference.fits(region, shape):
+            self.reference = self._begun(region, shape)
         place = self.reference.place(region)
         correlation = autocorrelation(seen_slopes, min(REACH_PX, min(shape) // 3))
         seen = metrics(seen_slopes, correlation, place.expected if place else None)
@@ -250,6 +257,13 @@ class TipJudge:
             self._know(self.reference, place, seen, correlation, region)
         return verdict
 
+    def _begun(self, region: Region, shape: tuple[int, int]) -> Reference:
+        """What is known so far of scans like this one, which the last was not; that is put by."""
+        known = next((one for one in self._others if one.fits(region, shape)), None)
+        self._others = [one for one in (*self._others, self.reference) if one is not None and one is not known]
+        del self._others[: -MOST_KINDS + 1]
+        return known or Reference(region.size_m, region.angle_rad, shape)
+
     def _learn(
         self, reference: Reference, place: Place | None, seen: TipMetrics, correlation: Array, region: Region
     ) -> Verdict:
@@ -257,6 +271,8 @@ class TipJudge:
             reference.deviations.append(_relative(seen, place.usual))
         reference.first.append(seen)
         self._know(reference, place, seen, correlation, region)
+        if self.has_learnt:
+            self._others.clear()
         return Verdict(Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans}", seen)
 
     def _know(

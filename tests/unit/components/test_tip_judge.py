@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from tip_scans_lab import ELSEWHERE, HOME, PIXELS, channels
 from afspm.components.tip_judge import Counter, Opinion, TipJudge, Tolerance, Verdict
 from afspm.components.tip_metrics import autocorrelation, ghost, slopes
 from afspm.errors import ConfigError, InvalidValue
-from afspm.model import Scan
+from afspm.model import Region, Scan
 
 LEARN = 3
 FLAWS = ("double", "blunt", "contaminated")
@@ -112,6 +114,28 @@ def test_a_scan_of_another_size_or_with_too_many_holes_is_not_judged() -> None:
     holes[: PIXELS // 2] = np.nan
     assert other.opinion is Opinion.UNCLEAR
     assert judge.judge(holes, retrace.values, HOME).opinion is Opinion.UNCLEAR
+
+
+@pytest.mark.parametrize("every", [False, True], ids=["once", "every time"])
+def test_an_overview_before_the_series_does_not_keep_it_from_being_judged(every: bool) -> None:
+    pairs = channels(0, "double", 5)
+    judge = TipJudge(LEARN)
+    overview = np.random.default_rng(1).normal(size=(PIXELS, PIXELS)) * 1e-9
+    for number, pair in enumerate(pairs[:LEARN]):
+        if every or number == 0:
+            judge.judge(overview, None, Region((0.0, 0.0), (1e-5, 1e-5)))
+            judge.restore(json.loads(json.dumps(judge.state())))
+        assert judged(judge, pair).opinion is Opinion.LEARNING
+    assert judged(judge, pairs[3]).opinion is Opinion.GOOD
+    assert judged(judge, pairs[5]).opinion is Opinion.BAD
+
+
+def test_half_a_turn_is_the_same_angle_to_either_side() -> None:
+    pairs = channels(0, "double", 5)
+    judge = TipJudge(LEARN)
+    for pair, angle in zip(pairs[:4], (math.pi, -math.pi, math.pi, -math.pi), strict=True):
+        verdict = judge.judge(pair[0].values, pair[1].values, replace(HOME, angle_rad=angle))
+    assert verdict.opinion is Opinion.GOOD
 
 
 def test_a_few_missing_lines_do_no_harm() -> None:
