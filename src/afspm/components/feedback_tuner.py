@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from afspm.components.feedback_metrics import error_shares, gain_search
-from afspm.errors import ConfigError, ControlLost, Refused
+from afspm.errors import ConfigError, ControlLost, InvalidValue, Refused
 from afspm.model import Problem, names
 from afspm.runtime.component import Component
 
@@ -80,7 +80,7 @@ class FeedbackTuner(Component):
         self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
 
     def _share_at(self, gain: float) -> float:
-        """Of the pixels beyond the threshold; all of them where the gain is refused."""
+        """Of the pixels beyond the threshold; all of them where the gain is refused, or the scan says nothing."""
         try:
             self.scope.set_feedback(integral_gain=gain)
         except Refused as refused:
@@ -92,7 +92,11 @@ class FeedbackTuner(Component):
                 f"the scans have no channel {self.channel!r}", where=self.name, hint=f"there are {', '.join(scans)}"
             )
         setpoint = self.scope.feedback.setpoint if self.scope.feedback else None
-        share = error_shares(scans[self.channel].values, setpoint, self.threshold).total
+        try:
+            share = error_shares(scans[self.channel].values, setpoint, self.threshold).total
+        except InvalidValue as error:
+            self.log.warning("integral gain %g can't be judged: %s", gain, error.what)
+            return 1.0
         self.log.info("integral gain %g: %.0f %% beyond the threshold", gain, share * 100)
         return share
 
