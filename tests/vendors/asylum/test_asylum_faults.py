@@ -11,7 +11,7 @@ from asylum_bench import Bench, Emulated
 from vendor_bench import Peer, scans, small, states
 
 from afspm.emulators.faults import Fault
-from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
+from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
@@ -72,6 +72,18 @@ def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str,
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
     made.until_said(told)
+
+
+def test_a_tip_on_its_way_is_still_on_it_when_the_connection_comes_back(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = small(made, move_s=20.0)
+    arrives_s = made.clock.now_s() + 20.0
+    assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((400e-9, 0.0))).ok
+    peer.until(ScopeState.MOVING)
+    made.strike("unknown")
+    heard = peer.until(FREE)
+    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    assert made.clock.now_s() >= arrives_s
 
 
 def test_igor_that_vanishes_is_found_again_when_it_is_back(bench: Make, tmp_path: Path) -> None:

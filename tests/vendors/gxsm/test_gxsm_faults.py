@@ -12,7 +12,7 @@ from gxsm_bench import Bench
 from vendor_bench import Peer, scans, states
 
 from afspm.emulators.gxsm.program import Program
-from afspm.model import ControlResponse, ScopeState, Spectrum, names
+from afspm.model import ControlRequest, ControlResponse, ProbePosition, ScopeState, Spectrum, names
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
@@ -69,6 +69,21 @@ def test_a_bad_answer_has_a_name_and_gxsm_is_found_again(
     made.until_said(told)
     assert scanned(peer)
     assert not Path("evil").exists()
+
+
+def test_a_tip_on_its_way_is_still_on_it_when_the_link_comes_back(bench: Make) -> None:
+    """A RedPitaya does not tell that the tip moves."""
+    made = bench(speed=5.0, card="RPSPMC")
+    peer = small(made)
+    assert peer.set(names.SCAN_SIZE_X, 1e-6).ok
+    assert peer.set(names.MOVE_SPEED, "20", "nm/s").ok
+    peer.until(FREE)
+    assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((400e-9, 0.0))).ok
+    peer.until(ScopeState.MOVING)
+    made.strike("error")
+    heard = peer.until(FREE)
+    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((400e-9, 0.0))
 
 
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])

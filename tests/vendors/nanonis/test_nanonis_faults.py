@@ -10,7 +10,7 @@ import pytest
 from nanonis_bench import Bench
 from vendor_bench import scans, small, states
 
-from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
+from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
@@ -302,6 +302,18 @@ def test_a_translator_that_was_killed_publishes_what_ended_meanwhile(bench: Make
     again = made.start()
     found = scans(again.until(FREE))
     assert found[0].filename.endswith("unnamed001.sxm")
+
+
+def test_a_tip_on_its_way_is_still_on_it_when_the_connection_comes_back(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = small(made)
+    assert peer.set(names.MOVE_SPEED, "20", "nm/s").ok
+    assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((600e-9, 0.0))).ok
+    peer.until(ScopeState.MOVING)
+    made.strike("cut")
+    heard = peer.until(FREE)
+    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((600e-9, 0.0))
 
 
 def test_software_that_vanishes_and_is_started_again_is_found_with_what_is_in_force_then(bench: Make) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -31,7 +30,7 @@ class Activity:
 
     Args:
         harvest: takes what comes of it.
-        kept: JSON-able, and lasts: the frame of the image that spots are counted on.
+        kept: JSON-able, and lasts: the frame of the image that spots are counted on, and until when the tip moves.
         folders: see `folders.local`.
         frame_in_force: as it was set.
     """
@@ -53,7 +52,6 @@ class Activity:
         self._frame_in_force = frame_in_force
         self._clock = clock
         self._log = log
-        self._moving_until_s = -math.inf
         self._stopping = False
 
     def status(self) -> ScopeStatus:
@@ -77,6 +75,11 @@ class Activity:
     def next_change_s(self) -> float | None:
         """When a move is over."""
         return self._moving_until_s if self._moving_until_s > self._clock.now_s() else None
+
+    @property
+    def _moving_until_s(self) -> float:
+        """Experiment time; it is remembered, as the tip goes on when the connection is lost."""
+        return float(self._kept.get("moving_until_s", 0.0))
 
     @property
     def image(self) -> Region:
@@ -169,7 +172,7 @@ class Activity:
 
     def moves(self, lasts_s: float) -> None:
         """The tip was sent away; it arrives, which Asylum does not tell, after so long at the latest."""
-        self._moving_until_s = self._clock.now_s() + lasts_s
+        self._kept["moving_until_s"] = self._clock.now_s() + lasts_s
 
     def _target(self, what: str) -> Target:
         suffix = self._session.values(["BaseSuffix"])["BaseSuffix"]

@@ -109,6 +109,7 @@ class Gxsm(Microscope):
             self._hardware,
             self._frame,
             self._harvest,
+            self._kept,
             self.clock,
             self.log,
             set_frame=lambda: frame(self.in_force(FRAME)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
@@ -28,6 +28,7 @@ class Activity:
     Args:
         ask: GXSM.
         frame: of the next scan; `set_frame` gives the same, as it was set, and (rows, columns).
+        kept: JSON-able, and lasts: when the tip arrives that was sent away.
         shows_s: how long what was begun may take to be seen running, in experiment time.
         saves: whether GXSM is told to save a scan at its end; if not, it does so by itself.
         scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
@@ -39,6 +40,7 @@ class Activity:
         hardware: Hardware,
         frame: Frame,
         harvest: Harvest,
+        kept: dict[str, Any],
         clock: Clock,
         log: logging.Logger,
         *,
@@ -60,7 +62,8 @@ class Activity:
         self._scan_dir, self._probe_dir = scan_dir, probe_dir
         self._stopping = False
         self._execute = ""
-        self._shows_until_s = self._arrives_s = 0.0
+        self._kept = kept
+        self._shows_until_s = 0.0
         self._endings: list[str] = []
 
     # --- what is begun ---
@@ -98,7 +101,12 @@ class Activity:
 
     def sets_out(self, way_s: float) -> None:
         """The tip was sent away, and arrives after so long, experiment time."""
-        self._arrives_s = self._clock.now_s() + way_s
+        self._kept["arrives_s"] = self._clock.now_s() + way_s
+
+    @property
+    def _arrives_s(self) -> float:
+        """Experiment time; it is remembered, as the tip goes on when the link is lost."""
+        return float(self._kept.get("arrives_s", 0.0))
 
     def next_change_s(self) -> float | None:
         """When the tip has arrived, what was begun must show, or files must be there."""
@@ -162,7 +170,7 @@ class Activity:
     def _forestalled(self) -> ScopeStatus:
         """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
         self._log.error("no spectrum is taken: somebody began to measure while the tip was on its way to it")
-        self._execute, self._arrives_s = "", 0.0
+        self._execute, self._kept["arrives_s"] = "", 0.0
         self._harvest.forget()
         return ScopeStatus(ScopeState.INTERRUPTED)
 

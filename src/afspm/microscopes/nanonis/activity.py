@@ -46,7 +46,6 @@ class Activity:
         self._kind_asked = ""
         self._told: str | None = None
         self._occupied = (ScopeState.FREE, 0.0)
-        self._arrives_s = 0.0
         self._was_safe = False
         self._shows_until_s = 0.0
 
@@ -105,12 +104,12 @@ class Activity:
 
     def sets_out(self, lasts_s: float) -> None:
         """The tip was sent away, and should arrive after so long, experiment time."""
-        self._arrives_s = self._clock.now_s() + lasts_s
+        self._probe.arrives_s = self._clock.now_s() + lasts_s
 
     def next_change_s(self) -> float | None:
         """When a move, a pulse or the wait for a file is over."""
         now_s = self._clock.now_s()
-        times = (self._occupied[1], self._arrives_s, self._harvest.next_s() or 0.0)
+        times = (self._occupied[1], self._probe.arrives_s, self._harvest.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
     # --- what goes on ---
@@ -182,7 +181,7 @@ class Activity:
     def _is_there(self) -> bool:
         if self._probe.arrived(self._ask):
             return True
-        if self._clock.now_s() < self._arrives_s + _LATEST_S:
+        if self._clock.now_s() < self._probe.arrives_s + _LATEST_S:
             return False
         self._log.error("the tip does not arrive where it was sent")
         self._probe.give_up()

@@ -216,6 +216,7 @@ class Probe(Group):
 
     Attributes:
         goal_m: where it is going; None when it is not.
+        arrives_s: when it should be there, experiment time.
     """
 
     names = POSITION
@@ -224,6 +225,7 @@ class Probe(Group):
 
     def __init__(self) -> None:
         self.goal_m: tuple[float, float] | None = None
+        self.arrives_s = 0.0
         self._seen_m: tuple[float, float] | None = None
         self._range_m = (math.inf, math.inf)
 
