@@ -1,4 +1,4 @@
-"""NSID files (.h5, pycroscopy's format) of images: [x, y], both ascending, in m; of Asylum's scans with their notes."""
+"""NSID files (.h5, pycroscopy's format) of images: [x, y], both ascending; of Asylum's scans with their notes."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.errors import FileError
 from afspm.files import asylum, hdf5
 from afspm.files.content import FileContent
 from afspm.model import Region, Scan
+from afspm.units import convert
 
 
 def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
-    """All images of a file. Raises FileError: none in it, or broken."""
+    """All images of a file. Raises FileError: none in it, or broken. UnitError: axes that are no lengths."""
     with hdf5.opened(path) as file:
         nodes: list[Any] = []
         file.visititems(lambda _, node: nodes.append(node))
@@ -50,10 +52,17 @@ def _plain(value: Any) -> Any:
     return hdf5.text(value) if isinstance(value, bytes) else value
 
 
+def _axis_m(axis: Any, unit: str) -> NDArray[np.float64]:
+    """Its values in m; `unit`: that it is in, whatever it says."""
+    values: NDArray[np.float64] = convert(hdf5.array(axis), unit or hdf5.text(axis.attrs.get("units", "m")), "m")
+    return values
+
+
 def _scan(image: Any, note: dict[str, Any], end_ns: int | None, path: Path) -> Scan:
     channel = hdf5.text(image.attrs["quantity"])
     values = hdf5.array(image).T
-    x, y = (hdf5.array(image.parent[axis]) for axis in "xy")
+    # what wrote Asylum's gave the axes the unit of their channel; they are in m
+    x, y = (_axis_m(image.parent[axis], "m" if note else "") for axis in "xy")
     if values.shape != (len(y), len(x)) or not ((np.diff(x) > 0).all() and (np.diff(y) > 0).all()):
         raise FileError(f"the axes of {channel} do not fit an image of {values.shape[1]} x {values.shape[0]} pixels")
     center_m, angle_rad = ((x[0] + x[-1]) / 2, (y[0] + y[-1]) / 2), 0.0

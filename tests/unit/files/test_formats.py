@@ -56,6 +56,27 @@ def test_an_image_has_its_pixels_where_they_were_measured(name: str, tmp_path: P
     assert list(content) == list(content.scans)
 
 
+def _of_another_instrument(path: Path, unit: str, per_m: float) -> Path:
+    """NSID without Asylum's note, its axes in another unit."""
+    import h5py
+
+    WHOLE["nsid.h5"](path)
+    with h5py.File(path, "r+") as file:
+        for group in (node for channel in file["Measurement_000"].values() for node in channel.values()):
+            del group["original_metadata"]
+            for axis in "xy":
+                group[axis][...] *= per_m
+                group[axis].attrs["units"] = unit
+    return path
+
+
+def test_the_axes_of_nsid_are_in_the_unit_that_they_say(tmp_path: Path) -> None:
+    region = afspm.read(_of_another_instrument(tmp_path / "other.h5", "nm", 1e9), zone=UTC).scans[0].region
+    same(region, Region((25e-9, 15e-9), REGION.size_m))
+    with pytest.raises(FileError, match="deg"):
+        afspm.read(_of_another_instrument(tmp_path / "angles.h5", "deg", 1.0), zone=UTC)
+
+
 def test_channels_of_one_name_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / "two.sxm"
     path.write_bytes(sxm().replace(b"\t0\tCurrent\tA\tforward", b"\t0\tZ\tm\tforward"))
