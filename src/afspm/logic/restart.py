@@ -34,11 +34,6 @@ class Restarts:
         self._times_s: deque[float] = deque()
         self._row = 0
 
-    @property
-    def spent(self) -> int:
-        """Restarts within the window, at the last failure."""
-        return len(self._times_s)
-
     def failed(self, now_s: float, lived_s: float) -> float | None:
         """It crashed after `lived_s`. Returns how long to wait before it is started again; None: give it up."""
         policy = self._policy

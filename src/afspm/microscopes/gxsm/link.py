@@ -12,7 +12,6 @@ from afspm.microscopes.microscope import ControllerLost
 
 BLOCK = "gxsm4_py_shm_data_block"
 PROCESS = "gxsm4"
-BRIDGE_PORT = 65431
 HINT = 'address = "127.0.0.1:65431", or "shm" for Gxsm4 without the bridge'
 
 

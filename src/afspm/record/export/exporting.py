@@ -89,13 +89,3 @@ def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
     if missing := [number for number in wanted if number not in by_number]:
         raise InvalidValue(f"there is no scan {missing[0]}", hint=f"there are 1 to {last}")
     return [by_number[number] for number in dict.fromkeys(wanted)]
-
-
-def stem(file: str) -> str:
-    """How the files of a measurement are called, whatever the format."""
-    return Path(file).stem
-
-
-def plain(name: str) -> str:
-    """A name as part of a file's name."""
-    return re.sub(r"[^\w.-]+", "_", name).strip("_") or "channel"

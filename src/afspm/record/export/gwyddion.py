@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import Scan, Spectrum
-from afspm.record.export.exporting import stem
+from afspm.record.export.file_names import stem
 from afspm.record.measured import write_synced
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow

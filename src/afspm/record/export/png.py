@@ -11,7 +11,7 @@ import numpy as np
 
 from afspm.clock import iso_utc
 from afspm.model import Scan, Spectrum
-from afspm.record.export.exporting import plain, stem
+from afspm.record.export.file_names import plain, stem
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 
 class Failed(AssertionError):
@@ -29,11 +28,6 @@ def expect(holds: object, expected: str, came: str) -> None:
     """Raises Failed unless it holds."""
     if not holds:
         raise Failed(expected, came)
-
-
-def expect_equal(what: str, expected: Any, came: Any) -> None:
-    """Raises Failed unless both are the same."""
-    expect(expected == came, f"{what} {expected}", f"{came}")
 
 
 def near(a: float, b: float, relative: float = 1e-3, absolute: float = 0.0) -> bool:
