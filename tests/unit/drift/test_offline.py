@@ -44,6 +44,16 @@ def test_a_pair_speaks_of_the_rows_that_both_show_and_is_brought_to_the_middle_o
     np.testing.assert_allclose(against_first(run, unknown, [pair]).drift_m[1], pair.displacement_m)
 
 
+def test_the_first_scan_of_a_run_had_the_rate_that_the_second_tells() -> None:
+    scans = [DriftScan(np.zeros((8, 8)), REGION, 900.0 * k, 900.0 * k + 200.0, upwards=True) for k in range(2)]
+    velocity = np.array([1e-10, 2e-10])
+    run = replace(record()[:2], rate_m_s=np.array([(0.0, 0.0), velocity]))
+    # what lies a quarter of the height above the middle, and is found further up by the drift
+    between_s = 900.0 / (1.0 - velocity[1] * 200.0 / REGION.size_m[1])
+    pair = found(tuple(velocity * between_s), center_m=(1e-6, 0.25e-6))
+    np.testing.assert_allclose(against_first(run, scans, [pair]).drift_m[1], velocity * 900.0)
+
+
 def test_a_refused_pair_stays_in_the_table_with_its_reason() -> None:
     scans = [DriftScan(np.zeros((8, 8)), REGION, 900.0 * k, 900.0 * k) for k in range(2)]
     refused = against_first(record()[:2], scans, [Registration.refused("nothing in common")])
