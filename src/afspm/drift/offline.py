@@ -33,11 +33,10 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
         pairs: of the first scan with each of the others.
     """
     drift, covariance = [np.zeros(2)], [np.zeros((2, 2))]
-    # of the very first scan no rate was known yet, that of the next is since then
-    first_rate_m_s = record.rate_m_s[0] if record.rate_m_s[0].any() else record.rate_m_s[min(1, len(record) - 1)]
+    rate_m_s = record.rate_then_m_s
     for k, (scan, pair) in enumerate(zip(scans[1:], pairs, strict=True), start=1):
-        early = first_rate_m_s * (row_delay_s(scans[0], pair.center_m) or 0.0)
-        late = record.rate_m_s[k] * (row_delay_s(scan, pair.center_m + pair.displacement_m) or 0.0)
+        early = rate_m_s[0] * (row_delay_s(scans[0], pair.center_m) or 0.0)
+        late = rate_m_s[k] * (row_delay_s(scan, pair.center_m + pair.displacement_m) or 0.0)
         drift.append(pair.displacement_m - (late - early))
         covariance.append(pair.covariance_m2)
     return replace(

@@ -32,7 +32,7 @@ class DriftRecord:
         center_m: (n, 2) centre of its region.
         drift_m: (n, 2) displacement of the sample under the tip since the start, known after the scan.
         covariance_m2: (n, 2, 2) of it.
-        rate_m_s: (n, 2) velocity of the sample then.
+        rate_m_s: (n, 2) velocity of the sample then; after the first scan none is known, which is told as zero.
         matched: (n,) whether the scan could be registered; where not, the drift is predicted.
         reasons: why it could not, for a person.
     """
@@ -65,6 +65,14 @@ class DriftRecord:
     def sd_m(self) -> Array:
         """(n, 2) standard deviations of x and y of the drift."""
         return np.sqrt(np.diagonal(self.covariance_m2, axis1=1, axis2=2))
+
+    @property
+    def rate_then_m_s(self) -> Array:
+        """(n, 2) the velocity during each scan: that during a first one, of which none was known, is that of the next."""
+        rates = self.rate_m_s.copy()
+        if len(rates) > 1 and not rates[0].any():
+            rates[0] = rates[1]
+        return rates
 
     @property
     def misplacement_m(self) -> Array:

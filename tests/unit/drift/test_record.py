@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,16 @@ def record(n: int = 20, seed: int = 1) -> DriftRecord:
         matched=np.arange(n) % 7 != 3,
         reasons=tuple("nothing in common" if k % 7 == 3 else "" for k in range(n)),
     )
+
+
+def test_the_rate_during_a_first_scan_is_what_the_next_tells_unless_it_was_known() -> None:
+    known = record(3)
+    np.testing.assert_array_equal(known.rate_then_m_s, known.rate_m_s)
+    rates = known.rate_m_s.copy()
+    rates[0] = 0.0
+    begun = replace(known, rate_m_s=rates)
+    np.testing.assert_array_equal(begun.rate_then_m_s, rates[[1, 1, 2]])
+    np.testing.assert_array_equal(begun[:1].rate_then_m_s, [(0.0, 0.0)])
 
 
 def test_a_record_that_was_written_is_read_as_it_was(tmp_path: Path) -> None:
