@@ -47,6 +47,8 @@ class SpectroscopyGrid(Component):
             self.positions = grid_centers(pair(center), (counts[0], counts[1]), pair(spacing), angle)
         else:
             raise ConfigError("a grid needs its `spacing`", hint='e.g. spacing = ["10 nm", "10 nm"]')
+        if not self.positions:
+            raise ConfigError("no position is listed", where="positions")
         if repeats < 1:
             raise ConfigError(f"{repeats} repeats are none", where="repeats")
         self.kind = kind

@@ -68,7 +68,7 @@ class DriftRecord:
 
     @property
     def rate_then_m_s(self) -> Array:
-        """(n, 2) the velocity during each scan: that during a first one, of which none was known, is that of the next."""
+        """(n, 2) the velocity during each scan: if none was known after the first, that of the next holds for it."""
         rates = self.rate_m_s.copy()
         if len(rates) > 1 and not rates[0].any():
             rates[0] = rates[1]
