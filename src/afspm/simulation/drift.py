@@ -7,6 +7,7 @@ experiment started is found at `x_tip = x_sample + drift(t)`.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -106,7 +107,9 @@ class Compensation:
         """(x, y, z) in m at experiment times, shape t.shape + (3,); z is not followed."""
         t = np.asarray(t_s, dtype=np.float64)
         followed = np.zeros((*t.shape, 3))
-        for since_s, x, y, velocity_x, velocity_y in self._turns:
+        # in a long night there are thousands, and asked for is what was last
+        first = bisect_right(self._turns, t.min(initial=math.inf), key=lambda turn: turn[0]) - 1
+        for since_s, x, y, velocity_x, velocity_y in self._turns[max(first, 0) :]:
             later = t >= since_s
             followed[later, 0] = x + velocity_x * (t[later] - since_s)
             followed[later, 1] = y + velocity_y * (t[later] - since_s)

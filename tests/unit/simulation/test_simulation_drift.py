@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from afspm.errors import InvalidValue
-from afspm.simulation.drift import Drift, DriftSettings, Relaxation, random_walk
+from afspm.simulation.drift import Compensation, Drift, DriftSettings, Relaxation, random_walk
 
 START = 1.75e9
 
@@ -66,3 +66,16 @@ def test_a_scanner_that_follows_with_the_right_velocity_sees_no_drift() -> None:
     again = World.from_settings({"drift": {"velocity_m_per_s": [1e-9, -2e-9, 0.0]}}, 1, 0.0)
     again.restore(world.state())
     np.testing.assert_array_equal(again.seen_drift_m(5e3), world.seen_drift_m(5e3))
+
+
+def test_a_scanner_has_followed_what_it_was_told_since_whenever_that_is_asked() -> None:
+    compensation = Compensation()
+    turns = [(10.0, 1e-9), (20.0, 3e-9), (20.0, -2e-9), (35.0, 0.0)]
+    for since_s, velocity in turns:
+        compensation.set((velocity, -velocity), since_s)
+    times = np.linspace(0.0, 50.0, 101)
+    expected = np.interp(times, [0.0, 10.0, 20.0, 35.0, 50.0], [0.0, 0.0, 10e-9, -20e-9, -20e-9])
+    for part in (times, times[::-1], times[60:], times[:5], times[:0]):
+        follows = np.interp(part, times, expected)
+        np.testing.assert_allclose(compensation.at(part)[:, :2], np.stack([follows, -follows], axis=1), atol=1e-20)
+    np.testing.assert_allclose([compensation.at(t)[0] for t in times], expected, atol=1e-20)
