@@ -8,6 +8,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from afspm.errors import AfspmError
 from afspm.record.going_on import lock
@@ -36,17 +37,33 @@ def commanding(address: str, run: str) -> Iterator[None]:
         yield
         return
     path = _file(address)
-    with path.open("a+b") as file:
-        try:
-            lock(file)
-        except OSError as error:
-            told = f"this controller is commanded by {_holder(path)}"
-            raise ControllerTaken(told, where=address, hint="one run at a time: end that one first") from error
+    with _locked(path, address) as file:
         with contextlib.suppress(OSError):  # a full disk: who holds it can't be told, and it is held all the same
             file.truncate(0)
             file.write(b" " * _LOCKED_BYTES + f"{run or 'another run'}, process {os.getpid()}".encode())
             file.flush()
-        yield
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):  # Windows keeps it while it is open
+                path.unlink()
+
+
+def _locked(path: Path, address: str) -> BinaryIO:
+    """The file, open, and locked by us. Raises ControllerTaken."""
+    while True:
+        file = path.open("a+b")
+        try:
+            lock(file)
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
+        except FileNotFoundError:
+            pass  # whoever had it has just taken it away
+        except OSError as error:
+            file.close()
+            told = f"this controller is commanded by {_holder(path)}"
+            raise ControllerTaken(told, where=address, hint="one run at a time: end that one first") from error
+        file.close()
 
 
 def _file(address: str) -> Path:

@@ -9,10 +9,12 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
 from afspm.clock import ExperimentClock
+from afspm.microscopes import sole
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
@@ -48,6 +50,27 @@ def test_a_second_run_is_refused_and_told_which_has_the_controller(other: str) -
             pass
     with commanding(other, "runs/second"):
         pass
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file can't be removed there")
+def test_nothing_is_left_behind_and_nobody_holds_what_has_been_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Path] = []
+    locked = sole.lock
+
+    def lock_too_late(file: BinaryIO) -> None:
+        """Whoever had it removes it just after it was opened."""
+        if not opened:
+            opened.extend(tmp_path.iterdir())
+            opened[0].unlink()
+        locked(file)
+
+    monkeypatch.setattr(sole, "lock", lock_too_late)
+    with commanding("lab:1", "a"), pytest.raises(ControllerTaken, match="commanded by a"), commanding("lab:1", "b"):
+        pass
+    assert opened
+    assert not list(tmp_path.iterdir())
 
 
 def test_this_computer_is_the_same_by_name_and_number() -> None:
