@@ -104,6 +104,16 @@ def test_without_a_match_only_the_prediction_applies() -> None:
     assert following.forecast.at(3000.0).mapping.translation_m == pytest.approx([-30.0 * NM, 0.0])
 
 
+def test_scans_of_places_that_nothing_is_known_of_are_no_sign_of_being_lost() -> None:
+    following = PaperTracker(World(), queue=3, lost_after=3)
+    places = [(k * 10e-6, 0.0) for k in range(6)]
+    updates = [
+        following.add(scan_at(1000.0 * k, key=str(k), center_m=place)) for k, place in enumerate([*places, *places])
+    ]
+    assert not any(update.lost for update in updates)
+    assert [update.matched for update in updates] == [True] + 11 * [False]
+
+
 def test_it_is_lost_after_some_scans_without_a_match() -> None:
     world = World(blind={"2", "3", "4"})
     following = PaperTracker(world, lost_after=3)

@@ -98,7 +98,8 @@ class PaperTracker:
         queue: l, scans that are kept.
         f_min: least intersection ratio of a pair, in sample coordinates.
         sr_norm_min: least ratio of their resolutions.
-        lost_after: so many scans one after the other without a match mean that it is lost (ours; the paper goes on).
+        lost_after: so many scans one after the other that should have matched and did not mean that it is lost (ours; the
+            paper goes on).
 
     Raises:
         ConfigError: a setting without a meaning.
@@ -145,7 +146,7 @@ class PaperTracker:
         placed, tried, reason = (None, {}, "") if first else self._match(scan, before.mapping)
         matched = first or placed is not None
         mapping = before.mapping if placed is None else self._averaged(before.mapping, placed)
-        self._unmatched = 0 if matched else self._unmatched + 1
+        self._unmatched = 0 if matched else self._unmatched + bool(tried)  # elsewhere there is nothing to be found
         self._step(scan, before, mapping, [one for one in tried.values() if one.accepted])
         self._queue.append(_Placed(scan, mapping))
         return Update(
