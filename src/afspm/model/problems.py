@@ -35,6 +35,9 @@ class ProblemNames(Mapping[str, int]):
             self._numbers[_plain(name)] = number
         self._names = {number: name for name, number in self._numbers.items()}
 
+    def __repr__(self) -> str:
+        return f"ProblemNames({self._numbers})"
+
     def number(self, problem: str | int) -> int:
         """The number of a problem given by number or by name ("tip-shape-changed", "EP_TIP_SHAPE_CHANGED").
 

@@ -82,6 +82,14 @@ class Scope:
         self._measuring = Measuring(link, self._holding, self._asker, self._results)
         self._measuring.resume(MEASURED, fits)
 
+    def __repr__(self) -> str:
+        """How it is, as far as it was heard of: asks nobody, as a notebook may want it at any time."""
+        view = self._link.view
+        control = view.control or ControlState(ControlMode.UNDEFINED)
+        flagged = "".join(f", {self.problems.name(number)} is flagged" for number in control.problems)
+        holder = control.holder or "nobody"
+        return f"<Scope {self._link.name!r}: {view.state.name}, {control.mode.name}, {holder} is in control{flagged}>"
+
     # --- measuring ---
 
     def scan(

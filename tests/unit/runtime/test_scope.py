@@ -186,6 +186,16 @@ def test_a_scan_whose_beginning_was_lost_with_the_connection_is_recognised(lab: 
     assert lab.begun_scans == 1
 
 
+def test_a_notebook_shows_how_it_is(lab: Lab, scope: Scope) -> None:
+    with scope.control():
+        name = scope.control_state.holder
+        assert repr(scope) == f"<Scope {name!r}: FREE, AUTOMATED, {name} is in control>"
+    lab.flag(Problem.TIP_SHAPE_CHANGED)
+    assert scope.control_state.problems
+    assert "nobody is in control, tip-shape-changed is flagged" in repr(scope)
+    assert "'tip-shape-changed': 1" in repr(scope.problems)
+
+
 def test_a_refusal_is_raised_with_its_reason(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: (
         Response(ControlResponse.PARAM_ERROR, reason="the limit of scan-size-x is 1 um")
