@@ -98,8 +98,8 @@ class PaperTracker:
         queue: l, scans that are kept.
         f_min: least intersection ratio of a pair, in sample coordinates.
         sr_norm_min: least ratio of their resolutions.
-        lost_after: so many scans one after the other that should have matched and did not mean that it is lost (ours; the
-            paper goes on).
+        lost_after: so many scans one after the other that should have matched and did not mean that it is lost (ours;
+            the paper goes on).
 
     Raises:
         ConfigError: a setting without a meaning.
