@@ -186,6 +186,6 @@ def _stack(found: Series, record: DriftRecord, path: Path) -> Path:
     """Only of scans that were matched: where the others lie is a guess."""
     which = np.flatnonzero(record.matched)
     scans = [found.scans[k] for k in which]
-    stack = corrected(scans, record.drift_m[which], record.rate_m_s[which])
+    stack = corrected(scans, record.drift_m[which], record.rate_then_m_s[which])
     stack.write(path, channel=found.channel, unit=found.unit)
     return path
