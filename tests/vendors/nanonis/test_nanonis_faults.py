@@ -11,6 +11,7 @@ from nanonis_bench import Bench
 from vendor_bench import scans, small, states
 
 from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
+from afspm.supervisor.ports import FreePorts
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
@@ -334,9 +335,9 @@ def test_software_that_vanishes_and_is_started_again_is_found_with_what_is_in_fo
 
 def test_an_address_without_anybody_is_named(bench: Make) -> None:
     made = bench()
-    made.address = "127.0.0.1:1"
+    made.address = f"127.0.0.1:{FreePorts().take()}"
     peer = made.start()
     response = peer.get_response(names.TIP_BIAS_VOLTAGE)
     assert response.code == ControlResponse.NO_RESPONSE
-    made.until_said("127.0.0.1:1: no connection")
+    made.until_said(f"{made.address}: no connection")
     made.until_said("is Nanonis running")

@@ -213,6 +213,8 @@ class Nanonis(Microscope):
         except protocol.NanonisError:
             self._activity.forget()
             raise
+        if self._ask("Scan.StatusGet")[0]:  # it may be over before it is looked at again
+            self._harvest.seen()
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
