@@ -404,7 +404,7 @@ def test_a_spectrum_is_stopped_while_the_tip_is_on_its_way_to_it(bench: Make) ->
 def test_a_spectrum_is_not_taken_into_a_scan_that_somebody_began_meanwhile(
     bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = bench(speed=20.0, **settings)
+    made = bench(speed=4.0, **settings)
     peer = made.start()
     ready(peer, shape=(40, 32))
     moved(peer, 100e-9, 10e-9)
