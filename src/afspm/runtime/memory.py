@@ -53,7 +53,14 @@ class Memory(MutableMapping[str, Any]):
             InvalidValue: a value is not of JSON's types.
             FileError: the folder is gone …
         """
-        text = self._text()
+        return self._write(self._text())
+
+    def save_changes(self) -> None:
+        """`save`, if anything is other than it was saved last, however deep within."""
+        if (text := self._text()) != self._saved:
+            self._write(text)
+
+    def _write(self, text: str) -> bool:
         with self._told.trying():
             if self._generations is not None:
                 self._generations.save(text.encode())
@@ -62,11 +69,6 @@ class Memory(MutableMapping[str, Any]):
             self._saved = text
             return True
         return False
-
-    def save_changes(self) -> None:
-        """`save`, if anything is other than it was saved last, however deep within."""
-        if self._text() != self._saved:
-            self.save()
 
     def _text(self) -> str:
         try:
