@@ -22,8 +22,13 @@ demo-drift: $(SETUP)
 
 ## all tests: more at a time than there are cores, since many of them wait. Tests and modules stay compiled
 TESTS_AT_A_TIME ?= 7
-test: $(SETUP)
+COLLECTED := .venv/.tests-collected
+test: $(COLLECTED)
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME)
+
+# asserts are rewritten once, not by each of the processes that run tests; what can't be collected is told by them
+$(COLLECTED): $(SETUP) $(shell find tests -name '*.py')
+	@ls -d tests/*/ | PYTHONDONTWRITEBYTECODE= xargs -P 2 -n 1 $(BIN)/pytest --collect-only -qq > /dev/null 2>&1; touch $@
 
 ## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots
 test-ui: $(SETUP)

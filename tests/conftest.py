@@ -31,13 +31,15 @@ COMPUTING = ("tests/deterministic/", "tests/unit/")
 """How the names of tests begin that need the processor all the time; the others wait for processes of their own."""
 COMPUTERS = 2
 """So many processes do these as long as there are any, beside those that wait: no core is ever idle."""
+LONG = ("tests/docs/", "tests/system/experiment/")
+"""How the names of tests begin that wait longest: they come first of those that wait, or one of them would be the last."""
 TOGETHER = ("tests/ui/", "tests/unit/components/test_tip_")
 """How the names of tests begin that one process does, in a row, since they share what is made once in a process."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Those that compute come first, those that wait longest at the end."""
-    items.sort(key=lambda item: (not item.nodeid.startswith(COMPUTING), item.nodeid.startswith("tests/docs/")))
+    """Those that compute come first, those that wait longest at the end, where those that wait are taken from."""
+    items.sort(key=lambda item: (not item.nodeid.startswith(COMPUTING), item.nodeid.startswith(LONG)))
 
 
 @pytest.hookimpl(optionalhook=True)
