@@ -32,7 +32,7 @@ COMPUTING = ("tests/deterministic/", "tests/unit/")
 COMPUTERS = 2
 """So many processes do these as long as there are any, beside those that wait: no core is ever idle."""
 LONG = ("tests/docs/", "tests/system/experiment/")
-"""How the names of tests begin that wait longest: they come first of those that wait, or one of them would be the last."""
+"""How the names of tests begin that wait longest: first of those that wait, or one of them would be the last."""
 TOGETHER = ("tests/ui/", "tests/unit/components/test_tip_")
 """How the names of tests begin that one process does, in a row, since they share what is made once in a process."""
 
