@@ -5,5 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pytest
+
 # vendor_bench is shared by the folders of the vendors
 sys.path.insert(0, str(Path(__file__).parent))
+pytest.register_assert_rewrite("vendor_bench")

@@ -51,7 +51,8 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
 @pytest.mark.parametrize("fetch", [False, True])
 def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: str, fetch: bool) -> None:
     """Against the heights of the simulated sample at each pixel: half a pixel off, or a mirrored axis, would show."""
-    made = bench(surface="steps", tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
+    seen = 20.0 if fetch else 100.0  # what is in no file must be seen running
+    made = bench(seen, surface="steps", tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
     ready(peer, region, (48, 32))
@@ -343,7 +344,7 @@ def test_the_panel_may_have_been_left_scanning_on_and_on_and_not_saving(bench: M
 
 
 def test_it_can_be_told_to_leave_saving_alone(bench: Make) -> None:
-    made = bench()
+    made = bench(speed=5.0)  # what is not saved must be seen running
     made.at_panel(lambda emulator: emulator.panel.__dict__.update(autosave="off"))
     peer = made.start(autosave=False)
     ready(peer)
