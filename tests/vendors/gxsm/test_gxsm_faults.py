@@ -9,10 +9,19 @@ from typing import Any
 
 import pytest
 from gxsm_bench import Bench
-from vendor_bench import Peer, scans, states
+from vendor_bench import SHAPE, Peer, ready, scans, states
 
 from afspm.emulators.gxsm.program import Program
-from afspm.model import ControlRequest, ControlResponse, ProbePosition, ScopeState, Spectrum, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    ProbePosition,
+    Region,
+    ScanParameters,
+    ScopeState,
+    Spectrum,
+    names,
+)
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
@@ -24,12 +33,7 @@ BRIDGE: dict[str, Any] = {}
 def small(made: Bench, **settings: object) -> Peer:
     """A translator that has found GXSM, with a frame of few pixels in force."""
     peer = made.start(**settings)
-    peer.until(FREE)
-    assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
-    assert peer.set(names.SCAN_RESOLUTION_Y, 8).ok
-    assert peer.set(names.SCAN_SIZE_X, 100e-9).ok
-    peer.until(lambda one: getattr(one, "shape", None) == (8, 16) and one.region.size_m[0] == 100e-9)
-    peer.until(FREE)
+    ready(peer, Region((0.0, 0.0), (100e-9, 1e-6)), (8, 16))
     return peer
 
 
@@ -74,16 +78,28 @@ def test_a_bad_answer_has_a_name_and_gxsm_is_found_again(
 def test_a_tip_on_its_way_is_still_on_it_when_the_link_comes_back(bench: Make) -> None:
     """A RedPitaya does not tell that the tip moves."""
     made = bench(speed=5.0, card="RPSPMC")
-    peer = small(made)
-    assert peer.set(names.SCAN_SIZE_X, 1e-6).ok
+    peer = made.start()
+    ready(peer, Region((0.0, 0.0), (1e-6, 1e-6)))
     assert peer.set(names.MOVE_SPEED, "20", "nm/s").ok
-    peer.until(FREE)
     assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((400e-9, 0.0))).ok
     peer.until(ScopeState.MOVING)
     made.strike("error")
     heard = peer.until(FREE)
     assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
     assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((400e-9, 0.0))
+
+
+def test_a_tip_that_its_frame_takes_along_is_on_its_way_too(bench: Make) -> None:
+    """A RedPitaya does not tell that either; and where it goes next, it goes from there."""
+    made = bench(speed=5.0, card="RPSPMC")
+    peer = made.start()
+    ready(peer, Region((0.0, 0.0), (1e-6, 1e-6)))
+    assert peer.set(names.MOVE_SPEED, "50", "nm/s").ok
+    for center_m in ((200e-9, 0.0), (200e-9, -100e-9)):
+        assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(Region(center_m, (1e-6, 1e-6)), SHAPE, "")).ok
+        peer.until(ScopeState.MOVING)
+        assert states(peer.until(FREE)) == ["FREE"]
+        assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx(center_m)
 
 
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])

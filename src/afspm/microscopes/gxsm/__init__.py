@@ -178,7 +178,7 @@ class Gxsm(Microscope):
         """The frame first, which the tip's place depends on."""
         framed = {name: value for name, value in values.items() if name in Frame.names}
         if framed:
-            self._frame.write(framed)
+            self._write_frame(framed)
         position = {name: float(value) for name, value in values.items() if name in POSITION}
         if position:
             x, y = (position.get(name, before) for name, before in zip(POSITION, self._probe_m(), strict=True))
@@ -210,18 +210,26 @@ class Gxsm(Microscope):
         kept = self._kept["probe"]
         return self._frame.tip() if kept is None else (float(kept[0]), float(kept[1]))
 
+    def _write_frame(self, framed: Mapping[str, Value]) -> None:
+        """The tip goes along with its frame, which a RedPitaya does not tell."""
+        untold = self._hardware is Hardware.RPSPMC
+        before_m = self._frame.tip() if untold else None
+        self._frame.write(framed)
+        if before_m is not None:
+            self._activity.sets_out(self._way_s(math.dist(before_m, self._frame.tip())))
+
     def _send_probe(self, xy_m: tuple[float, float]) -> None:
-        way_s = self._way_s(xy_m)
+        way_s = self._way_s(math.dist(self._frame.tip(), xy_m))
         self._frame.move_tip(xy_m)
         self._kept["probe"] = list(xy_m)
         self._activity.sets_out(way_s)
 
-    def _way_s(self, xy_m: tuple[float, float]) -> float:
-        """How long the tip may take from where it was sent last; none if GXSM does not tell its speed."""
+    def _way_s(self, way_m: float) -> float:
+        """How long the tip takes for so long a way; none if GXSM does not tell its speed."""
         if names.MOVE_SPEED not in self._refs:
             return 0.0
         speed_m_s = float(super().read([names.MOVE_SPEED])[names.MOVE_SPEED])
-        return math.dist(self._probe_m(), xy_m) / speed_m_s if speed_m_s > 0.0 else 0.0
+        return way_m / speed_m_s if speed_m_s > 0.0 else 0.0
 
     # --- results ---
 
@@ -260,11 +268,8 @@ class Gxsm(Microscope):
         if execute(kind) not in self._actions:
             reason = f"this GXSM has no {execute(kind)} with its hardware ({self._hardware.value}): see x-spec-kind"
             raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
-        position_m = self._probe_m()
-        region = self._frame.region()
-        reach_m = math.hypot(*region.size_m)
-        speed_m_s = float(super().read([names.MOVE_SPEED])[names.MOVE_SPEED]) if names.MOVE_SPEED in self._refs else 0.0
-        self._activity.start_curve(kind, position_m, reach_m / speed_m_s if speed_m_s > 0.0 else 0.0)
+        reach_m = math.hypot(*self._frame.region().size_m)
+        self._activity.start_curve(kind, self._probe_m(), self._way_s(reach_m))
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:

@@ -100,8 +100,9 @@ class Activity:
         self._stop()
 
     def sets_out(self, way_s: float) -> None:
-        """The tip was sent away, and arrives after so long, experiment time."""
-        self._kept["arrives_s"] = self._clock.now_s() + way_s
+        """The tip was sent on, and arrives so long, experiment time, after it would have been where it was sent before,
+        at the latest."""
+        self._kept["arrives_s"] = max(self._clock.now_s(), self._arrives_s) + way_s
 
     @property
     def _arrives_s(self) -> float:
