@@ -16,6 +16,8 @@ from afspm.supervisor.ports import FreePorts
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
 UNDEFINED = ScopeState.UNDEFINED
+SEEN = 5.0
+"""A speed at which a scan is seen while it lasts, on a busy computer too: or it is not known to have run."""
 
 
 @pytest.mark.parametrize(
@@ -128,7 +130,7 @@ def test_a_file_that_takes_its_time_is_waited_for(bench: Make, kind: str) -> Non
 
 @pytest.mark.parametrize("kind", ["file-late", "half-file", "file-missing"])
 def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> None:
-    made = bench(speed=20.0)
+    made = bench(speed=SEEN)
     peer = small(made)
     made.strike(kind, duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
@@ -139,7 +141,7 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
 
 
 def test_a_scan_that_does_not_begin_is_broken_off_and_the_one_before_not_taken_for_it(bench: Make) -> None:
-    made = bench(speed=20.0)
+    made = bench(speed=SEEN)
     peer = small(made)
     assert peer.act(names.START_SCAN).ok
     assert scans(peer.until(FREE))
@@ -154,12 +156,12 @@ def test_a_scan_that_does_not_begin_is_broken_off_and_the_one_before_not_taken_f
 @pytest.mark.parametrize("kinds", [("late-start",), ("ends-at-once",), ("ends-at-once", "late-start")])
 def test_a_scan_that_begins_late_is_the_one_that_is_published(bench: Make, kinds: tuple[str, ...]) -> None:
     """It is asked for the end of the scan before that has begun: what it hears of another, or of none, is no end."""
-    made = bench(speed=20.0)
+    made = bench(speed=SEEN)
     peer = small(made)
     assert peer.act(names.START_SCAN).ok
     first = scans(peer.until(FREE))
     for kind in kinds:
-        made.strike(kind, duration_s=40.0)
+        made.strike(kind, duration_s=10.0)
     assert peer.act(names.START_SCAN).ok
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "FREE"]
@@ -244,7 +246,7 @@ def test_a_spectrum_that_somebody_takes_unsaved_is_not_that_of_before(bench: Mak
 
 
 def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
-    made = bench(speed=20.0)
+    made = bench(speed=SEEN)
     peer = small(made, result_timeout_s=1e6)  # whoever waits for a file waits longer than this test does
     made.strike("autosave-off", duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
