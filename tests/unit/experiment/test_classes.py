@@ -25,4 +25,4 @@ def test_modules_beside_the_file_are_forgotten_and_those_of_an_environment_in_it
             importlib.import_module(name)
         assert {"beside", "package", "library"} <= set(sys.modules)
     assert not {"beside", "package"} & set(sys.modules)
-    monkeypatch.delitem(sys.modules, "library")  # it was there still
+    del sys.modules["library"]  # it was there still
