@@ -41,14 +41,14 @@ def test_faults_on_demand_are_not_there_unless_wanted(run: Any) -> None:
 
 def test_slow_answers_come_late(faulty: Any) -> None:
     peer = faulty.peer().ready()
-    demand(peer, "slow", count=2, duration_s=0.4)
+    demand(peer, "slow", count=2, duration_s=1.0)
     for _ in range(2):
         began_s = time.monotonic()
         assert peer.ask_frames(get_speed(), 10)[0] == b"\0"
-        assert time.monotonic() - began_s >= 0.4
+        assert time.monotonic() - began_s >= 1.0
     began_s = time.monotonic()
     peer.get("scan-speed")
-    assert time.monotonic() - began_s < 0.4
+    assert time.monotonic() - began_s < 1.0
 
 
 def test_a_lost_answer_was_carried_out_and_is_given_when_asked_again(faulty: Any) -> None:
