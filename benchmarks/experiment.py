@@ -1,4 +1,6 @@
-"""A whole experiment: how soon it is up, how soon a killed process is back, and what it costs while nothing happens."""
+"""A whole experiment: how soon it is up, how soon a killed process is back, how soon all has ended, and what it costs
+while nothing happens.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +28,7 @@ from benchmarks.rows import Row, measurement
 DEADLINE_S = 30.0
 STARTS = 5
 KILLS = 5
+ENDS = 5
 IDLE_S = 10.0
 
 # six processes, none of which has anything to do
@@ -175,6 +178,27 @@ def _back_s(name: str) -> float:
                     scope.get("scan-speed")
                     return perf_counter() - began_s
     raise TimeoutError(f"{name} did not come back")
+
+
+@measurement
+def ending() -> Iterator[Row]:
+    if sys.platform == "win32":
+        return
+    took_s = [_end_s(deaf=False) for _ in range(ENDS)]
+    yield Row("Ctrl-C until all has ended", "s", statistics.median(took_s), None, 2.0)
+    took_s = [_end_s(deaf=True) for _ in range(ENDS)]
+    yield Row("Ctrl-C until all has ended, one being frozen", "s", statistics.median(took_s), None, 2.0)
+
+
+def _end_s(*, deaf: bool) -> float:
+    with running() as run:
+        run.wait_for(r"watcher .*knows the state")
+        if deaf:
+            os.kill(run.pids["watcher"], signal.SIGSTOP)
+        began_s = perf_counter()
+        run.process.send_signal(signal.SIGINT)
+        run.process.wait(DEADLINE_S)
+        return perf_counter() - began_s
 
 
 @measurement
