@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import socket
 import subprocess
 import sys
@@ -159,7 +160,9 @@ class TranslatorProcess:
             simulated=clock.real_s(1.0) != 1.0,
         )
         command = [sys.executable, "-m", "afspm.runtime.host"]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+        # where the lock on the controller lies, which one that is killed leaves behind
+        own = {**os.environ, "TMPDIR": str(folder), "TEMP": str(folder)}
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, env=own)
         self._listening = Thread(target=(said or Said()).listen, args=(self._process.stderr,))
         self._listening.start()
         stack.callback(self._end)
