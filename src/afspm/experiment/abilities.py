@@ -21,15 +21,13 @@ class Abilities:
 def of_class(microscope: type, settings: Mapping[str, Any]) -> Abilities | None:
     """The abilities of a `Microscope` class with these settings; None where the class does not tell."""
     from afspm.microscopes.microscope import Microscope
-    from afspm.microscopes.parameters import ParameterTable
 
     if not issubclass(microscope, Microscope):
         return None
     marks = (getattr(getattr(microscope, name), "_afspm_action", None) for name in dir(microscope))
     actions = {mark.name for mark in marks if mark is not None} | set(settings.get("actions") or {})
     try:
-        table = ParameterTable.from_toml(microscope.parameters_file)
-        table = table.extended(settings.get("parameters") or {}, where="the experiment file")
+        table = microscope.parameter_table(settings.get("parameters") or {})
     except (AfspmError, AttributeError):
         return None  # the microscope itself will say what is wrong with its table
     return Abilities(frozenset(actions), {name: table[name].si_unit for name in table})

@@ -135,6 +135,8 @@ class Microscope(ABC):
     """
 
     parameters_file: ClassVar[Path]
+    translated: ClassVar[Collection[str]] = ()
+    """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
     eager_poll_s: ClassVar[float] = EAGER_S
     """Real seconds between two looks when a scan may end at any moment."""
     max_pixels: ClassVar[int] = 4096 * 4096
@@ -166,8 +168,7 @@ class Microscope(ABC):
     ) -> None:
         if live_lines_s is not None and type(self).lines is Microscope.lines:
             raise ConfigError(f"{type(self).__name__} can't give lines while it scans", where="live_lines_s")
-        table = ParameterTable.from_toml(self.parameters_file)
-        self.table = table.extended(parameters or {}, where="the experiment file")
+        self.table = self.parameter_table(parameters or {})
         self.added_actions = dict(actions or {})
         self.poll_period_s = poll_period_s
         self.result_timeout_s = result_timeout_s
@@ -178,6 +179,16 @@ class Microscope(ABC):
         """How long to wait, in experiment seconds, for what takes the controller `of_s` at most on its own computer:
         longer where so much passes while a program draws breath (an emulated controller at sixty times the speed)."""
         return max(of_s, self.program_s / self.clock.real_s(1.0))
+
+    @classmethod
+    def parameter_table(cls, changed: Mapping[str, Mapping[str, Any]]) -> ParameterTable:
+        """The parameters of this kind of microscope, with the rows that the experiment file adds or changes.
+
+        Raises:
+            ConfigError: a row says what it can't.
+        """
+        table = ParameterTable.from_toml(cls.parameters_file)
+        return table.extended(changed, where="the experiment file", translated=cls.translated)
 
     @abstractmethod
     def connect(self) -> None:

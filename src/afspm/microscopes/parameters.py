@@ -220,14 +220,24 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             raise ConfigError(f"the parameters can't be read: {error}", where=str(path)) from error
         return cls({}).extended(content.get("parameters", {}), where=path.name)
 
-    def extended(self, rows: Mapping[str, Mapping[str, Any]], *, where: str) -> ParameterTable:
+    def extended(
+        self, rows: Mapping[str, Mapping[str, Any]], *, where: str, translated: Collection[str] = ()
+    ) -> ParameterTable:
         """This table with rows added or changed, attribute by attribute, e.g. by the experiment file.
+
+        Args:
+            translated: the names of rows that code translates: how the controller has them is not a row's to say.
 
         Raises:
             ConfigError: an attribute is unknown or has a value that it can't have.
         """
         table = dict(self._rows)
         for name, given in rows.items():
+            if name in translated and not _OF_THE_CONTROLLER.isdisjoint(given):
+                what = " and ".join(sorted(_OF_THE_CONTROLLER.intersection(given)))
+                told = f"{what}: code translates this parameter for this microscope, and would not look at that"
+                hint = "a Microscope class of your own, made from this one, can translate it otherwise"
+                raise ConfigError(told, where=f"{where}, parameters.{name}", hint=hint)
             known = table.get(name, ParameterSpec(name, vendor=name, unit=names.BASE_PARAMETERS.get(name) or ""))
             table[name] = _row(known, given, where)
         return ParameterTable(table)
@@ -280,6 +290,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
 
 
 _ATTRIBUTES = {field.name for field in fields(ParameterSpec)} - {"name", "where"}
+_OF_THE_CONTROLLER = frozenset({"vendor", "sign"})
 
 
 def _row(known: ParameterSpec, given: Mapping[str, Any], where: str) -> ParameterSpec:

@@ -10,7 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes import ParameterSpec, ParameterTable, Value
+from afspm.microscopes import Microscope, ParameterSpec, ParameterTable, Value
+from afspm.microscopes.asylum import Asylum
+from afspm.microscopes.gxsm import Gxsm
+from afspm.microscopes.nanonis import Nanonis
 from afspm.microscopes.simulator import Simulator
 from afspm.model import names
 
@@ -73,6 +76,17 @@ def test_an_experiment_file_changes_single_attributes_of_a_row() -> None:
     assert narrow["scan-size-x"].vendor == "W"
     with pytest.raises(Refused, match="the experiment file"):
         narrow["scan-size-x"].parse("3", "um")
+
+
+@pytest.mark.parametrize("microscope", [Asylum, Gxsm, Nanonis])
+def test_how_the_controller_has_what_code_translates_is_not_a_rows_to_say(microscope: type[Microscope]) -> None:
+    narrow = microscope.parameter_table({"scan-angle": {"range": ["-90 deg", "90 deg"]}})
+    assert narrow["scan-angle"].range[1] == pytest.approx(math.pi / 2)
+    for row in ({"sign": -1}, {"vendor": "Rotation"}):
+        with pytest.raises(ConfigError, match=f"the experiment file, parameters.scan-angle: {next(iter(row))}: code"):
+            microscope.parameter_table({"scan-angle": row})
+    without_vendor = {name for name, row in microscope.parameter_table({}).items() if row.vendor == name}
+    assert without_vendor <= set(microscope.translated)
 
 
 def test_a_file_that_is_no_table_is_said_with_its_name(tmp_path: Path) -> None:

@@ -46,6 +46,7 @@ class Asylum(Microscope):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*NAMES, *POSITION, *_AT_FIRST, FEEDBACK_ON, ENGAGED, names.CONTROLLER)
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.gxsm.activity import SHOWS_S, Activity
-from afspm.microscopes.gxsm.frame import REFNAMES, Frame, number, send, user_unit_m
+from afspm.microscopes.gxsm.frame import PIXELS, REFNAMES, Frame, number, send, user_unit_m
 from afspm.microscopes.gxsm.hardware import ABORT, APPROACH, AUTOSAVE_OFF, Hardware, available, execute, recognised
 from afspm.microscopes.gxsm.harvest import SOON_S, Harvest
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
@@ -20,8 +20,6 @@ from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
 
-_OWN: Final = (*Frame.names, *POSITION, FEEDBACK_ON, names.SPEC_KIND, names.CONTROLLER)
-"""What no single one of GXSM's parameters stands for."""
 _SAVERS: Final = ("afspm", "gxsm")
 
 
@@ -40,6 +38,7 @@ class Gxsm(Microscope):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*Frame.names, *POSITION, FEEDBACK_ON, names.SPEC_KIND, names.CONTROLLER)
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 
@@ -120,7 +119,7 @@ class Gxsm(Microscope):
         )
 
     def _find_parameters(self) -> None:
-        vendors = {name: spec.vendor for name, spec in self._whole_table.items() if name not in _OWN}
+        vendors = {name: spec.vendor for name, spec in self._whole_table.items() if name not in self.translated}
         self._refs = available(vendors, self._refnames)
         lacking = sorted(vendors.keys() - self._refs.keys())
         self.table = self._whole_table.without(lacking)
@@ -211,12 +210,13 @@ class Gxsm(Microscope):
         return self._frame.tip() if kept is None else (float(kept[0]), float(kept[1]))
 
     def _write_frame(self, framed: Mapping[str, Value]) -> None:
-        """The tip goes along with its frame, which a RedPitaya does not tell."""
-        untold = self._hardware is Hardware.RPSPMC
-        before_m = self._frame.tip() if untold else None
+        if self._hardware is not Hardware.RPSPMC or framed.keys() <= PIXELS:
+            self._frame.write(framed)
+            return
+        # the tip goes along with its frame, which a RedPitaya does not tell
+        before_m = self._frame.tip()
         self._frame.write(framed)
-        if before_m is not None:
-            self._activity.sets_out(self._way_s(math.dist(before_m, self._frame.tip())))
+        self._activity.sets_out(self._way_s(math.dist(before_m, self._frame.tip())))
 
     def _send_probe(self, xy_m: tuple[float, float]) -> None:
         way_s = self._way_s(math.dist(self._frame.tip(), xy_m))

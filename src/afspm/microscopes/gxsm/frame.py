@@ -23,7 +23,7 @@ _UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03b
 _ROUNDED: Final = 0.06  # what a panel's digits may leave out
 REFNAMES: Final = ("PointsX", "PointsY", "RangeX", "RangeY", "OffsetX", "OffsetY", "Rotation")
 _SIZE: Final = {names.SCAN_SIZE_X, names.SCAN_SIZE_Y}
-_PIXELS: Final = {names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
+PIXELS: Final = {names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
 _CORNER: Final = {names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y}
 
 
@@ -79,10 +79,10 @@ class Frame:
         asked = values.keys()
         before = {} if asked >= set(FRAME) else self.read()
         region, (rows, columns) = frame({**before, **values})
-        if asked & _PIXELS:
+        if asked & PIXELS:
             self._send("PointsX", columns)
             self._send("PointsY", rows)
-        if asked & (_PIXELS | _SIZE):
+        if asked & (PIXELS | _SIZE):
             self._send("RangeX", region.size_m[0] / self._unit_m)
             self._send("RangeY", region.size_m[1] / self._unit_m)
         if asked & (_SIZE | _CORNER):

@@ -49,6 +49,7 @@ class Nanonis(Microscope):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
+    translated = (*groups.NAMES, *_AT_FIRST, names.CONTROLLER)
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 

@@ -297,3 +297,5 @@ class Kept(Group):
 
 OTHERS: Final = (ScanFrame(), ScanSpeed(), Gains(), MoveSpeed(), Slope(), DriftRate())
 """Those that remember nothing."""
+NAMES: Final = tuple(name for group in (*OTHERS, Probe, FeedbackOn) for name in group.names)
+"""Of all parameters that any group translates but `Kept`."""
