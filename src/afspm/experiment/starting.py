@@ -13,6 +13,7 @@ from afspm.experiment.experiment import Start
 from afspm.experiment.findings import nearest
 from afspm.experiment.known import DASHBOARD
 from afspm.experiment.parts import Part, Role
+from afspm.logic.watchdog import FEEDBACK_OFF, WatchdogSettings
 from afspm.model import Frame
 from afspm.runtime.launch import Launch, Sockets
 
@@ -129,6 +130,7 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
         beat_period_s=resolved.restart.beat_period,
         simulated=resolved.simulated,
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
+        retracts=role is Role.TRANSLATOR and _retracts(resolved),
     )
     folders = tuple(str(folder) for folder in resolved.document.folders)
     return Start(launch, role, _command(part), experiment.folder, folders, part.own.get("heartbeats") is not False)
@@ -196,6 +198,13 @@ def _in_sample_coordinates(resolved: Resolved) -> bool:
     """Whether the scheduler maps places, as its class says."""
     schedulers = resolved.with_role(Role.SCHEDULER)
     return any(getattr(resolved.classes.get(part.name), "frame", None) is Frame.SAMPLE for part in schedulers)
+
+
+def _retracts(resolved: Resolved) -> bool:
+    """Whether a tip without feedback is to be retracted when nobody is in control any more."""
+    control = resolved.control
+    dangerous = WatchdogSettings().dangerous if control.dangerous is None else control.dangerous
+    return control.retract and FEEDBACK_OFF in dangerous
 
 
 def _first(a: int | None, b: int) -> int:

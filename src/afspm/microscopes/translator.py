@@ -53,6 +53,8 @@ class Translator:
         memory: kept over a restart.
         run_dir: the folder of the run.
         step: entered around everything that takes time, so that busy can be told from frozen.
+        retracts: whether it retracts the tip when nobody is there any more to switch on the feedback that a request
+            has switched off.
     """
 
     def __init__(
@@ -63,12 +65,15 @@ class Translator:
         run_dir: Path,
         log: logging.Logger,
         step: Callable[[], AbstractContextManager[None]] = nullcontext,
+        *,
+        retracts: bool = False,
     ) -> None:
         self.microscope = microscope
         self._port = port
         self._memory = memory
         self._log = log
         self._step = step
+        self._retracts = retracts
         self._clock: Clock = port.clock
         microscope.clock, microscope.log, microscope.run_dir = port.clock, log, run_dir
         microscope.wake = port.wake_up
@@ -89,6 +94,7 @@ class Translator:
         self._why_lost = self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
+        self._may_have_switched = False  # a request has done something since the last look at what is in force
         self._ended = False
 
     def run(self) -> ExitCode:
@@ -97,13 +103,16 @@ class Translator:
             while not self._ended:
                 with self._step():
                     self.look()
-                for arrived in self._port.poll(self.wait_s()):
-                    if isinstance(arrived, ParentGone):
+                arrived = self._port.poll(self.wait_s())
+                for one in arrived:
+                    if not isinstance(one, ParentGone):
                         with self._step():
-                            self._trusting(self._stop_measuring)
-                        return ExitCode.ORPHAN
+                            self.handle(one)
+                # if the scheduler has said that the experiment is over, it has seen to the tip
+                if not self._ended and any(isinstance(one, ParentGone) for one in arrived):
                     with self._step():
-                        self.handle(arrived)
+                        self._leave()
+                    return ExitCode.ORPHAN
             return ExitCode.ENDED
         finally:
             self.microscope.close()
@@ -179,7 +188,7 @@ class Translator:
             for packet in self._outbox.start():
                 self._port.publish(*packet)
             self._save()
-        self._values = self._read()
+        self._take_in(self._read())
         self._publish_all()
         return True
 
@@ -217,7 +226,8 @@ class Translator:
 
     def _observe_values(self, announce: Sequence[str]) -> None:
         values = self._read()
-        before, self._values = in_force.messages(self._values), values
+        before = in_force.messages(self._values)
+        self._take_in(values)
         for name, thing in in_force.messages(values).items():
             if name in announce or before.get(name) != thing:
                 self._publish(thing)
@@ -225,6 +235,17 @@ class Translator:
         if next_s is not None:
             wait_s = min(wait_s, max(0.0, self._clock.real_s(next_s - self._clock.now_s())))
         self._all_at_s = self._clock.monotonic_s() + wait_s
+
+    def _take_in(self, values: dict[str, Value]) -> None:
+        """What is in force now, and whether it was a request that has switched the feedback off."""
+        was_on, is_on = self._values.get(names.FEEDBACK_ON), values.get(names.FEEDBACK_ON)
+        self._values = values
+        if is_on is not False:
+            self._kept["feedback_off"] = False
+        elif was_on and self._may_have_switched:
+            self._kept["feedback_off"] = True
+            self._save()
+        self._may_have_switched = False
 
     def _read(self) -> dict[str, Value]:
         """What is in force; differences below the controller's precision are none."""
@@ -310,6 +331,27 @@ class Translator:
         self._reply(Response(ControlResponse.SUCCESS))
         self._ended = True
 
+    def _leave(self) -> None:
+        """Nobody is there any more. What is switched off at the panel is for whoever is at the panel."""
+        self._trusting(self._stop_measuring)
+        if not (self._retracts and self._kept.get("feedback_off")):
+            return
+        answered: list[Response] = []
+        self._trusting(lambda: answered.append(self._retract()))
+        if answered and answered[0].ok:
+            self._log.warning("the run is stopped with the feedback off: the tip is retracted")
+        else:
+            why = answered[0].reason if answered else self._why_lost
+            self._log.critical("the run is stopped with the feedback off, and the tip can't be retracted: %s", why)
+
+    def _retract(self) -> Response:
+        if not self._connected:
+            raise ControllerLost(self._why_lost)
+        answer = self._service.answer(Request(ControlRequest.ACTION, names.RETRACT))
+        self._play(answer.steps)
+        self._save()
+        return answer.response
+
     def _stop_measuring(self) -> None:
         """The tip does not go on scanning with nobody there."""
         stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(self._sequence.said.state)
@@ -332,6 +374,9 @@ class Translator:
 
     def _about_to_act(self, request: Request) -> None:
         self._acting = request
+        self._may_have_switched = True
+        if request.subject == names.RETRACT:
+            self._may_have_switched = self._kept["feedback_off"] = False  # a tip that is away needs none
         self._ledger.begin(request)
         # what a kill leaves half set may be set again; an action may not be done again
         if request.id and request.kind == ControlRequest.ACTION and not self.microscope.memory_is_all:
@@ -415,4 +460,5 @@ def _run_alone(microscope: Microscope, context: Context, make: Callable[..., Tra
     port = open_server_port(launch, context.clock)
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     run_dir = Path(launch.run_dir or ".")
-    return make(microscope, port, memory, run_dir, context.log, context.activity.step).run()
+    step = context.activity.step
+    return make(microscope, port, memory, run_dir, context.log, step, retracts=launch.retracts).run()

@@ -68,6 +68,9 @@ class Launch:
     simulated: bool = False
     sample_coordinates: bool = False
     """Whether places are those of the sample, which the scheduler maps to those of the tip."""
+    retracts: bool = False
+    """Of a translator: whether it retracts the tip when its standard input ends and a request of the run has switched
+    the feedback off."""
 
     def to_json(self) -> str:
         """One line, without the newline at its end."""

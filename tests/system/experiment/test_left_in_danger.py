@@ -1,11 +1,18 @@
-"""A component dies with the feedback off: the tip is retracted, and nobody measures until somebody has seen to it."""
+"""A component dies with the feedback off, or the run: the tip is retracted, and nobody measures until somebody has seen
+to it."""
 
 from __future__ import annotations
 
+import os
+import select
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from experiment_lab import AfspmRun, require_each_once
+
+from afspm.runtime.memory import Memory
 
 MODULE = """
 import os
@@ -23,6 +30,14 @@ class Reckless(Component):
             self.scope.set("x-feedback-on", "false")
             mark.touch()
             os._exit(9)
+
+
+class Blind(Component):
+    def run(self):
+        with self.scope.control():
+            self.scope.set("x-feedback-on", "false")
+            self.log.info("the feedback is off")
+            self.scope.wait_until(lambda: False)
 
 
 class Doctor(Component):
@@ -50,6 +65,15 @@ component = true
 class = "danger.Doctor"
 """
 
+BLIND = """
+[control]
+retract = {retract}
+
+[blind]
+component = true
+class = "danger.Blind"
+"""
+
 
 def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_it_was_seen_to(
     run: Callable[..., AfspmRun], tmp_path: Path
@@ -67,3 +91,24 @@ def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_i
     assert found == sorted(found), one.output
     assert "state SCANNING" not in one.output[found[1] : found[3]]
     require_each_once(one, 6)
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="waiting for the end of another's child")
+@pytest.mark.parametrize(("by", "retract"), [("SIGINT", True), ("SIGTERM", False), ("SIGKILL", True)])
+def test_when_the_run_is_stopped_with_the_feedback_off_the_tip_is_retracted(
+    run: Callable[..., AfspmRun], tmp_path: Path, by: str, retract: bool
+) -> None:
+    (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
+    one = run(more=BLIND.format(retract=str(retract).lower()), scans=1000)
+    one.wait_for(" blind ", "the feedback is off")
+    translator = os.pidfd_open(one.pid("microscope"))
+    one.process.send_signal(getattr(signal, by))
+    try:
+        assert select.select([translator], [], [], 10.0)[0]
+    finally:
+        os.close(translator)
+    values = Memory(one.folder / "state" / "microscope.json")["microscope"]["values"]
+    assert values["x-engaged"] is not retract
+    if by != "SIGKILL":  # there is nobody any more to tell it to
+        assert one.end() == 130, one.output
+        assert ("the feedback off: the tip is retracted" in one.output) is retract

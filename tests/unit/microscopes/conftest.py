@@ -26,6 +26,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.memory import Memory
 from afspm.transport.port import RequestReceived, Served
 
@@ -165,6 +166,10 @@ class FakeMicroscope(Microscope):
     def explode(self) -> None:
         raise ZeroDivisionError("a bug of the implementer")
 
+    @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
+    def retract(self) -> None:
+        self.done.append("retract")
+
     def command(self, text: str) -> None:
         self.done.append(text)
 
@@ -182,12 +187,17 @@ class Bench:
         self.microscope = FakeMicroscope(**(settings or {}))
         self.start()
 
-    def start(self) -> None:
+    def start(self, *, retracts: bool = True) -> None:
         """Start the translator's process, or start it again after a kill: only the disk is left of the last."""
         self.port = FakePort(self.clock)
-        memory = Memory(self.folder / "translator.json")
-        self.translator = Translator(self.microscope, self.port, memory, self.folder, logging.getLogger("test"))
+        memory, log = Memory(self.folder / "translator.json"), logging.getLogger("test")
+        self.translator = Translator(self.microscope, self.port, memory, self.folder, log, retracts=retracts)
         self.translator.look()
+
+    def run_to_the_end(self, *last: Served) -> ExitCode:
+        """Run it until it ends, after this came to it, all at once."""
+        self.port.poll = lambda timeout_s: list(last)  # type: ignore[method-assign]
+        return self.translator.run()
 
     def ask(self, kind: ControlRequest, subject: Any = None, request_id: str = "", payload: bytes = b"") -> Response:
         return self.ask_frames(wire.encode_request(Request(kind, subject, payload, request_id)))

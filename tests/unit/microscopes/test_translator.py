@@ -23,7 +23,7 @@ from afspm.model import (
     names,
 )
 from afspm.runtime.exit_codes import ExitCode
-from afspm.transport.port import ParentGone, SubscriberJoined
+from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.wire.generated import feedback_pb2, scan_pb2
 
 ACTION, PARAM, SUPPORT = ControlRequest.ACTION, ControlRequest.PARAM, ControlRequest.ACTION_SUPPORT
@@ -111,15 +111,80 @@ def test_a_scan_without_a_file_ends_as_interrupted(bench: Any) -> None:
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_the_tip_does_not_go_on_scanning_when_the_run_is_stopped(
-    bench: Any, monkeypatch: pytest.MonkeyPatch, lost: bool
-) -> None:
+def test_the_tip_does_not_go_on_scanning_when_the_run_is_stopped(bench: Any, lost: bool) -> None:
     bench.ask(ACTION, names.START_SCAN)
     bench.microscope.lost = lost
-    monkeypatch.setattr(bench.port, "poll", lambda timeout_s: [ParentGone()])
-    assert bench.translator.run() == ExitCode.ORPHAN
+    assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
     assert bench.microscope.done == (["scan"] if lost else ["scan", "stop"])
     assert bench.heard() == (["SCANNING", "UNDEFINED"] if lost else ["SCANNING", "INTERRUPTED", "FREE"])
+
+
+def switched(bench: Any, to: str) -> None:
+    told(bench.ask(PARAM, Parameter(names.FEEDBACK_ON, to)))
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_without_the_feedback_that_a_request_has_switched_off_the_tip_is_retracted_when_the_run_is_stopped(
+    bench: Any, caplog: pytest.LogCaptureFixture, killed: bool
+) -> None:
+    switched(bench, "false")
+    bench.ask(ACTION, names.START_SCAN)
+    if killed:
+        bench.start()
+    assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    assert bench.microscope.done == ["scan", "stop", "retract"]
+    assert "the feedback off: the tip is retracted" in caplog.text
+
+
+def test_the_tip_stays_where_the_feedback_is_on_or_was_switched_off_by_others(bench: Any) -> None:
+    def left() -> list[str]:
+        assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+        done, bench.microscope.done = bench.microscope.done, []
+        bench.microscope.values["Loop"] = True
+        bench.start()
+        return list(done)
+
+    switched(bench, "false")
+    switched(bench, "true")
+    assert left() == []
+    switched(bench, "false")
+    bench.microscope.values["Loop"] = True  # and on again, at the panel
+    bench.look()
+    assert left() == []
+    bench.ask(PARAM, Parameter("tip-bias-voltage", "1", "V"))
+    bench.look()
+    bench.microscope.values["Loop"] = False
+    bench.look()
+    assert left() == []  # at the panel
+    switched(bench, "false")
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    assert left() == ["retract"]  # once
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    bench.microscope.values["Loop"] = False  # by that
+    bench.look()
+    assert left() == ["retract"]
+    bench.start(retracts=False)
+    switched(bench, "false")
+    assert left() == []
+
+
+def test_a_scheduler_that_has_ended_the_experiment_has_seen_to_the_tip(bench: Any) -> None:
+    switched(bench, "false")
+    assert bench.run_to_the_end(ParentGone(), RequestReceived([wire.CLOSE])) == ExitCode.ENDED
+    assert bench.microscope.done == []
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_that_a_tip_without_feedback_can_not_be_retracted_is_critical(
+    bench: Any, caplog: pytest.LogCaptureFixture, lost: bool
+) -> None:
+    switched(bench, "false")
+    bench.microscope.lost = lost
+    bench.microscope.lacking = {names.RETRACT: "it has no coarse motor"}
+    assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    last = caplog.records[-1]
+    assert last.levelname == "CRITICAL"
+    assert ("unplugged" if lost else "it has no coarse motor") in last.getMessage()
 
 
 def test_a_stop_interrupts_and_no_scan_comes(bench: Any, scan: Any) -> None:
