@@ -341,7 +341,7 @@ class Desk:
             self._log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
         elif end is End.UNKNOWN:
             if job.request.kind == _ACTION:
-                self._watchdog.started(str(job.request.subject), job.states_seen)  # as far as we know
+                self._watchdog.started(str(job.request.subject), job.states_seen, certain=False)
             self._finish(job, response, Fate.UNKNOWN)
         else:
             self._forget(job, response)

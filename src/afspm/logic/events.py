@@ -144,8 +144,13 @@ class Announced:
 
 
 @dataclass(frozen=True, slots=True)
+class Stopped:
+    """The run is stopped though the experiment is not over: this is the last that the scheduler hears."""
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
-    """Nothing happened, but a deadline (`SchedulerCore.wait_s`) has come."""
+    """Nothing happened, but a deadline (`SchedulerCore.deadline_s`) has come."""
 
 
 Input = (
@@ -163,6 +168,7 @@ Input = (
     | ComponentDied
     | ProblemSeen
     | Announced
+    | Stopped
     | Tick
 )
 

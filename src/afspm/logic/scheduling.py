@@ -33,6 +33,7 @@ from afspm.logic.events import (
     Reply,
     RequestIn,
     SaveState,
+    Stopped,
     SubscriberJoined,
     Tick,
     TranslatorCaughtUp,
@@ -52,6 +53,7 @@ from afspm.model import (
     HAS_ENDED,
     RESTART_REQUEST,
     TELL_REQUEST,
+    ControlMode,
     ControlResponse,
     ControlState,
     Feedback,
@@ -128,6 +130,7 @@ class SchedulerCore:
             ComponentDied: self._on_died,
             ProblemSeen: self._on_problem,
             Announced: self._on_announced,
+            Stopped: self._on_stopped,
             Tick: self._on_tick,
         }
 
@@ -377,6 +380,12 @@ class SchedulerCore:
         return (_AT_ONCE_S, SCHEDULER) if self._watchdog.left_to_people else (self._trust.due_s(), TRANSLATOR)
 
     # --- time ---
+
+    def _on_stopped(self, event: Stopped, now_s: float, now_ns: int) -> None:
+        """Whoever resumes the run finds the tip retracted, or worse. A person in control knows."""
+        if self.control.mode is not ControlMode.MANUAL:
+            self._watchdog.leave_to_people()
+            self._effects.append(self._save())
 
     def _on_tick(self, event: Tick, now_s: float, now_ns: int) -> None:
         self._see_to_deadlines(now_s, now_ns)

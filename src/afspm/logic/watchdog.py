@@ -59,6 +59,7 @@ class Watchdog:
         self._settings = settings or WatchdogSettings()
         self._state = ScopeState.UNDEFINED
         self._feedback_on: bool | None = None
+        self._is_away = False  # the tip: neither the motor that retracts it nor a feedback that is off does harm
         self._starting: str | None = None
         self._states_seen = 0
         self._wanted: list[str] = []
@@ -88,6 +89,10 @@ class Watchdog:
         self._wanted = list(wanted)
         self._left_to_people = left_to_people
 
+    def leave_to_people(self) -> None:
+        """Nobody can be told any more what to do with a tip in danger: the translator sees to it as it leaves."""
+        self._left_to_people |= self._settings.retract is not None and self.danger is not None
+
     def people_called(self) -> None:
         """The problem was flagged."""
         self._left_to_people = False
@@ -116,12 +121,15 @@ class Watchdog:
     def feedback_is(self, feedback: Feedback) -> None:
         if feedback.on is not None:
             self._feedback_on = feedback.on
+            self._is_away = self._is_away and not feedback.on
             self._see_danger()
 
     @property
     def danger(self) -> str | None:
         """What is dangerous now, in words; None: nothing, or it was seen to."""
         dangerous = self._settings.dangerous
+        if self._is_away:
+            return None
         if self._feedback_on is False and FEEDBACK_OFF in dangerous:
             return "the feedback is off"
         return f"the microscope is in {self._state.name}" if self._state.name in dangerous else None
@@ -138,11 +146,13 @@ class Watchdog:
         if self.danger is None:
             self._danger_told = None
 
-    def started(self, action: str, states_seen: int) -> None:
-        """A start action succeeded, or may have, that was sent when `states_seen` states were known.
+    def started(self, action: str, states_seen: int, *, certain: bool = True) -> None:
+        """An action succeeded, or may have, that was sent when `states_seen` states were known.
 
         The answer may overtake the state that the microscope is in by it, or be overtaken.
         """
+        if action not in _STARTS and action not in _STOP.values():
+            self._is_away = certain and action == self._settings.retract  # what else there is may bring the tip back
         if states_seen == self._states_seen:
             self._starting = _STARTS.get(action, self._starting)
 
@@ -193,7 +203,7 @@ class Watchdog:
         if code == ControlResponse.SUCCESS:
             self._starting = None
             if self._wanted[0] == self._settings.retract:
-                self._feedback_on = None  # the tip is away: no danger, until the feedback is told of again
+                self._is_away = True
                 self._see_danger()
             self._forget()
             return Result.DONE

@@ -111,6 +111,7 @@ class Scheduler:
                 ready = shell.wait()
                 with context.activity.step():
                     shell.handle(ready)
+            shell.stop()
         finally:
             sockets.close()
             shell.close()

@@ -145,6 +145,11 @@ class Shell:
         response = Response(ControlResponse.FAILURE, reason=HAS_ENDED, id=_id_of(asked))
         self._sockets.router.reply(asked.connection, wire.encode_response(response))
 
+    def stop(self) -> None:
+        """See to what must be known to whoever resumes the run, unless the experiment is over."""
+        if not self.ended:
+            self._take(events.Stopped())
+
     def close(self) -> None:
         """Write down what is cached, unless the experiment is over."""
         if not self.ended:

@@ -34,8 +34,12 @@ class Reckless(Component):
 
 class Blind(Component):
     def run(self):
+        mark = Path(__file__).with_name("blind")
+        if mark.exists():
+            return
         with self.scope.control():
             self.scope.set("x-feedback-on", "false")
+            mark.touch()
             self.log.info("the feedback is off")
             self.scope.wait_until(lambda: False)
 
@@ -59,7 +63,8 @@ grace = "1 s"
 [reckless]
 component = true
 class = "danger.Reckless"
-
+"""
+DOCTOR = """
 [doctor]
 component = true
 class = "danger.Doctor"
@@ -79,7 +84,7 @@ def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_i
     run: Callable[..., AfspmRun], tmp_path: Path
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
-    one = run(more=PARTS, scans=6, speed=60.0)
+    one = run(more=PARTS + DOCTOR, scans=6, speed=60.0)
     assert one.end() == 0, one.output
     steps = [
         "x-retract is sent to the microscope, since ",
@@ -89,6 +94,7 @@ def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_i
     ]
     found = [one.output.index(step) for step in steps]
     assert found == sorted(found), one.output
+    assert one.output.count("x-retract: done") == 1
     assert "state SCANNING" not in one.output[found[1] : found[3]]
     require_each_once(one, 6)
 
@@ -112,3 +118,20 @@ def test_when_the_run_is_stopped_with_the_feedback_off_the_tip_is_retracted(
     if by != "SIGKILL":  # there is nobody any more to tell it to
         assert one.end() == 130, one.output
         assert ("the feedback off: the tip is retracted" in one.output) is retract
+
+
+def test_a_run_that_was_stopped_with_the_tip_in_danger_is_resumed_when_that_was_seen_to(
+    run: Callable[..., AfspmRun], resume: Callable[[Path], AfspmRun], tmp_path: Path
+) -> None:
+    (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
+    more = BLIND.format(retract="true") + DOCTOR
+    one = run(more=more, scans=1000)
+    one.wait_for(" blind ", "the feedback is off")
+    one.process.send_signal(signal.SIGINT)
+    assert one.end() == 130, one.output
+    again = resume(one.folder)
+    again.wait_for("device-malfunction is cleared by doctor")
+    again.wait_for(" witness ", "state SCANNING")
+    steps = ("device-malfunction is flagged by scheduler", "is cleared by doctor", "state SCANNING")
+    found = [again.output.index(step) for step in steps]
+    assert found == sorted(found), again.output

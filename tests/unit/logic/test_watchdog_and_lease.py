@@ -108,6 +108,34 @@ def test_a_danger_that_is_seen_to_is_not_told_nor_seen_to_again() -> None:
     assert dog.control_taken(Cause.ENDED, None) == []
 
 
+def retracted() -> Watchdog:
+    dog = off(FREE)
+    dog.control_taken(Cause.PROBLEM, None)
+    dog.next_action()
+    dog.answered(OK)
+    dog.scope_is(ScopeState.COARSE_MOTOR)
+    dog.feedback_is(Feedback(on=False))  # as a controller says that has withdrawn its tip
+    return dog
+
+
+def test_a_tip_that_is_away_is_in_no_danger_until_it_may_be_back() -> None:
+    dog = retracted()
+    dog.started("start-scan", dog.states_seen)
+    assert dog.danger is None
+    assert dog.control_taken(Cause.PROBLEM, None) == ["stop-scan"]
+    dog.feedback_is(Feedback(on=True))
+    dog.feedback_is(Feedback(on=False))
+    assert dog.danger == "the feedback is off"
+    for action in ("x-engage", "x-approach-of-mine"):
+        dog = retracted()
+        dog.started(action, dog.states_seen)
+        assert dog.danger == "the feedback is off"
+        dog.started("x-retract", dog.states_seen, certain=False)
+        assert dog.danger == "the feedback is off"
+        dog.started("x-retract", dog.states_seen)
+        assert dog.danger is None
+
+
 def test_a_danger_that_can_not_be_seen_to_is_told() -> None:
     dog = off(FREE, retract=None)
     assert dog.control_taken(Cause.PROBLEM, None) == []

@@ -7,9 +7,10 @@ import json
 import pytest
 from logic_lab import NS, Lab, replies
 
-from afspm.logic.events import ComponentDied, Effect, Forward, Kill, Log, SaveState, Tick
+from afspm.logic.events import ComponentDied, Effect, Forward, Kill, Log, SaveState, Stopped, Tick
 from afspm.logic.limits import Limit, Limits
 from afspm.logic.settings import SchedulerSettings
+from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -45,6 +46,15 @@ def killed(lab: Lab, settings: SchedulerSettings) -> Lab:
     again = Lab(settings, state=json.loads(json.dumps(saved)))
     again.now_s, again.now_ns = lab.now_s, lab.now_ns
     again.translator()
+    return again
+
+
+def resumed(lab: Lab, settings: SchedulerSettings) -> Lab:
+    """The same, when it has caught up with the translator."""
+    again = killed(lab, settings)
+    for _ in range(3):  # one decision in each
+        again.later(real_s=settings.catch_up_s)
+        again.step(Tick())
     return again
 
 
@@ -182,6 +192,31 @@ def test_a_solver_may_work_with_the_feedback_off_and_is_not_disturbed() -> None:
     lab.publish("ZCtrlParameters", Feedback(on=True))
     lab.clear("classifier", Problem.TIP_SHAPE_CHANGED)
     assert sent(lab) == []
+
+
+@pytest.mark.parametrize(
+    ("mode", "retract", "is_called"),
+    [
+        (ControlMode.AUTOMATED, "x-retract", True),
+        (ControlMode.AUTOMATED, None, False),
+        (ControlMode.MANUAL, "x-retract", False),
+    ],
+)
+def test_who_resumes_a_run_that_was_stopped_with_the_feedback_off_is_called(
+    mode: ControlMode, retract: str | None, is_called: bool
+) -> None:
+    settings = SchedulerSettings(watchdog=WatchdogSettings(retract=retract))
+    lab = feedback_off(settings)
+    lab.mode("person", mode)
+    lab.step(Stopped())
+    assert (Problem.DEVICE_MALFUNCTION in resumed(lab, settings).core.control.problems) is is_called
+
+
+def test_who_resumes_a_run_that_was_stopped_without_danger_is_not_called() -> None:
+    lab = feedback_off()
+    lab.publish("ZCtrlParameters", Feedback(on=True))
+    lab.step(Stopped())
+    assert not resumed(lab, SchedulerSettings()).core.control.problems
 
 
 def test_a_lease_that_runs_out_leaves_no_danger() -> None:
