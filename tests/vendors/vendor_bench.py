@@ -226,15 +226,14 @@ class VendorBench(Generic[Emulated]):
         self.data = folder / self.data_name
         self._said = Said()
         self._emulator_settings: dict[str, Any] = {"port": FreePorts().take(), "surface": "steps", **emulator}
-        self._start_controller()
-
-    def _start_controller(self) -> None:
-        self.emulator = self.emulated(**self._emulator_settings)
-        self.address = self._stack.enter_context(self.emulator.running(self.data, self.clock))
+        self._controller = stack.enter_context(ExitStack())
+        self.start_controller_again()
 
     def start_controller_again(self) -> None:
-        """Another one where the last was, which knows nothing of it."""
-        self._start_controller()
+        """Another one where the last was, which knows nothing of it, once that has let go of its address."""
+        self._controller.close()
+        self.emulator = self.emulated(**self._emulator_settings)
+        self.address = self._controller.enter_context(self.emulator.running(self.data, self.clock))
 
     def at_panel(self, do: Callable[[Emulated], object]) -> None:
         """Do something in the emulator's own thread; returns when it is done."""

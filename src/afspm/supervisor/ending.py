@@ -9,6 +9,7 @@ OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and
 AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
 FAREWELL_S = 60.0  # but not for ever
 KILL_AFTER_S = 1.5  # after being asked
+TIP_S = 15.0  # after being asked: so long the tip may take to be seen to, by a controller that answers slowly
 LEAVE_AFTER_S = 3.0  # after being killed
 
 
@@ -45,6 +46,7 @@ class Ending:
         ask_s, kill_s: when, in real monotonic time.
         latest_s: until when those who are busy may be waited for before they are asked.
         last: what has been done already.
+        in_haste: somebody wants it to be over now.
     """
 
     why: Why
@@ -53,6 +55,7 @@ class Ending:
     kill_s: float
     latest_s: float
     last: Do | None = None
+    in_haste: bool = False
 
     @classmethod
     def begin(cls, why: Why, text: str, now_s: float) -> Ending:
@@ -68,7 +71,7 @@ class Ending:
             return self
         if self.last is None and self.why is not Why.STOPPED:
             return replace(self, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s)
-        return replace(self, kill_s=now_s, last=Do.ASK)
+        return replace(self, kill_s=now_s, last=Do.ASK, in_haste=True)
 
     def deadline_s(self) -> float | None:
         """When `step` has something to do next; None: never again."""
@@ -86,7 +89,8 @@ class Ending:
         """What the time has come for, if anything, and the ending after it.
 
         Args:
-            busy: somebody still works on a step, within what it declared (a picture of the night, say).
+            busy: somebody still works on a step, within what it declared: before they are asked, a component (a picture
+                of the night, say), and then a translator, which does not leave before the tip is safe.
         """
         deadline_s = self.deadline_s()
         if deadline_s is None or now_s < deadline_s:
@@ -94,5 +98,7 @@ class Ending:
         if self.last is None and busy and now_s < self.latest_s:
             ask_s = min(now_s + AGAIN_S, self.latest_s)
             return replace(self, ask_s=ask_s, kill_s=ask_s + KILL_AFTER_S), None
+        if self.last is Do.ASK and busy and not self.in_haste and now_s < self.ask_s + TIP_S:
+            return replace(self, kill_s=min(now_s + AGAIN_S, self.ask_s + TIP_S)), None
         do = {None: Do.ASK, Do.ASK: Do.KILL, Do.KILL: Do.LEAVE}[self.last]
         return replace(self, last=do), do

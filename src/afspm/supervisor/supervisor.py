@@ -359,18 +359,23 @@ class Supervisor:
         child.rescued = True
         self._start(child)
 
+    def _waited_for(self, ending: Ending, now_s: float) -> list[str]:
+        """The names of those who have something to finish; a translator has after it was asked to end, too: the tip."""
+        liveness = self._policy.liveness
+        is_asked, has_ended = ending.last is not None, ending.why is Why.EXPERIMENT_ENDED
+        return [
+            child.name
+            for child in self._children.values()
+            if (child.is_busy(now_s, liveness) and (not is_asked or child.task.role is Role.TRANSLATOR))
+            or (child.may_still_finish(now_s, liveness) and has_ended and not is_asked)
+        ]
+
     def _go_on_ending(self, ending: Ending, now_s: float) -> None:
         if ending.last is None and ending.why is Why.EXPERIMENT_ENDED:
             self._look_after_the_last(now_s)
-        liveness = self._policy.liveness
-        busy = [
-            child.name
-            for child in self._children.values()
-            if child.is_busy(now_s, liveness)
-            or (child.may_still_finish(now_s, liveness) and ending.why is Why.EXPERIMENT_ENDED)
-        ]
+        busy = self._waited_for(ending, now_s)
         self._ending, do = ending.step(now_s, busy=bool(busy))
-        if do is None and self._ending.ask_s != ending.ask_s and not self._has_told_waiting:
+        if do is None and self._ending != ending and not self._has_told_waiting:
             self._has_told_waiting = True
             told = f"waiting for {', '.join(busy)} to finish; Ctrl-C ends it now"
             self._log.write(SUPERVISOR, logging.INFO, told)

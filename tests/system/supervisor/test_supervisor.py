@@ -143,6 +143,18 @@ def test_stopping_takes_about_two_seconds_at_most(run_tasks: RunTasks) -> None:
     assert deaf.last_exit != "ended as it was asked to"
 
 
+def test_a_translator_that_sees_to_the_tip_is_not_killed_meanwhile(run_tasks: RunTasks) -> None:
+    scope = peer("scope", Role.TRANSLATOR, first="busy", busy_s=4.0, longest_step_s=60.0)
+    running = run_tasks(scope, peer("other", first="busy", busy_s=600.0, longest_step_s=900.0))
+    for name in ("scope", "other"):
+        running.terminal.wait_for(f" {name} ", "is up")
+    assert running.stop().why is Why.STOPPED
+    running.terminal.wait_for(" scope ", "no longer busy")
+    running.terminal.wait_for("waiting for scope to finish", "Ctrl-C")
+    running.terminal.wait_for(" other ", "does not end: killed")
+    assert not any(" scope " in line and "killed" in line for line in running.terminal.lines)
+
+
 def test_a_second_wish_to_stop_is_not_made_to_wait(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("deaf", first="deaf"))
     running.terminal.wait_for(" deaf ", "life 1")

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from afspm.supervisor.ending import FAREWELL_S, KILL_AFTER_S, LEAVE_AFTER_S, OWN_PACE_S, Do, Ending, Why
+from afspm.supervisor.ending import FAREWELL_S, KILL_AFTER_S, LEAVE_AFTER_S, OWN_PACE_S, TIP_S, Do, Ending, Why
 
 
 def test_ctrl_c_asks_at_once_and_kills_within_two_seconds() -> None:
@@ -50,6 +50,20 @@ def test_who_is_busy_at_the_end_of_the_experiment_is_waited_for_but_not_for_ever
 
 def test_nobody_is_waited_for_after_ctrl_c() -> None:
     assert Ending.begin(Why.STOPPED, "", 100.0).step(100.0, busy=True)[1] is Do.ASK
+
+
+def test_who_sees_to_the_tip_is_not_killed_meanwhile_but_not_for_ever() -> None:
+    ending, _ = Ending.begin(Why.STOPPED, "", 100.0).step(100.0)
+    kept, do = ending.step(100.0 + KILL_AFTER_S, busy=True)
+    assert do is None
+    assert kept.hurried(102.0).step(102.0, busy=True)[1] is Do.KILL
+    now_s = 100.0
+    while do is None:
+        deadline_s = ending.deadline_s()
+        assert deadline_s is not None
+        now_s = deadline_s
+        ending, do = ending.step(now_s, busy=True)
+    assert (do, now_s) == (Do.KILL, 100.0 + TIP_S)
 
 
 def test_each_stage_comes_once_and_in_its_time() -> None:

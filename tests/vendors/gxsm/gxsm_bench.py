@@ -29,9 +29,3 @@ class Bench(VendorBench[Emulated]):
         self.settings = {"reply_timeout_s": 2.0, "result_timeout_s": 2.0 * speed}
         block = f"afspm_test_{os.getpid()}_{id(self)}"
         super().__init__(folder, stack, speed, {"block": block, **emulator})
-
-    def start_controller_again(self) -> None:
-        if self.address.startswith("shm"):  # which has no port
-            self._start_controller()
-        else:
-            super().start_controller_again()
