@@ -7,7 +7,7 @@ On each page, in the order of the page and in one empty folder:
 - other ```python blocks are executed, sharing their names;
 - other ```toml blocks must be TOML;
 - ```console blocks: each line after `$ ` is run by the shell and must succeed; the lines below must come in its output,
-  in this order, where … stands for anything.
+  in this order, where … stands for anything. What two processes say (`… tiles … tile 1`) is in no order.
 
 Blocks of other kinds (```text, ```sh …) are only shown.
 """
@@ -20,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "experiments").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#]+)")
+PROCESS = re.compile(r"… (\w+) …")
 FILE_NAME = re.compile(r"(?:#|//) ([\w./-]+\.(?:py|toml|proto))\n")
 
 
@@ -75,12 +77,13 @@ def run_console(text: str, folder: Path, where: str) -> None:
         )
         output = done.stdout + done.stderr
         assert done.returncode == 0, f"{where}: {command} failed:\n{output}"
-        at = 0
+        ends: defaultdict[str, int] = defaultdict(int)
         for line in filter(None, map(str.strip, expected.splitlines())):
             pattern = ".*?".join(re.escape(piece) for piece in line.split("…"))
-            found = re.compile(pattern).search(output, at)
+            process = said[1] if (said := PROCESS.match(line)) else ""
+            found = re.compile(pattern).search(output, ends[process])
             assert found, f"{where}: {line!r} does not come in the output of {command}:\n{output}"
-            at = found.end()
+            ends[process] = found.end()
 
 
 def test_the_pages_are_found() -> None:
