@@ -187,7 +187,8 @@ class Rig:
         self._folder = folder
         self._runs: list[AfspmRun] = []
 
-    def start(self, drift: str = "", scans: int = 5, speed: float = 120.0) -> AfspmRun:
+    def start(self, drift: str = "", scans: int = 5, speed: float = 60.0) -> AfspmRun:
+        """What a busy computer is late by, in real time, the sample has drifted on by at the speed of the clock."""
         (self._folder / "surveyor.py").write_text(SURVEYOR, encoding="utf-8")
         file = self._folder / "experiment.toml"
         file.write_text(EXPERIMENT.format(drift=drift, scans=scans, speed=speed), encoding="utf-8")
