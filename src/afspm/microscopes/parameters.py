@@ -233,13 +233,8 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         """
         table = dict(self._rows)
         for name, given in rows.items():
-            if name in translated and not _OF_THE_CONTROLLER.isdisjoint(given):
-                what = " and ".join(sorted(_OF_THE_CONTROLLER.intersection(given)))
-                told = f"{what}: code translates this parameter for this microscope, and would not look at that"
-                hint = "a Microscope class of your own, made from this one, can translate it otherwise"
-                raise ConfigError(told, where=f"{where}, parameters.{name}", hint=hint)
             known = table.get(name, ParameterSpec(name, vendor=name, unit=names.BASE_PARAMETERS.get(name) or ""))
-            table[name] = _row(known, given, where)
+            table[name] = _row(known, given, where, translated=name in translated)
         return ParameterTable(table)
 
     def without(self, names_: Collection[str]) -> ParameterTable:
@@ -293,7 +288,7 @@ _ATTRIBUTES = {field.name for field in fields(ParameterSpec)} - {"name", "where"
 _OF_THE_CONTROLLER = frozenset({"vendor", "sign"})
 
 
-def _row(known: ParameterSpec, given: Mapping[str, Any], where: str) -> ParameterSpec:
+def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translated: bool) -> ParameterSpec:
     at = f"{where}, parameters.{known.name}"
     if not isinstance(given, Mapping):
         raise ConfigError(f"a table is wanted, not {given!r}", where=at)
@@ -302,6 +297,10 @@ def _row(known: ParameterSpec, given: Mapping[str, Any], where: str) -> Paramete
             near = difflib.get_close_matches(key, _ATTRIBUTES, n=1)
             hint = f"did you mean {near[0]!r}?" if near else ""
             raise ConfigError(f"unknown attribute {key!r}", where=at, hint=hint)
+        if translated and key in _OF_THE_CONTROLLER:
+            hint = "a Microscope class of your own, made from this one, can translate it otherwise"
+            told = f"{key}: code translates this parameter for this microscope, and would not look at that"
+            raise ConfigError(told, where=at, hint=hint)
     values = dict(given)
     for key in ("vendor", "unit", "type"):
         if not isinstance(values.get(key, ""), str):
