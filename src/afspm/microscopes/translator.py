@@ -375,8 +375,6 @@ class Translator:
     def _about_to_act(self, request: Request) -> None:
         self._acting = request
         self._may_have_switched = True
-        if request.subject == names.RETRACT:
-            self._may_have_switched = self._kept["feedback_off"] = False  # a tip that is away needs none
         self._ledger.begin(request)
         # what a kill leaves half set may be set again; an action may not be done again
         if request.id and request.kind == ControlRequest.ACTION and not self.microscope.memory_is_all:
@@ -386,6 +384,8 @@ class Translator:
         """Write down what came of a request before anybody hears of it, and answer."""
         if self._acting is request:
             self._acting = None
+            if request.subject == names.RETRACT and response.ok:
+                self._may_have_switched = self._kept["feedback_off"] = False  # a tip that is away needs none
             if response.code == ControlResponse.PARAM_ERROR:
                 self._ledger.forget(request)  # nothing was changed
             else:

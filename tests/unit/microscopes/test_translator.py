@@ -163,6 +163,11 @@ def test_the_tip_stays_where_the_feedback_is_on_or_was_switched_off_by_others(be
     bench.microscope.values["Loop"] = False  # by that
     bench.look()
     assert left() == ["retract"]
+    switched(bench, "false")
+    bench.microscope.lacking = {names.RETRACT: "its motor is stuck"}
+    assert not bench.ask(ACTION, names.RETRACT).ok
+    bench.microscope.lacking = {}
+    assert left() == ["retract"]  # at last
     bench.start(retracts=False)
     switched(bench, "false")
     assert left() == []
