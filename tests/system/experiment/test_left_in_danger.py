@@ -130,8 +130,8 @@ def test_a_run_that_was_stopped_with_the_tip_in_danger_is_resumed_when_that_was_
     one.process.send_signal(signal.SIGINT)
     assert one.end() == 130, one.output
     again = resume(one.folder)
-    again.wait_for("device-malfunction is cleared by doctor")
-    again.wait_for(" witness ", "state SCANNING")
-    steps = ("device-malfunction is flagged by scheduler", "is cleared by doctor", "state SCANNING")
+    steps = ("device-malfunction is flagged by scheduler", "is cleared by doctor", "series is in control")
+    for step in steps:
+        again.wait_for(" scheduler ", step)
     found = [again.output.index(step) for step in steps]
     assert found == sorted(found), again.output
