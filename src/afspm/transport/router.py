@@ -8,7 +8,7 @@ from typing import NamedTuple
 import zmq
 
 from afspm.transport.complaints import Complaints
-from afspm.transport.frames import descriptor_of, readable, receive_small, send, user_of
+from afspm.transport.frames import descriptor_of, property_of, readable, receive_small, send, user_of
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import QUEUE_LENGTH, Network
 
@@ -65,6 +65,7 @@ class Router:
         self._connections = 0
         self.touched = True
         self._by_descriptor: dict[int, _Peer] = {}
+        self._formers: dict[int, _Peer] = {}  # whose descriptor it was last, as long as words of theirs may come
         self._identities: dict[int, bytes] = {}
         self.socket = network.socket(zmq.ROUTER)
         self.socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
@@ -119,6 +120,10 @@ class Router:
         for sender, events in said:
             if sender.connection not in gone:
                 told += events
+        if len(messages) < QUEUE_LENGTH:  # all was read that came before the descriptor was given out again
+            for peer, came in changes:
+                if came:
+                    self._formers.pop(peer.descriptor, None)
         return told
 
     def _sender(self, first: zmq.Frame, changes: list[tuple[_Peer, bool]]) -> _Peer | None:
@@ -134,8 +139,26 @@ class Router:
                 return former and self._introduced(former, first, identity)
             # what was left of an earlier connection had been taken for the first words of this one
             changes += [(current, False), (current := self._new(descriptor), True)]
+        last = self._formers.get(descriptor)
+        if current.identity is None and last and last.identity == identity and not self._lives(first, identity):
+            # the last words of who had the descriptor before, and not the first of its next life
+            return last if last in gone else None
         unheard = next((peer for peer in gone if peer.identity is None), None)
         return self._introduced(unheard if current.identity is None and unheard else current, first, identity)
+
+    def _lives(self, first: zmq.Frame, identity: bytes) -> bool:
+        """Whether anybody has the identity of who said this now. Who has hears an empty frame; of REQ peers, whose
+        connection that would end, it is not asked."""
+        if property_of(first, "Socket-Type") != "DEALER":
+            return True
+        self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        try:
+            self.socket.send_multipart([identity, b""], zmq.NOBLOCK)
+        except zmq.ZMQError as error:
+            return error.errno != zmq.EHOSTUNREACH
+        finally:
+            self.socket.setsockopt(zmq.ROUTER_MANDATORY, 0)
+        return True
 
     def reply(self, connection: int, frames: Sequence[bytes]) -> None:
         """Answer by `connection`, if it is still there. Never blocks."""
@@ -156,6 +179,7 @@ class Router:
         for kind, descriptor in self.monitor.drain():
             gone = self._by_descriptor.pop(descriptor, None)
             if gone is not None:
+                self._formers[descriptor] = gone
                 changes.append((gone, False))
             if kind == ACCEPTED:
                 changes.append((self._new(descriptor), True))

@@ -5,14 +5,20 @@ from __future__ import annotations
 import logging
 import socket
 import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import pytest
 import zmq
 
+from afspm import wire
 from afspm.clock import ExperimentClock
+from afspm.model import Response
+from afspm.transport import router
 from afspm.transport.complaints import Complaints
+from afspm.transport.monitor import ACCEPTED, DISCONNECTED, ConnectionEvent
 from afspm.transport.network import MAX_REQUEST_BYTES, Network
-from afspm.transport.port import ControlConnected
+from afspm.transport.port import ControlConnected, ReplyReceived
 from afspm.transport.router import PeerAsked, PeerConnected, PeerDisconnected, Router
 from afspm.transport.zmq_port import ZmqPort
 
@@ -134,3 +140,131 @@ def test_those_that_speak_another_protocol_come_and_go(open_: Any, plain: Any) -
         listening.told.clear()
     peer(plain, listening, b"A").send_multipart([b"", b"\7"])
     assert listening.until(1)
+
+
+@pytest.fixture
+def raw() -> Iterator[Callable[..., Raw]]:
+    made: list[Raw] = []
+
+    def make(name: bytes, kind: bytes = b"DEALER") -> Raw:
+        made.append(Raw(name, kind))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.socket.close()
+
+
+class Raw:
+    """A peer by hand: its socket is there before it connects and stays after it has left, so that the router's
+    next connection has the descriptor of the last."""
+
+    def __init__(self, name: bytes, kind: bytes) -> None:
+        self.socket = socket.socket()
+        told = ((b"Socket-Type", kind), (b"Identity", name))
+        properties = [bytes([len(key)]) + key + bytes([0, 0, 0, len(value)]) + value for key, value in told]
+        self._ready = b"\x05READY" + b"".join(properties)
+
+    def connect(self, listening: Listening) -> None:
+        host, port = listening.router.address.removeprefix("tcp://").split(":")
+        self.socket.connect((host, int(port)))
+
+    def say(self, what: bytes, *, first: bool = False) -> None:
+        if first:
+            greeting = b"\xff" + bytes(7) + b"\1\x7f\3\1NULL" + bytes(16 + 1 + 31)
+            self.socket.sendall(greeting + bytes([4, len(self._ready)]) + self._ready)
+            heard = b""
+            while b"\x05READY" not in heard:
+                heard += self.socket.recv(1000)
+        self.socket.sendall(bytes([1, 0, 0, len(what)]) + what)
+
+    def leave(self) -> None:
+        self.socket.shutdown(socket.SHUT_RDWR)
+
+
+def happened(listening: Listening, kind: int) -> list[ConnectionEvent]:
+    """What the monitor tells up to an event of a kind."""
+    events: list[ConnectionEvent] = []
+    deadline_s = time.monotonic() + 5.0
+    while not any(event.kind == kind for event in events):
+        assert time.monotonic() < deadline_s
+        events += listening.router.monitor.drain()
+    return events
+
+
+def follows(listening: Listening, monkeypatch: pytest.MonkeyPatch, *rounds: list[ConnectionEvent]) -> list[Any]:
+    """What the router tells of these events, seen all at once."""
+    left = list(rounds)
+    monkeypatch.setattr(listening.router.monitor, "drain", lambda: left.pop(0) if left else [])
+    told = listening.router.follow()
+    monkeypatch.undo()
+    return told
+
+
+@pytest.mark.parametrize("in_time", [True, False])
+def test_last_words_are_not_taken_for_those_of_who_has_the_descriptor_next(
+    open_: Any, raw: Callable[..., Raw], monkeypatch: pytest.MonkeyPatch, in_time: bool
+) -> None:
+    listening, series, witness = Listening(open_), raw(b"series"), raw(b"witness")
+    series.connect(listening)
+    series.say(b"1", first=True)
+    (first,) = listening.until(1)
+    series.say(b"2")
+    series.leave()
+    gone, told = happened(listening, DISCONNECTED), []
+    if not in_time:  # the socket told of the end before it gave out the last words
+        with monkeypatch.context() as patched:
+            patched.setattr(router, "readable", lambda socket: False)
+            told += follows(listening, patched, gone)
+        assert told == [PeerDisconnected(first.connection)]
+        gone = []
+    witness.connect(listening)
+    came = happened(listening, ACCEPTED)
+    told += follows(listening, monkeypatch, [*gone, *came])
+    assert {event.value for event in came} == {first_descriptor(listening)}
+    last = [PeerAsked(first.connection, "series", None, [b"2"])] if in_time else []
+    assert told == [*last, PeerDisconnected(first.connection), PeerConnected(2)]
+    witness.say(b"3", first=True)
+    assert listening.until(2)[-1] == PeerAsked(2, "witness", None, [b"3"])
+
+
+def first_descriptor(listening: Listening) -> int:
+    (descriptor,) = listening.router._by_descriptor
+    return descriptor
+
+
+@pytest.mark.parametrize("kind", [b"DEALER", b"REQ"])
+def test_the_first_words_of_a_next_life_on_the_same_descriptor_are_its_own(
+    open_: Any, raw: Callable[..., Raw], monkeypatch: pytest.MonkeyPatch, kind: bytes
+) -> None:
+    listening, series, again = Listening(open_), raw(b"series", kind), raw(b"series", kind)
+    series.connect(listening)
+    series.say(b"1", first=True)
+    listening.until(1)
+    descriptor = first_descriptor(listening)
+    series.leave()
+    events = happened(listening, DISCONNECTED)
+    again.connect(listening)
+    events += happened(listening, ACCEPTED)
+    again.say(b"2", first=True)
+    assert listening.router.socket.poll(5000)
+    told = follows(listening, monkeypatch, events)
+    assert told == [PeerDisconnected(1), PeerConnected(2), PeerAsked(2, "series", None, [b"2"])]
+    assert first_descriptor(listening) == descriptor
+    listening.router.reply(2, [b"heard"])
+    heard = b""
+    while not heard.endswith(b"heard"):
+        heard += again.socket.recv(1000)
+    assert heard.startswith(b"\0\0") is (kind == b"DEALER")  # an empty frame, to see whether it is there
+
+
+def test_to_be_looked_for_disturbs_no_component(open_: Any, until: Any, caplog: pytest.LogCaptureFixture) -> None:
+    listening, found = Listening(open_), []
+    component = open_(ZmqPort(Network(), "A", CLOCK, control=listening.router.address))
+    until(lambda: ControlConnected() in found, (component, found))
+    component.send([b"\7", b"", b"A/first/1"])
+    (asked,) = listening.until(1)
+    listening.router.socket.send_multipart([b"A", b""])
+    listening.router.reply(asked.connection, wire.encode_response(Response(0, id="A/first/1")))
+    until(lambda: any(isinstance(one, ReplyReceived) for one in found), (component, found))
+    assert not caplog.records
