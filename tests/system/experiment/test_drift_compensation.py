@@ -16,6 +16,8 @@ KNOWN_M = 2e-9
 """How well a scan is known to lie; a pixel is 16 nm."""
 PLACED_M = 20e-9
 """How well one lies where it was asked for, once the rate is known; the sample drifts by 60 nm and more between two."""
+QUICK = 120.0
+"""Where it does not matter how well that is."""
 
 
 @pytest.fixture
@@ -64,7 +66,7 @@ def test_killed_in_the_middle_the_scheduler_and_its_worker_know_where_the_sample
 
 
 def test_without_correction_drift_is_told_and_seen(rig: Rig) -> None:
-    run = rig.start("correct = false", scans=3)
+    run = rig.start("correct = false", scans=3, speed=QUICK)
     assert run.end() == 0, run.output
     found = surveyed(run)
     np.testing.assert_array_equal(found.said_m, np.zeros((3, 2)))
@@ -110,21 +112,21 @@ def test_a_controller_that_is_given_the_rate_keeps_the_tip_on_the_sample_by_itse
 
 
 def test_a_user_s_own_estimator_is_named_in_the_experiment_file(rig: Rig) -> None:
-    run = rig.start('estimator = "surveyor.Drifts", rescan = { rule = "never" }', scans=3)
+    run = rig.start('estimator = "surveyor.Drifts", rescan = { rule = "never" }', scans=3, speed=QUICK)
     assert run.end() == 0, run.output
     found = surveyed(run)
     assert (away_m(found.said_m, found.true_m) < KNOWN_M).all(), found
 
 
 def test_an_estimator_that_fails_costs_no_scan_and_says_why(rig: Rig) -> None:
-    run = rig.start('estimator = "surveyor.Nothing", rescan = { rule = "never" }', scans=2)
+    run = rig.start('estimator = "surveyor.Nothing", rescan = { rule = "never" }', scans=2, speed=QUICK)
     assert run.end() == 0, run.output
     assert "ZeroDivisionError: nothing is known" in table(run)[1]["reason"]
     assert len(surveyed(run).said_m) == 2
 
 
 def test_an_estimator_that_hangs_costs_no_scan(rig: Rig) -> None:
-    run = rig.start('estimator = "surveyor.Hangs", longest_registration = "3 s"', scans=2)
+    run = rig.start('estimator = "surveyor.Hangs", longest_registration = "3 s"', scans=2, speed=QUICK)
     assert run.end() == 0, run.output
     run.wait_for("scheduler .*was not registered within 3 s, it goes out as predicted")
     assert len(surveyed(run).said_m) == 2
