@@ -18,7 +18,7 @@ from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys
 from afspm.transport.network import Network
-from afspm.transport.port import ControlConnected, PacketReceived, ReplyReceived, RequestReceived
+from afspm.transport.port import ControlConnected, ControlDisconnected, PacketReceived, ReplyReceived, RequestReceived
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
 
@@ -47,7 +47,8 @@ class Component:
         return answers[-1] if answers else None
 
     def ask(self, kind: int, subject: Any = None, key: str | None = None) -> Response:
-        """Ask and wait for the answer."""
+        """Ask, once there is somebody to be asked, and wait for the answer."""
+        self._rig.until(self.connected)
         request_id = self.send(kind, subject, key)
         answer: Response = self._rig.until(lambda: self.answer_to(request_id))
         return answer
@@ -60,7 +61,9 @@ class Component:
         ]
 
     def connected(self) -> bool:
-        return any(isinstance(i, ControlConnected) for i in self.found)
+        """As far as it knows; what is asked without a connection is dropped."""
+        changes = [i for i in self.found if isinstance(i, ControlConnected | ControlDisconnected)]
+        return bool(changes) and isinstance(changes[-1], ControlConnected)
 
 
 class Rig:
