@@ -347,18 +347,23 @@ class Translator:
     def _retract(self) -> Response:
         if not self._connected:
             raise ControllerLost(self._why_lost)
-        answer = self._service.answer(Request(ControlRequest.ACTION, names.RETRACT))
-        self._play(answer.steps)
+        response = self._act(names.RETRACT)
         self._save()
-        return answer.response
+        return response
 
     def _stop_measuring(self) -> None:
         """The tip does not go on scanning with nobody there."""
         stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(self._sequence.said.state)
         if stop is not None and self._connected:
-            self._play(self._service.answer(Request(ControlRequest.ACTION, stop)).steps)
+            self._act(stop)
             self._observe()
             self._save()
+
+    def _act(self, action: str) -> Response:
+        """Do what nobody has asked for."""
+        answer = self._service.answer(Request(ControlRequest.ACTION, action))
+        self._play(answer.steps)
+        return answer.response
 
     def _answer(self, request: Request) -> None:
         if not self._connected:

@@ -23,25 +23,22 @@ from afspm import Component
 
 class Reckless(Component):
     def run(self):
-        mark = Path(__file__).with_name("died")
+        mark = Path(__file__).with_name("once")
         if mark.exists():
             return
         with self.scope.control():
             self.scope.set("x-feedback-on", "false")
             mark.touch()
-            os._exit(9)
+            self.leave_it_so()
+
+    def leave_it_so(self):
+        os._exit(9)
 
 
-class Blind(Component):
-    def run(self):
-        mark = Path(__file__).with_name("blind")
-        if mark.exists():
-            return
-        with self.scope.control():
-            self.scope.set("x-feedback-on", "false")
-            mark.touch()
-            self.log.info("the feedback is off")
-            self.scope.wait_until(lambda: False)
+class Blind(Reckless):
+    def leave_it_so(self):
+        self.log.info("the feedback is off")
+        self.scope.wait_until(lambda: False)
 
 
 class Doctor(Component):
@@ -121,7 +118,7 @@ def test_when_the_run_is_stopped_with_the_feedback_off_the_tip_is_retracted(
 
 
 def test_a_run_that_was_stopped_with_the_tip_in_danger_is_resumed_when_that_was_seen_to(
-    run: Callable[..., AfspmRun], resume: Callable[[Path], AfspmRun], tmp_path: Path
+    run: Callable[..., AfspmRun], afspm_run: Callable[..., AfspmRun], tmp_path: Path
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
     more = BLIND.format(retract="true") + DOCTOR
@@ -129,7 +126,7 @@ def test_a_run_that_was_stopped_with_the_tip_in_danger_is_resumed_when_that_was_
     one.wait_for(" blind ", "the feedback is off")
     one.process.send_signal(signal.SIGINT)
     assert one.end() == 130, one.output
-    again = resume(one.folder)
+    again = afspm_run("--resume", str(one.folder))
     steps = ("device-malfunction is flagged by scheduler", "is cleared by doctor", "series is in control")
     for step in steps:
         again.wait_for(" scheduler ", step)
