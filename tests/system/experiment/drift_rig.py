@@ -55,6 +55,8 @@ SURVEYOR = '''
 """Thinks in sample coordinates: the same region and the same feature, again and again."""
 
 import json
+import threading
+from pathlib import Path
 
 import numpy as np
 
@@ -84,22 +86,6 @@ class Surveyor(Component):
             file.write(json.dumps(facts) + "\\n")
 
 
-class Nothing:
-    """An estimator that knows nothing, and says so by an error."""
-
-    def register(self, reference, scan, prior=None):
-        raise ZeroDivisionError("nothing is known")
-
-
-class Hangs:
-    """An estimator that never comes back."""
-
-    def register(self, reference, scan, prior=None):
-        import threading
-
-        threading.Event().wait()
-
-
 class Drifts:
     """An estimator that knows how this sample drifts."""
 
@@ -107,6 +93,25 @@ class Drifts:
         moved_m = np.array([0.25e-9, -0.15e-9]) * (scan.mid_s - reference.mid_s)
         center_m = np.array(reference.region.center_m)
         return Registration(True, "", moved_m, np.eye(2) * 1e-20, np.zeros((2, 2)), center_m)
+
+
+class Fails(Drifts):
+    """It fails at the first scan that it is asked about, and never comes back from the second."""
+
+    def register(self, reference, scan, prior=None):
+        for trouble in (self.fail, self.hang):
+            mark = Path(__file__).with_name(trouble.__name__)
+            if not mark.exists():
+                mark.write_text(scan.key)
+            if mark.read_text() == scan.key:
+                trouble()
+        return super().register(reference, scan, prior)
+
+    def fail(self):
+        raise ZeroDivisionError("nothing is known")
+
+    def hang(self):
+        threading.Event().wait()
 '''
 
 
