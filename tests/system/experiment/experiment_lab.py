@@ -84,12 +84,13 @@ class Finisher(Component):
     """Has something to finish at the end, which takes for ever in its first life."""
 
     def on_end(self):
-        first = not (self.run_dir / "finishing.txt").exists()
-        (self.run_dir / "finishing.txt").touch()
+        begun = self.run_dir / f"{self.name} finishes.txt"
+        first = not begun.exists()
+        begun.touch()
         self.log.info("finishing")
         if first:
             threading.Event().wait()
-        (self.run_dir / "finished.txt").touch()
+        (self.run_dir / f"{self.name} has finished.txt").touch()
 '''
 
 

@@ -48,15 +48,16 @@ def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, w
         one.wait_for(f"{name} was restarted once")
 
 
-@pytest.mark.parametrize("name", ["microscope", "scheduler", "series"])
-def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run, name: str) -> None:
-    one = run(more=MORE, scans=4)
-    one.wait_for("scan 2 of 4")
-    one.wait_for_next(" witness ", "state SCANNING")
-    one.signal(name, signal.SIGSTOP)
-    one.wait_for(f" {name} ", "no heartbeat")
+def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run) -> None:
+    one = run(more=MORE, scans=10)
+    one.wait_for("scan 2 of 10")
+    for name in ("microscope", "scheduler", "series"):
+        one.wait_for_next(" witness ", "state SCANNING")
+        one.signal(name, signal.SIGSTOP)
+        one.wait_for(f" {name} ", "no heartbeat")
+        one.wait_up(name, times=2)
     assert one.end() == 0, one.output
-    require_each_once(one, 4)
+    require_each_once(one, 10)
 
 
 def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Run) -> None:
@@ -70,15 +71,20 @@ def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Ru
     require_each_row_once(one, 5)
 
 
-@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
-def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run, fault: signal.Signals) -> None:
-    one = run(more=MORE + '[finisher]\ncomponent = true\nclass = "witness.Finisher"\n')
-    one.wait_for(" finisher ", "finishing")
+def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run) -> None:
+    faults = {"dies": signal.SIGKILL, "freezes": signal.SIGSTOP}
+    finishers = (f'[{name}]\ncomponent = true\nclass = "witness.Finisher"\n' for name in faults)
+    one = run(more=MORE + "".join(finishers))
+    for name in faults:
+        one.wait_for(f" {name} ", "finishing")
     one.wait_for(" afspm ", "the experiment has ended$")
-    one.signal("finisher", fault)
-    one.wait_for(" finisher ", "it is started again, to finish")
+    for name, fault in faults.items():
+        one.signal(name, fault)
+    for name in faults:
+        one.wait_for(f" {name} ", "it is started again, to finish")
     assert one.end() == 0, one.output
-    assert (one.folder / "finished.txt").exists(), one.output
+    for name in faults:
+        assert (one.folder / f"{name} has finished.txt").exists(), one.output
     require_each_once(one, 4)
 
 

@@ -75,6 +75,12 @@ retract = {retract}
 component = true
 class = "danger.Blind"
 """
+RETRACTED = "the feedback off: the tip is retracted"
+
+
+def engaged(run: AfspmRun) -> bool:
+    """Whether the translator left the tip at the surface."""
+    return bool(Memory(run.folder / "state" / "microscope.json")["microscope"]["values"]["x-engaged"])
 
 
 def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_it_was_seen_to(
@@ -97,8 +103,8 @@ def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_i
 
 
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="waiting for the end of another's child")
-@pytest.mark.parametrize(("by", "retract"), [("SIGINT", True), ("SIGTERM", False), ("SIGKILL", True)])
-def test_when_the_run_is_stopped_with_the_feedback_off_the_tip_is_retracted(
+@pytest.mark.parametrize(("by", "retract"), [("SIGTERM", False), ("SIGKILL", True)])
+def test_when_a_run_ends_with_the_feedback_off_the_tip_is_retracted_unless_the_file_says_otherwise(
     run: Callable[..., AfspmRun], tmp_path: Path, by: str, retract: bool
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
@@ -110,14 +116,13 @@ def test_when_the_run_is_stopped_with_the_feedback_off_the_tip_is_retracted(
         assert select.select([translator], [], [], 10.0)[0]
     finally:
         os.close(translator)
-    values = Memory(one.folder / "state" / "microscope.json")["microscope"]["values"]
-    assert values["x-engaged"] is not retract
+    assert engaged(one) is not retract
     if by != "SIGKILL":  # there is nobody any more to tell it to
         assert one.end() == 130, one.output
-        assert ("the feedback off: the tip is retracted" in one.output) is retract
+        assert RETRACTED not in one.output
 
 
-def test_a_run_that_was_stopped_with_the_tip_in_danger_is_resumed_when_that_was_seen_to(
+def test_with_the_tip_retracted_by_ctrl_c_a_run_is_resumed_when_that_was_seen_to(
     run: Callable[..., AfspmRun], afspm_run: Callable[..., AfspmRun], tmp_path: Path
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
@@ -126,6 +131,8 @@ def test_a_run_that_was_stopped_with_the_tip_in_danger_is_resumed_when_that_was_
     one.wait_for(" blind ", "the feedback is off")
     one.process.send_signal(signal.SIGINT)
     assert one.end() == 130, one.output
+    assert RETRACTED in one.output
+    assert not engaged(one)
     again = afspm_run("--resume", str(one.folder))
     steps = ("device-malfunction is flagged by scheduler", "is cleared by doctor", "series is in control")
     for step in steps:

@@ -97,10 +97,3 @@ def test_people_are_called_and_find_a_report(run: Run, tmp_path: Path, hook: que
     kept = [file for file in one.folder.rglob("*") if file.is_file() and SECRET.encode() in file.read_bytes()]
     assert kept == []
     assert SECRET not in one.output
-
-
-def test_a_report_that_is_not_wanted_is_not_written(run: Run) -> None:
-    one = run("--no-report", scans=1)
-    assert one.end() == 0, one.output
-    assert not (one.folder / "report.html").exists()
-    assert (one.folder / "journal.sqlite").is_file()

@@ -29,6 +29,8 @@ def test_an_experiment_ends_by_itself_and_leaves_its_folder(run: Run, tmp_path: 
     assert "scheduler" in log
     assert "[clock]" in (folder / "experiment.toml").read_text(encoding="utf-8")
     assert one.facts()["guest"]["sockets"]["control"] == one.facts()["processes"]["scheduler"]["serve"]
+    assert not (folder / "report.html").exists()  # --no-report
+    assert (folder / "journal.sqlite").is_file()
 
 
 def test_errors_in_the_file_are_told_and_nothing_starts(run: Run, tmp_path: Path) -> None:
@@ -80,18 +82,14 @@ def test_an_experiment_can_be_started_in_two_parts(run: Run) -> None:
     assert decides.facts()["clock"] == acts.facts()["clock"], "each part has a time of its own"
 
 
-def test_the_second_file_wins(run: Run) -> None:
-    one = run(over="[series]\nscans = 1\n[witness]\nscans = 1\n")
-    assert one.end() == 0, one.output
-    require_each_once(one, 1)
-
-
-def test_modules_beside_the_file_are_meant_not_those_where_it_was_started(run: Run, tmp_path: Path) -> None:
+def test_the_second_file_wins_and_modules_beside_the_file_are_meant_not_those_where_it_was_started(
+    run: Run, tmp_path: Path
+) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     for name in ("witness", "queue"):  # one of the experiment's, one that Python itself needs
         (elsewhere / f"{name}.py").write_text("raise RuntimeError('the wrong one')\n", encoding="utf-8")
-    one = run(scans=1, where=elsewhere)
+    one = run(over="[series]\nscans = 1\n[witness]\nscans = 1\n", where=elsewhere)
     assert one.end() == 0, one.output
     require_each_once(one, 1)
 
