@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from afspm.cli.app import app
 from afspm.cli.joining import NOT_RUNNING, person
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -44,12 +46,17 @@ scans = 1000
 """
 
 
-def afspm(*arguments: object, answer: str = "") -> subprocess.CompletedProcess[str]:
+def afspm(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [*AFSPM, *map(str, arguments)]
     environment = {**os.environ, "COLUMNS": "200", "PYTHONIOENCODING": "utf-8"}
     return subprocess.run(
-        command, capture_output=True, text=True, encoding="utf-8", input=answer, timeout=DEADLINE_S, env=environment
+        command, capture_output=True, text=True, encoding="utf-8", timeout=DEADLINE_S, env=environment
     )
+
+
+def afspm_here(*arguments: object, answer: str = "") -> Any:
+    """A command in this process, where all is loaded: as a process of its own each is seen in another test."""
+    return CliRunner().invoke(app, [*map(str, arguments)], input=answer)
 
 
 class Running:
@@ -61,7 +68,7 @@ class Running:
         self.runs = folder / "runs"
         self.output: list[str] = []
         self.process = subprocess.Popen(
-            [*AFSPM, "run", str(file), "--runs", str(self.runs), "--verbose"],
+            [*AFSPM, "run", str(file), "--runs", str(self.runs), "--verbose", "--no-report"],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", start_new_session=True,
         )  # fmt: skip
 
@@ -75,7 +82,7 @@ class Running:
         raise AssertionError(f"{pattern} never came:\n{''.join(self.output)}")
 
     def status(self) -> dict[str, Any]:
-        told: dict[str, Any] = json.loads(afspm("status", self.runs, "--json").stdout)
+        told: dict[str, Any] = json.loads(afspm_here("status", self.runs, "--json").stdout)
         return told
 
     def until(self, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
@@ -123,12 +130,12 @@ def test_pause_and_resume_are_manual_and_automated(night: Running) -> None:
 
 
 def test_a_problem_is_flagged_and_cleared_by_the_person(night: Running) -> None:
-    assert afspm("problems", night.runs, "--flag", "thermal-drift").returncode == 0
+    assert afspm_here("problems", night.runs, "--flag", "thermal-drift").exit_code == 0
     listed = afspm("problems", night.runs).stdout
     assert "thermal-drift, for" in listed
     assert f"flagged by {person()}" in listed
-    assert afspm("problems", night.runs, "--clear", "thermal-drift").returncode == 0
-    assert "no problem is flagged" in afspm("problems", night.runs).stdout
+    assert afspm_here("problems", night.runs, "--clear", "thermal-drift").exit_code == 0
+    assert "no problem is flagged" in afspm_here("problems", night.runs).stdout
 
 
 def test_a_misspelt_problem_is_an_error_with_the_nearest(night: Running) -> None:
@@ -142,9 +149,9 @@ def test_watch_without_a_terminal_writes_a_line_whenever_something_changes(night
     try:
         assert watching.stdout is not None
         assert "AUTOMATED" in watching.stdout.readline()
-        assert afspm("pause", night.runs).returncode == 0
+        assert afspm_here("pause", night.runs).exit_code == 0
         assert any("MANUAL" in line for line in watching.stdout)
-        assert afspm("resume", night.runs).returncode == 0
+        assert afspm_here("resume", night.runs).exit_code == 0
         assert any("AUTOMATED" in line for line in watching.stdout)
     finally:
         watching.kill()
@@ -172,16 +179,16 @@ def test_a_run_whose_supervisor_is_killed_is_told_as_cut_off_everywhere(tmp_path
     assert told in watching.communicate(timeout=DEADLINE_S)[1]
     assert watching.returncode == NOT_RUNNING
     for command in ("status", "pause"):
-        said = afspm(command, folder)
-        assert said.returncode == NOT_RUNNING
+        said = afspm_here(command, folder)
+        assert said.exit_code == NOT_RUNNING
         assert told in said.stderr
-    page = Path(afspm("report", folder).stdout.strip()).read_text(encoding="utf-8")
+    page = Path(afspm_here("report", folder).stdout.strip()).read_text(encoding="utf-8")
     assert told in html.unescape(page)
 
 
 def test_end_asks_first(night: Running) -> None:
-    said = afspm("end", night.runs, answer="n\n")
-    assert said.returncode == 1
+    said = afspm_here("end", night.runs, answer="n\n")
+    assert said.exit_code == 1
     assert night.status()["mode"] == "AUTOMATED"
 
 
@@ -203,6 +210,6 @@ def test_end_ends_it_and_then_nothing_runs(night: Running) -> None:
     night.wait_for(r"everything is in")
     assert night.process.wait(DEADLINE_S) == 0
     for command in ("status", "watch", "pause", "resume", "problems"):
-        said = afspm(command, night.runs)
-        assert said.returncode == NOT_RUNNING, said.stderr
+        said = afspm_here(command, night.runs)
+        assert said.exit_code == NOT_RUNNING, said.stderr
         assert "has ended (" in said.stderr
