@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 NM = 1e9
 NM_PER_MIN = 60e9
 _SCANS_OF_A_RUN = "scans"
+_FEW_PIXELS = 100_000  # of all scans: to compare these takes no longer than to start a process for it
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +114,7 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int, con
     with Progress(*columns, console=console, transient=True) as progress, ThreadPoolExecutor(1) as beside:
         track = progress.add_task("followed", total=len(scans))
         pair = progress.add_task("compared with the first", total=len(scans) - 1)
-        others = max(jobs - 1, 2) if jobs > 1 else 1  # one would be this process
-        work = beside.submit(_pairs, scans, by, others, lambda: progress.advance(pair))
+        work = beside.submit(_pairs, scans, by, _others(scans, jobs), lambda: progress.advance(pair))
         updates = []
         for update in followed(scans, tracking):
             updates.append(update)
@@ -122,6 +122,12 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int, con
         pairs = work.result()
     record = DriftRecord.of(scans, updates)
     return Analysis(record, pairs, against_first(record, scans, pairs))
+
+
+def _others(scans: Sequence[DriftScan], jobs: int) -> int:
+    """How many processes compare; 1 is this one."""
+    few = sum(scan.values.size for scan in scans) <= _FEW_PIXELS
+    return 1 if few or jobs == 1 else max(jobs - 1, 2)
 
 
 def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], None]) -> tuple[Registration, ...]:
