@@ -22,7 +22,7 @@ def test_the_script_of_the_page_measures_and_ends_the_experiment(tmp_path: Path)
     for snippet in snippets(PAGE):
         if name := FILE_NAME.match(snippet.text):
             (tmp_path / name[1]).write_text(snippet.text, encoding="utf-8")
-    command = (*AFSPM, "run", "--verbose", "experiment.toml")
+    command = (*AFSPM, "run", "--verbose", "--no-report", "experiment.toml")
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
         try:
             assert run.stdout is not None

@@ -55,7 +55,7 @@ class Short(Component):
 
 def afspm_run(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "afspm", "run", *arguments],
+        [sys.executable, "-m", "afspm", "run", "--no-report", *arguments],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
