@@ -30,14 +30,13 @@ from afspm.model.words import day_and_time
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.measured import SUFFIX as RECORDED
 from afspm.study.recorded import Series, series
-from afspm.study.workers import on_cores
+from afspm.study.workers import FEW_PIXELS, on_cores
 
 Array = NDArray[np.float64]
 
 NM = 1e9
 NM_PER_MIN = 60e9
 _SCANS_OF_A_RUN = "scans"
-_FEW_PIXELS = 100_000  # of all scans: to compare these takes no longer than to start a process for it
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +125,7 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int, con
 
 def _others(scans: Sequence[DriftScan], jobs: int) -> int:
     """How many processes compare; 1 is this one."""
-    few = sum(scan.values.size for scan in scans) <= _FEW_PIXELS
+    few = sum(scan.values.size for scan in scans) <= FEW_PIXELS
     return 1 if few or jobs == 1 else max(jobs - 1, 2)
 
 

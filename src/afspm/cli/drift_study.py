@@ -13,6 +13,7 @@ from rich.table import Table
 
 from afspm.study import Grid, NightSettings, Outcome, Summary, night, on_cluster, on_cores, summarised
 from afspm.study.summary import BY
+from afspm.study.workers import FEW_PIXELS
 
 COLUMNS = {
     BY: "rms",
@@ -40,6 +41,8 @@ def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int) -
     """Do a study and print it."""
     combinations = dict(Grid.of(given).settings())
     tasks = [(settings, seed + k) for k in range(nights) for settings in combinations.values()]
+    if sum(settings.scans * settings.pixels**2 for settings, _ in tasks) <= FEW_PIXELS:
+        jobs = 1
     labels = list(combinations)
     metrics: dict[str, list[Mapping[str, float]]] = defaultdict(list)
     failed: dict[str, list[str]] = defaultdict(list)

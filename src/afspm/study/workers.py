@@ -12,6 +12,8 @@ from typing import Any
 
 from afspm.errors import AfspmError, ConfigError
 
+FEW_PIXELS = 100_000
+"""Of all scans: to register these takes no longer than to start a process for it."""
 _MOST_DEATHS = 3  # of workers one after the other while nothing gets done
 
 

@@ -78,7 +78,7 @@ def run_folder(tmp_path: Path) -> Path:
 def test_a_run_folder_is_followed_told_and_drawn(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drift_files, "_FEW_PIXELS", 0)  # as of large scans, by processes
+    monkeypatch.setattr(drift_files, "FEW_PIXELS", 0)  # as of large scans, by processes
     output = tmp_path / "out"
     line = ["drift", str(run_folder), "-o", str(output), "-j", "2", "--estimator", "correlation", "--tracker", "paper"]
     done = CliRunner().invoke(app, line, env={"COLUMNS": "100"})
