@@ -22,6 +22,7 @@ OVERSAMPLING = 4
 TIP_PX = 1.5  # so far from its apex the parabolic tip is one rms height of the sample above it
 ROUGH_PX = 40.0  # above this length `rough` is not any rougher
 BAND_PX = 0.5  # Gaussian that limits the band, as feedback and probe do
+_ROWS = 16  # dilated at a time, so that they stay in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -164,12 +165,17 @@ def imaged(height: Array, second_tip_px: tuple[float, float] | None = None) -> A
 
 def _dilated(height: Array, tip: Array, axis: int) -> Array:
     """Grey dilation of one axis by an even function."""
-    padded = np.moveaxis(height, axis, 0)
     reach = len(tip) // 2
-    padded = np.pad(padded, ((reach, reach), (0, 0)), mode="edge")
-    highest = np.full((padded.shape[0] - 2 * reach, padded.shape[1]), -np.inf)
-    for k, below in enumerate(tip):
-        np.maximum(highest, padded[k : k + len(highest)] + below, out=highest)
+    padded = np.ascontiguousarray(np.pad(np.moveaxis(height, axis, 0), ((reach, reach), (0, 0)), mode="edge"))
+    highest = padded[reach:-reach].copy()
+    for first in range(0, len(highest), _ROWS):
+        here = highest[first : first + _ROWS]
+        either = np.empty_like(here)
+        for far in range(1, reach + 1):
+            before, after = (padded[first + reach + k :][: len(here)] for k in (-far, far))
+            np.maximum(before, after, out=either)
+            either += tip[reach + far]
+            np.maximum(here, either, out=here)
     return np.moveaxis(highest, 0, axis)
 
 
