@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from afspm.errors import InvalidValue
 from afspm.model import Region
+from afspm.model.geometry import XY
 
 Array = NDArray[np.float64]
 
@@ -27,10 +28,11 @@ def intersection_m(first: Region, second: Region) -> Array:
         raise InvalidValue(f"a region in {first.frame.value} and one in {second.frame.value} coordinates can't overlap")
     # About one centre, in units of one size: far from the origin the digits of the corners would be used up.
     origin, unit = np.array(first.center_m), max(*first.size_m, *second.size_m)
-    polygon = (first.corners_m() - origin) / unit
-    sides = (second.corners_m() - origin) / unit
-    for start, end in zip(sides, np.roll(sides, -1, axis=0), strict=True):
-        polygon = _clipped(polygon, start, end)
+    corners: list[XY] = ((first.corners_m() - origin) / unit).tolist()
+    sides: list[XY] = ((second.corners_m() - origin) / unit).tolist()
+    for start, end in zip(sides, sides[1:] + sides[:1], strict=True):
+        corners = _clipped(corners, start, end)
+    polygon = np.array(corners)
     return polygon * unit + origin if _area(polygon) > 0.0 else np.empty((0, 2))
 
 
@@ -53,7 +55,7 @@ def intersection_center_m(first: Region, second: Region) -> Array | None:
     if not len(polygon):
         return None
     corners = polygon - polygon[0]
-    after = np.roll(corners, -1, axis=0)
+    after = _after(corners)
     twice = corners[:, 0] * after[:, 1] - after[:, 0] * corners[:, 1]
     center: Array = ((corners + after) * twice[:, None]).sum(axis=0) / (3.0 * twice.sum()) + polygon[0]
     return center
@@ -96,25 +98,28 @@ def _moved(region: Region, x_m: float, y_m: float) -> Region:
     return region.moved_to((region.center_m[0] + x_m, region.center_m[1] + y_m))
 
 
-def _clipped(polygon: Array, start: Array, end: Array) -> Array:
+def _clipped(polygon: list[XY], start: XY, end: XY) -> list[XY]:
     """What of a polygon lies left of the line from `start` to `end`."""
-    if not len(polygon):
-        return polygon
-    along = end - start
-    left = along[0] * (polygon[:, 1] - start[1]) - along[1] * (polygon[:, 0] - start[0])
+    along_x, along_y = end[0] - start[0], end[1] - start[1]
+    left = [along_x * (y - start[1]) - along_y * (x - start[0]) for x, y in polygon]
     kept = []
-    for corner, side, before, side_before in zip(
-        polygon, left, np.roll(polygon, 1, axis=0), np.roll(left, 1), strict=True
-    ):
+    for k, (x, y) in enumerate(polygon):
+        side, side_before, (x_before, y_before) = left[k], left[k - 1], polygon[k - 1]
         if side * side_before < 0.0:
-            kept.append(before + (corner - before) * (side_before / (side_before - side)))
+            share = side_before / (side_before - side)
+            kept.append((x_before + (x - x_before) * share, y_before + (y - y_before) * share))
         if side >= 0.0:
-            kept.append(corner)
-    return np.array(kept) if kept else np.empty((0, 2))
+            kept.append((x, y))
+    return kept
 
 
 def _area(polygon: Array) -> float:
     if len(polygon) < 3:
         return 0.0
-    x, y = polygon.T
-    return max(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2, 0.0)
+    (x, y), (x_after, y_after) = polygon.T, _after(polygon).T
+    return max(float(x @ y_after - y @ x_after) / 2, 0.0)
+
+
+def _after(corners: Array) -> Array:
+    """The corner that follows on each."""
+    return np.concatenate([corners[1:], corners[:1]])
