@@ -113,7 +113,7 @@ def test_noise_has_the_size_it_is_said_to_have() -> None:
 @pytest.mark.parametrize("surface", SURFACES)
 def test_maximum_likelihood_reaches_the_bound_of_white_noise(surface: str) -> None:
     """One noisy image against the exact surface: half of C, had both images the whole overlap."""
-    made = pair(surface, "white10", seed=5)
+    made = pair(surface, "white10", seed=5, size=80)
     frame, random = made.frames[1], np.random.default_rng(7)
     sample = frame.sample_px(frame.offsets_px())
     clean, chi2 = made.view.at(sample), []
