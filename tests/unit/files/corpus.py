@@ -13,8 +13,8 @@ import afspm
 from afspm.files import FORMATS, FileContent
 
 _FILES = sorted(path.relative_to(DATA).as_posix() for path in DATA.rglob("*") if path.suffix in FORMATS)
-REAL = sorted({re.sub(r"\d+", "", name): name for name in _FILES}.values())
-"""One of each series: the others are built the same."""
+REAL = sorted({re.sub(r"\w+\.h5$|\d+", "", name): name for name in reversed(_FILES)}.values())
+"""One of each series, and one .h5, all of which one program made: the others are built the same."""
 
 
 @cache
