@@ -148,18 +148,20 @@ class Client(Process):
 
     def received(self, feed: Feed, packet: Packet) -> None:
         assert packet.time_ns is not None
-        known = self.newest.get(packet.envelope)
-        if known is not None and packet.time_ns <= known[0]:
+        envelope, time_ns, payload = packet.envelope, packet.time_ns, packet.payload
+        known = self.newest.get(envelope)
+        if known is not None and time_ns <= known[0]:
             return  # as our subscribers do
         self.on_received(self, packet)
-        self.newest[packet.envelope] = (packet.time_ns, packet.payload)
-        self.newest_ns = max(self.newest_ns, packet.time_ns)
-        thing = self.codec.decode(packet.payload)
+        self.newest[envelope] = (time_ns, payload)
+        if time_ns > self.newest_ns:
+            self.newest_ns = time_ns
+        thing = self.codec.decode(payload)
         if isinstance(thing, ControlState):
             self.control = thing
         elif isinstance(thing, ScopeStatus):
             self.scope = thing.state
-        elif packet.envelope.startswith("Scan2d"):
+        elif envelope.startswith("Scan2d"):
             self.scans.append(thing)
         self._go_on()
 

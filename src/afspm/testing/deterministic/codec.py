@@ -12,18 +12,18 @@ class TableCodec:
     """See `logic.events.Codec`; payloads are the numbers, in ASCII, of the objects that they stand for."""
 
     def __init__(self) -> None:
-        self._objects: list[Any] = []
+        self._objects: dict[bytes, Any] = {}
         self._numbers: dict[Any, bytes] = {}
 
     def encode(self, thing: Any) -> bytes:
         payload = self._numbers.get(thing)
         if payload is None:
             payload = self._numbers[thing] = b"%d" % len(self._objects)
-            self._objects.append(thing)
+            self._objects[payload] = thing
         return payload
 
     def decode(self, payload: bytes | memoryview) -> Any:
-        return self._objects[int(bytes(payload))]
+        return self._objects[bytes(payload)]
 
     def encode_orders(self, restart: Sequence[str]) -> bytes:
         return self.encode(tuple(restart))

@@ -78,7 +78,7 @@ class Invariants:
         self._trace: deque[tuple[float, Input | None, tuple[Effect, ...]]] = deque(maxlen=_TRACE)
         self._holder: str | None = None
         self._held_since_s = 0.0
-        self._absent_since_s: dict[str, float] = {}
+        self._absent_since_s: dict[str, float | None] = {}
         self._idle_since_ns: int | None = None
         self._used_ns = 0
         self._last_ns = -1
@@ -89,6 +89,7 @@ class Invariants:
         self._open: dict[tuple[str, str], tuple[float, int]] = {}
         self._definite: dict[tuple[str, str], int] = {}
         self._life = 0
+        self._checked: Control | None = None
         self._saved_control: Control | None = None
         self._saved_state: dict[str, bytes] | None = None
         self.written = Written(timeline, codec, self._must, NAME_TAKEN)
@@ -136,7 +137,9 @@ class Invariants:
 
     def _control(self, host: SchedulerHost) -> None:
         control = host.core.control
-        state = host.core.control_state
+        if control is self._checked:
+            return
+        self._checked, state = control, host.core.control_state
         self._must(
             control.holder is None or state.mode is ControlMode.AUTOMATED, f"{control.holder} is in control in MANUAL"
         )
@@ -157,17 +160,18 @@ class Invariants:
     def _presence(self, host: SchedulerHost) -> None:
         """Control never stays with the dead."""
         now_s = self._timeline.monotonic_s()
-        there = {client.identity for client in self.components if client.alive and client.identity == client.name}
         for client in self.components:
-            if client.identity in there:
-                self._absent_since_s.pop(client.identity, None)
-            else:
-                self._absent_since_s.setdefault(client.identity, now_s)
+            if client.identity != client.name:
+                continue  # an impostor
+            if client.alive:
+                self._absent_since_s[client.name] = None
+            elif self._absent_since_s.get(client.name) is None:
+                self._absent_since_s[client.name] = now_s
         holder = host.core.control.holder
-        if holder is None or holder in there:
+        if holder is None or (absent_since_s := self._absent_since_s.get(holder, 0.0)) is None:
             return
         allowed_s = max(self._bounds.grace_s, self._bounds.restart_grace_s) + _SLACK_S
-        since_s = max(self._absent_since_s.get(holder, 0.0), self._held_since_s, host.since_s)
+        since_s = max(absent_since_s, self._held_since_s, host.since_s)
         self._must(
             now_s - since_s <= allowed_s, f"{holder} has been dead for {now_s - since_s:.1f} s and is in control"
         )
@@ -196,10 +200,11 @@ class Invariants:
             return
         self._saved_control, self._saved_state = host.core.control, host.disk.state
         control = host.core.control.to_dict()
-        saved = host.disk.saved_part("control")
-        if saved is None:
-            saved = {"mode": 2, "holder": None, "solving": 0, "problems": {}, "ended": False}
-        self._must(saved == control, f"told before it was saved: {control}, saved {saved}")
+        if not host.disk.holds("control", control):
+            saved = host.disk.saved_part("control")
+            if saved is None:
+                saved = {"mode": 2, "holder": None, "solving": 0, "problems": {}, "ended": False}
+            self._must(saved == control, f"told before it was saved: {control}, saved {saved}")
 
     # --- requests ---
 

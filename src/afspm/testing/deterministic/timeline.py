@@ -10,6 +10,7 @@ from typing import Any
 START_S = 1_750_000_000.0
 """Experiment time at the beginning."""
 
+_START_NS = int(START_S) * 10**9
 _STUCK = 10_000
 
 
@@ -58,7 +59,7 @@ class Timeline:
 
     def at_ns(self, time_s: float) -> int:
         """Experiment time at a moment of real time."""
-        return int(START_S) * 10**9 + round(time_s * self.speed * 1e9)
+        return _START_NS + round(time_s * self.speed * 1e9)
 
     def now_s(self) -> float:
         return START_S + self._time_s * self.speed
