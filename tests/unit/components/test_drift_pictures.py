@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,12 @@ SETTINGS = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (60e
 PIXELS, EVERY_S, SWITCHED_ON = 48, 600.0, 4
 
 
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a figure looks like is not asked here."""
+    monkeypatch.setattr("afspm.drift.figures.style.DPI", 30)
+
+
 def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -> None:
     told = [Told(str(k), k >= 3) for k in range(6)]
     assert parts(told) == [("off", 0, 3), ("on", 4, 6)]
@@ -34,19 +41,28 @@ def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -
     assert parts([]) == []
 
 
-def saved(folder: Path) -> list[tuple[Path, Region, float]]:
-    """Nine scans, from the fourth on in a frame that follows the sample, and what is true of them."""
+@cache
+def scanned() -> list[tuple[bytes, Region, float]]:
+    """Nine scans, from the fourth on in a frame that follows the sample: as saved, where, and when."""
     world = World.from_settings(SETTINGS, seed=1, start_s=0.0)
-    (folder / "scans").mkdir()
     found = []
     for k in range(9):
         middle_s = EVERY_S * k + PIXELS / 2
         x, y, _ = world.drift_m(middle_s) - world.drift_m(PIXELS / 2)
         region = Region((float(x), float(y)) if k >= SWITCHED_ON else (0.0, 0.0), (1e-6, 1e-6))
         scan = world.scan(region, (PIXELS, PIXELS), 1.0, EVERY_S * k)
-        path = folder / "scans" / f"scan-{k}.nc"
         measured = Measured(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
-        path.write_bytes(encode_scan(region, scan.channels(), measured))
+        found.append((encode_scan(region, scan.channels(), measured), region, middle_s))
+    return found
+
+
+def saved(folder: Path) -> list[tuple[Path, Region, float]]:
+    """The files of the scans, and what is true of them."""
+    (folder / "scans").mkdir()
+    found = []
+    for k, (content, region, middle_s) in enumerate(scanned()):
+        path = folder / "scans" / f"scan-{k}.nc"
+        path.write_bytes(content)
         found.append((path, region, middle_s))
     start = {"n": 1, "time_s": 0.0, "event": "start", "settings": SETTINGS, "seed": 1}
     (folder / "truth.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")
@@ -97,7 +113,8 @@ def test_the_table_and_all_figures_are_there_when_the_experiment_has_ended(tmp_p
 def test_a_restart_loses_nothing(tmp_path: Path) -> None:
     lab = night(tmp_path)
     lab.at(450.0, lab.parent_goes)
-    DriftPictures(estimator="correlation").run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
+    first = DriftPictures(estimator="correlation", features="correlation")
+    first.run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
     lab.restart_component()
     lab.at(1500.0, lab.kill)
     run(DriftPictures(estimator="correlation"), lab, tmp_path / "state", run_dir=str(tmp_path))
@@ -113,11 +130,13 @@ def test_what_was_compared_before_a_restart_is_not_left_to_the_end(
 ) -> None:
     lab = night(tmp_path)
     lab.at(850.0, lab.parent_goes)
-    DriftPictures(estimator="correlation").run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
+    quick = {"estimator": "correlation", "features": "correlation"}
+    DriftPictures(**quick).run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
     lab.restart_component()
-    component, left = DriftPictures(estimator="correlation"), list[int]()
+    component, left = DriftPictures(**quick), list[int]()
     pairs_at_end = DriftPictures.on_end
     monkeypatch.setattr(DriftPictures, "on_end", lambda self: left.append(6 - len(self._pairs)) or pairs_at_end(self))
+    monkeypatch.setattr("afspm.drift.figures.album.write", lambda *_, **__: [])
     lab.at(1500.0, lab.kill)
     run(component, lab, tmp_path / "state", run_dir=str(tmp_path))
     assert left == [0]
