@@ -22,22 +22,23 @@ def subseed(seed: int, name: str) -> int:
 
 def hashes(seed: int, *keys: ArrayLike) -> Hashes:
     """64 mixed bits for each combination (broadcast) of whole numbers."""
-    state = _mix(np.asarray(seed % 2**64, dtype=np.uint64))
-    for key in keys:
-        whole = np.asarray(key).astype(np.int64).astype(np.uint64)
-        state = _mix(_times_golden(whole) ^ state)
-    return state
+    with np.errstate(over="ignore"):  # arithmetic modulo 2**64 is what is meant
+        state = _mix(np.asarray(seed % 2**64, dtype=np.uint64))
+        for key in keys:
+            state = _with(state, key)
+        return state
 
 
 def uniform(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
     """Uniform in [0, 1), shaped as the keys broadcast."""
-    return (hashes(seed, *keys) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    return _fraction(hashes(seed, *keys))
 
 
 def normal(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
     """Standard normal (Box and Muller), shaped as the keys broadcast."""
-    first = 1.0 - uniform(seed, *keys, 0)
-    second = uniform(seed, *keys, 1)
+    state = hashes(seed, *keys)
+    with np.errstate(over="ignore"):
+        first, second = 1.0 - _fraction(_with(state, 0)), _fraction(_with(state, 1))
     result: NDArray[np.float64] = np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
     return result
 
@@ -52,14 +53,21 @@ def generator(seed: int, *keys: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(int(hashes(seed, *keys)[()])))
 
 
-def _times_golden(values: Hashes) -> Hashes:
-    with np.errstate(over="ignore"):  # arithmetic modulo 2**64 is what is meant
-        return (values + np.uint64(1)) * _GOLDEN
+def _fraction(values: Hashes) -> NDArray[np.float64]:
+    return (values >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+def _with(state: Hashes, key: ArrayLike) -> Hashes:
+    """The hashes of one more number."""
+    whole = np.asarray(key).astype(np.int64).astype(np.uint64)
+    return _mix((whole + np.uint64(1)) * _GOLDEN ^ state)
 
 
 def _mix(values: Hashes) -> Hashes:
-    with np.errstate(over="ignore"):
-        values = values + _GOLDEN
-        values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        return values ^ (values >> np.uint64(31))
+    values = values + _GOLDEN
+    values ^= values >> np.uint64(30)
+    values *= np.uint64(0xBF58476D1CE4E5B9)
+    values ^= values >> np.uint64(27)
+    values *= np.uint64(0x94D049BB133111EB)
+    values ^= values >> np.uint64(31)
+    return values
