@@ -40,7 +40,8 @@ def test_what_made_the_points_is_found_among_wrong_pairs(
     linear, shift = LINEAR[name](*numbers), np.array([0.3, -0.2])
     b = a @ linear.T + shift
     b[:12] = points(seed + 5000, 12)
-    found = Search(form, 150, 0.2, np.random.default_rng(0)).among(a, b, 1e-3)
+    # three right pairs are drawn every fifth time, and never in 60 times in one of 700 000 examples
+    found = Search(form, 60, 0.2, np.random.default_rng(0)).among(a, b, 1e-3)
     assert found is not None
     assert found.inlier[12:].all()
     np.testing.assert_allclose(found.transform(a[12:]), b[12:], atol=1e-3)

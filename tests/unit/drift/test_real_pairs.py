@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +28,20 @@ def scanned(name: str, channel: str) -> DriftScan:
     return DriftScan(scan.values, scan.region, start_s, start_s + 256.0, key=name)
 
 
-def registered(reference: str, scan: str, channel: str = "HeightRetrace") -> tuple[Registration, np.ndarray]:
-    """And the displacement in pixels of the reference."""
-    first, second = scanned(reference, channel), scanned(scan, channel)
-    found = LeastSquares().register(first, second)
-    return found, found.displacement_m / first.pixel_m
+Registered = Callable[..., tuple[Registration, np.ndarray]]
+
+
+@pytest.fixture(scope="module")
+def registered() -> Registered:
+    """Each pair once; and the displacement in pixels of the reference."""
+
+    @cache
+    def registered(reference: str, scan: str, channel: str) -> tuple[Registration, np.ndarray]:
+        first, second = scanned(reference, channel), scanned(scan, channel)
+        found = LeastSquares().register(first, second)
+        return found, found.displacement_m / first.pixel_m
+
+    return lambda reference, scan, channel="HeightRetrace": registered(reference, scan, channel)
 
 
 PZT = ("PZT_final0001", "PZT_final0002", "PZT_final0003")
@@ -48,18 +59,20 @@ PMN = ("PMN28Pt0001", "PMN28Pt0002")
         (*PMN, "DeflectionRetrace", (-5.2, 13.2)),
     ],
 )
-def test_the_drift_is_found(reference: str, scan: str, channel: str, expected_px: tuple[float, float]) -> None:
+def test_the_drift_is_found(
+    registered: Registered, reference: str, scan: str, channel: str, expected_px: tuple[float, float]
+) -> None:
     found, shift_px = registered(reference, scan, channel)
     assert found.accepted, found.reason
     assert np.hypot(*(shift_px - expected_px)) < 1.0
 
 
-def test_two_steps_are_as_far_as_one() -> None:
+def test_two_steps_are_as_far_as_one(registered: Registered) -> None:
     first, second, both = (registered(a, b)[1] for a, b in ((PZT[0], PZT[1]), (PZT[1], PZT[2]), (PZT[0], PZT[2])))
     assert np.hypot(*(first + second - both)) < 0.3
 
 
-def test_the_way_back_is_the_way_there() -> None:
+def test_the_way_back_is_the_way_there(registered: Registered) -> None:
     """Both scans are treated alike; only where the displacement holds differs."""
     there, back = registered(*PMN)[0], registered(*PMN[::-1])[0]
     at_m = there.center_m + there.displacement_m
@@ -76,13 +89,13 @@ def test_the_way_back_is_the_way_there() -> None:
         ("PMN28Pt0000", PZT[1]),
     ],
 )
-def test_scans_of_different_samples_are_refused(reference: str, scan: str) -> None:
+def test_scans_of_different_samples_are_refused(registered: Registered, reference: str, scan: str) -> None:
     found, _ = registered(reference, scan)
     assert not found.accepted
     assert found.reason
 
 
-def test_a_channel_that_holds_too_little_is_refused() -> None:
+def test_a_channel_that_holds_too_little_is_refused(registered: Registered) -> None:
     found, _ = registered(*PMN, "PhaseRetrace")
     assert not found.accepted
     assert "no common features" in found.reason
