@@ -24,10 +24,11 @@ class Waves:
         self._height_m = 1e-9 * length_m / length_m.max()
 
     def at(self, x_m: Array, y_m: Array) -> Array:
-        height = np.zeros(x_m.shape)
-        for kx, ky, phase, amplitude in zip(*self._k, self._phase, self._height_m, strict=True):
-            height += amplitude * np.cos(kx * x_m + ky * y_m + phase)
-        return height
+        """At the pixels of a scan, whose phases are sums of those along its first column and its first row."""
+        column = self._k.T @ [x_m[:, 0], y_m[:, 0]] + self._phase[:, None]
+        row = self._k.T @ [x_m[0] - x_m[0, 0], y_m[0] - y_m[0, 0]]
+        height = self._height_m[:, None]
+        return (height * np.cos(column)).T @ np.cos(row) - (height * np.sin(column)).T @ np.sin(row)
 
 
 def scanned(
