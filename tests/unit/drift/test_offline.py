@@ -72,11 +72,14 @@ def test_pairs_for_the_eye_are_as_far_apart_as_asked_and_spread_over_the_run() -
     assert spread_pairs(run[:1], 7200.0, 2) == []
 
 
-def test_an_album_holds_every_figure_that_there_is_something_for(tmp_path: Path) -> None:
+def test_an_album_holds_every_figure_that_there_is_something_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("matplotlib")
-    from afspm.drift.figures import album
+    from afspm.drift.figures import album, style
     from afspm.drift.registration import Matches
 
+    monkeypatch.setattr(style, "DPI", 30)
     run = record(12)
     scans = [DriftScan(np.random.default_rng(k).normal(size=(16, 16)), REGION, t, t) for k, t in enumerate(run.time_s)]
     at = np.random.default_rng(1).uniform(0.5e-6, 1.5e-6, (9, 2))
