@@ -72,9 +72,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_finish() -> None:
-    """What thousands of tests are made of is there to the end: garbage is not looked for in it again and again."""
+    """What thousands of tests are made of is there to the end: garbage is not looked for in it again and again.
+
+    Nor as often as Python does: a simulated night makes a great many things and little garbage.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture
