@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fi
 
 
 def test_nothing_that_was_published_is_lost_and_nothing_is_there_twice(tmp_path: Path) -> None:
-    verdict = power_cuts(tmp_path, cuts=3, seed=5)
+    verdict = power_cuts(tmp_path, cuts=4, seed=5)
     assert verdict.wrong == []
     assert verdict.seen > 0, "nobody saw anything"
     assert verdict.scans > 0
