@@ -86,7 +86,8 @@ def best_of(found: dict[str, float]) -> tuple[str, float]:
 
 
 def _best(larger: Picture, detail: Picture) -> float:
-    return max(_correlation(larger, detail, shift) for shift in _shifts(larger.region))
+    x, y = detail.region.pixels_m(detail.values.shape)
+    return max(_correlation(larger, detail.values, x + right, y + up) for right, up in _shifts(larger.region))
 
 
 def _shifts(region: Region) -> Iterator[tuple[float, float]]:
@@ -94,12 +95,11 @@ def _shifts(region: Region) -> Iterator[tuple[float, float]]:
     return ((right * side, up * side) for right in _SHIFTS for up in _SHIFTS)
 
 
-def _correlation(larger: Picture, detail: Picture, shift_m: tuple[float, float]) -> float:
-    x, y = detail.region.pixels_m(detail.values.shape)
-    wanted, inside = _at(larger, x + shift_m[0], y + shift_m[1])
+def _correlation(larger: Picture, detail: Array, x_m: Array, y_m: Array) -> float:
+    wanted, inside = _at(larger, x_m, y_m)
     if inside.mean() < _INSIDE:
         return -1.0
-    a, b = _level(detail.values, inside), _level(wanted, inside)
+    a, b = _level(inside, detail, wanted)
     scale = np.sqrt((a**2).sum() * (b**2).sum())
     return float((a * b).sum() / scale) if scale > 0.0 else 0.0
 
@@ -122,9 +122,9 @@ def _at(picture: Picture, x_m: Array, y_m: Array) -> tuple[Array, NDArray[np.boo
     return np.asarray(low * (1 - v) + high * v), inside
 
 
-def _level(values: Array, inside: NDArray[np.bool_]) -> Array:
-    """Without its plane: no sample lies quite flat."""
+def _level(inside: NDArray[np.bool_], *pictures: Array) -> Array:
+    """What of them is inside, each without its plane: no sample lies quite flat."""
     rows, columns = np.nonzero(inside)
     plane = np.stack([rows, columns, np.ones(len(rows))], axis=1).astype(float)
-    found = values[inside]
-    return np.asarray(found - plane @ np.linalg.lstsq(plane, found, rcond=None)[0])
+    found = np.stack([values[inside] for values in pictures], axis=1)
+    return np.asarray(found - plane @ np.linalg.lstsq(plane, found, rcond=None)[0]).T
