@@ -15,8 +15,9 @@ from hypothesis import HealthCheck, settings
 
 # how long one example takes says more about how busy the computer is than about us
 any_pace: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
-settings.register_profile("repeatable", **any_pace, derandomize=True)
-settings.register_profile("explore", **any_pace)  # new examples each time: AFSPM_EXAMPLES=explore make test
+settings.register_profile("repeatable", **any_pace, derandomize=True, max_examples=60)
+# new examples each time, and more of them: AFSPM_EXAMPLES=explore make test
+settings.register_profile("explore", **any_pace, max_examples=300)
 settings.load_profile(os.environ.get("AFSPM_EXAMPLES", "repeatable"))
 
 # as for a registration in an experiment: on small arrays several threads are slower than one, and take others' cores

@@ -20,9 +20,21 @@ def states(heard: list[Heard]) -> list[str]:
 
 def broken_off(kit: Taking, mark: int, stop: str, begun: ScopeState) -> list[Heard]:
     """Stop what runs; what is published from its beginning on, once its states have been found right."""
+    asked_to_stop(kit, mark, stop, begun)
+    return require_broken_off(kit, mark, stop, begun)
+
+
+def asked_to_stop(kit: Taking, mark: int, stop: str, begun: ScopeState) -> float:
+    """Stop what runs; when that was answered, experiment time in s."""
     bench = kit.bench
     expect(bench.state is begun, f"SS_{begun.name} until it is stopped", told(bench.story.since(mark)))
     kit.act(stop)
+    return bench.clock.now_s()
+
+
+def require_broken_off(kit: Taking, mark: int, stop: str, begun: ScopeState) -> list[Heard]:
+    """What is published from the beginning on of what was stopped, once its states have been found right."""
+    bench = kit.bench
     bench.wait_state(ScopeState.INTERRUPTED, mark)
     bench.wait_state(ScopeState.FREE, mark, bench.real_s(60.0))
     heard = bench.settled(mark)

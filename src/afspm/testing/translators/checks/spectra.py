@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from afspm.model import ProbePosition, ScopeState, Spectrum, names
-from afspm.testing.translators.checks.cancelling import broken_off, states
+from afspm.testing.translators.checks.cancelling import asked_to_stop, require_broken_off, states
 from afspm.testing.translators.checks.scans import CLOCK_S, require_order
 from afspm.testing.translators.frames import NEAR, in_words
 from afspm.testing.translators.registry import check
@@ -16,8 +16,6 @@ from afspm.testing.translators.taking import Taking
 from afspm.testing.translators.verdicts import Failed, Skipped, expect
 
 _NEEDS = (names.START_SPEC,)
-SHORT_REAL_S = 0.1
-"""A spectrum that lasts no longer may be over before it can be stopped."""
 
 
 @check(
@@ -26,22 +24,23 @@ SHORT_REAL_S = 0.1
     needs=(names.START_SPEC, names.STOP_SPEC),
 )
 def cancel(kit: Taking) -> None:
-    mark = kit.begin_spectrum()
+    mark, answered_s = kit.begin_spectrum(), math.inf
     try:
-        heard = broken_off(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
+        answered_s = asked_to_stop(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
+        heard = require_broken_off(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
     except Failed:
-        if _was_over(kit, mark):
+        if _was_over(kit, mark, answered_s):
             raise Skipped("a spectrum is over sooner than it could be stopped") from None
         raise
     expect(not spectra(heard), "no Spec1d of a spectrum that was stopped", told(heard))
 
 
-def _was_over(kit: Taking, mark: int) -> bool:
-    """Whether a spectrum came to its end by itself, all in order, before anybody could stop it."""
+def _was_over(kit: Taking, mark: int, answered_s: float) -> bool:
+    """Whether a spectrum came to its end by itself, all in order, before anybody had stopped it."""
     bench = kit.bench
     heard = bench.settled(mark)
-    begun_s, ended_s = (bench.story.at_s(state, mark) for state in (ScopeState.SPEC, ScopeState.FREE))
-    if begun_s is None or ended_s is None or bench.clock.real_s(ended_s - begun_s) >= SHORT_REAL_S:
+    ended_s = bench.story.at_s(ScopeState.FREE, mark)
+    if ended_s is None or ended_s > answered_s:
         return False
     first, *between, last = [str(one) for one in heard if one.state is not None or isinstance(one.thing, Spectrum)]
     return (first, {*between}, last) == ("SS_SPEC", {"Spec1d"}, "SS_FREE")
