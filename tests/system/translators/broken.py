@@ -125,6 +125,15 @@ class CancelIgnored(Broken):
         """Nothing comes of it."""
 
 
+class SpectrumNotStopped(Broken):
+    @action(names.STOP_SPEC)
+    def stop_spec(self) -> None:
+        """Nothing comes of it, and nothing is said."""
+
+    def spoil(self) -> None:
+        sequence.Sequence.interrupt = lambda self: []  # type: ignore[method-assign]
+
+
 class CancelledSpectrumUntold(Broken):
     """A spectrum that is stopped is free at once, as if it had come to its end."""
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from afspm.testing.translators import Options, Report, bench, run
+from afspm.testing.translators.session import SPEED
 
 HERE = Path(__file__).parent
 STUCK = ("NeverFreeAgain", "SuccessWithoutChange")
@@ -24,11 +25,11 @@ initial = {{ tip-bias-voltage = "200 mV", scan-angle = "3 deg" }}
 """
 
 
-def checked(folder: Path, name: str, *only: str) -> Report:
+def checked(folder: Path, name: str, *only: str, speed: float = SPEED) -> Report:
     shutil.copy(HERE / "broken.py", folder)
     file = folder / "experiment.toml"
     file.write_text(EXPERIMENT.format(name=name), encoding="utf-8")
-    return run(Options([file], runs=folder / "runs", only=only))
+    return run(Options([file], runs=folder / "runs", only=only, speed=speed))
 
 
 @pytest.mark.parametrize(
@@ -76,6 +77,15 @@ def test_what_is_wrong_is_said_in_one_line(
     assert not report.passed
     if name not in STUCK:
         assert report.unrestored == []
+
+
+def test_a_spectrum_that_goes_on_when_it_is_stopped_is_not_one_that_was_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "NOTICED_S", 4.0)  # what is waited for in vain
+    report = checked(tmp_path, "broken.SpectrumNotStopped", "spectrum/cancel", speed=1.0)
+    (failure,) = report.failed
+    assert re.search("expected SS_INTERRUPTED .*; came SS_SPEC, Spec1d, SS_FREE", failure.line), failure.line
 
 
 def test_the_scan_before_is_not_taken_for_the_new_one(tmp_path: Path) -> None:
