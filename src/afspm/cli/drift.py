@@ -29,7 +29,14 @@ app = typer.Typer(
     "in simulated nights (afspm drift study).",
 )
 Jobs = Annotated[
-    int | None, typer.Option("--jobs", "-j", min=1, help="Processes. Default: the cores.", show_default=False)
+    int | None,
+    typer.Option(
+        "--jobs",
+        "-j",
+        min=1,
+        help="Processes. Default: the cores, or for a few small scans this one alone.",
+        show_default=False,
+    ),
 ]
 
 
@@ -58,7 +65,7 @@ def files(
     from afspm.experiment.classes import importing_from
 
     with importing_from([Path.cwd()]):
-        drift_files.run(paths, channel, estimator, tracker, output, jobs or os.cpu_count() or 1)
+        drift_files.run(paths, channel, estimator, tracker, output, jobs)
 
 
 @app.command("study")
@@ -84,7 +91,7 @@ def study(
     from afspm.experiment.classes import importing_from
 
     with importing_from([Path.cwd()]):
-        drift_study.run(settings or [], nights, seed, cluster, jobs or os.cpu_count() or 1)
+        drift_study.run(settings or [], nights, seed, cluster, jobs)
 
 
 def _one_thread_a_process() -> None:

@@ -30,7 +30,7 @@ from afspm.model.words import day_and_time
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.measured import SUFFIX as RECORDED
 from afspm.study.recorded import Series, series
-from afspm.study.workers import FEW_PIXELS, on_cores
+from afspm.study.workers import on_cores, processes
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class Analysis:
     estimates: DriftRecord
 
 
-def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Path, jobs: int) -> None:
+def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Path, jobs: int | None) -> None:
     """Analyse and tell.
 
     Raises:
@@ -106,7 +106,7 @@ def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registratio
     return estimator(by).register(reference, scan)
 
 
-def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int, console: Console) -> Analysis:
+def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console) -> Analysis:
     """Followed in this process, one scan after the other, while others compare each with the first."""
     tracking = tracker(following, estimator(by))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -123,10 +123,10 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int, con
     return Analysis(record, pairs, against_first(record, scans, pairs))
 
 
-def _others(scans: Sequence[DriftScan], jobs: int) -> int:
+def _others(scans: Sequence[DriftScan], jobs: int | None) -> int:
     """How many processes compare; 1 is this one."""
-    few = sum(scan.values.size for scan in scans) <= FEW_PIXELS
-    return 1 if few or jobs == 1 else max(jobs - 1, 2)
+    wanted = processes(jobs, sum(scan.values.size for scan in scans))
+    return 1 if wanted == 1 else max(wanted - 1, 2)
 
 
 def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], None]) -> tuple[Registration, ...]:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from afspm.study import Grid, NightSettings, Outcome, Summary, night, on_cluster, on_cores, summarised
 from afspm.study.summary import BY
-from afspm.study.workers import FEW_PIXELS
+from afspm.study.workers import processes
 
 COLUMNS = {
     BY: "rms",
@@ -37,16 +37,15 @@ def metrics_of(settings: NightSettings, seed: int) -> Mapping[str, float]:
     return night(settings, seed).metrics()
 
 
-def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int) -> None:
+def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int | None) -> None:
     """Do a study and print it."""
     combinations = dict(Grid.of(given).settings())
     tasks = [(settings, seed + k) for k in range(nights) for settings in combinations.values()]
-    if sum(settings.scans * settings.pixels**2 for settings, _ in tasks) <= FEW_PIXELS:
-        jobs = 1
+    here = processes(jobs, sum(settings.scans * settings.pixels**2 for settings, _ in tasks))
     labels = list(combinations)
     metrics: dict[str, list[Mapping[str, float]]] = defaultdict(list)
     failed: dict[str, list[str]] = defaultdict(list)
-    work = on_cluster(metrics_of, tasks, address=cluster) if cluster else on_cores(metrics_of, tasks, jobs=jobs)
+    work = on_cluster(metrics_of, tasks, address=cluster) if cluster else on_cores(metrics_of, tasks, jobs=here)
     for outcome in _shown(work, len(tasks)):
         label = labels[outcome.index % len(labels)]
         if outcome.error:

@@ -103,7 +103,7 @@ class Desk:
 
     def unclear_until_s(self) -> float | None:
         """When the first of them has waited long enough; None: nobody waits."""
-        return min(until_s for _, until_s in self._unclear.values()) if self._unclear else None
+        return min((until_s for _, until_s in self._unclear.values()), default=None)
 
     def refuse_unclear(self, now_s: float) -> None:
         """Both connections go on: they are two."""

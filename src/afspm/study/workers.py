@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import multiprocessing
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -12,8 +13,7 @@ from typing import Any
 
 from afspm.errors import AfspmError, ConfigError
 
-FEW_PIXELS = 100_000
-"""Of all scans: to register these takes no longer than to start a process for it."""
+_FEW_PIXELS = 100_000  # of all scans: to register these takes no longer than to start a process for it
 _MOST_DEATHS = 3  # of workers one after the other while nothing gets done
 
 
@@ -30,6 +30,13 @@ class Outcome:
     index: int
     value: Any = None
     error: str = ""
+
+
+def processes(asked: int | None, pixels: int) -> int:
+    """How many: as asked for; or one a core, where there is so much to compare that it pays to start them."""
+    if asked is not None:
+        return asked
+    return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
 
 
 def on_cores(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, jobs: int) -> Iterator[Outcome]:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from afspm.cli import drift_files
 from afspm.cli.app import app
 from afspm.drift.record import DriftRecord
 from afspm.errors import InvalidValue
@@ -75,10 +74,7 @@ def run_folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.timeout(60)
-def test_a_run_folder_is_followed_told_and_drawn(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drift_files, "FEW_PIXELS", 0)  # as of large scans, by processes
+def test_a_run_folder_is_followed_told_and_drawn(run_folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     line = ["drift", str(run_folder), "-o", str(output), "-j", "2", "--estimator", "correlation", "--tracker", "paper"]
     done = CliRunner().invoke(app, line, env={"COLUMNS": "100"})

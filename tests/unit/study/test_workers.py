@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import ConfigError, InvalidValue
-from afspm.study.workers import Outcome, on_cluster, on_cores
+from afspm.study.workers import Outcome, on_cluster, on_cores, processes
 
 
 def doubled(number: int) -> int:
@@ -38,6 +38,12 @@ def by_index(outcomes: list[Outcome]) -> list[Outcome]:
 def test_every_task_is_done_and_an_error_is_told_for_its_task_alone(jobs: int) -> None:
     done = by_index(list(on_cores(doubled, [(1,), (-1,), (3,)], jobs=jobs)))
     assert done == [Outcome(0, 2), Outcome(1, error="below zero"), Outcome(2, 6)]
+
+
+def test_as_many_processes_as_asked_for_else_one_where_they_do_not_pay() -> None:
+    assert [processes(3, pixels) for pixels in (1, 10**9)] == [3, 3]
+    assert processes(None, 32 * 32) == 1
+    assert processes(None, 10**9) == (os.cpu_count() or 1)
 
 
 def test_a_worker_that_is_killed_loses_no_task(tmp_path: Path) -> None:

@@ -65,10 +65,6 @@ class Disk:
         """As it comes out of a JSON file; None if nothing was saved."""
         return None if self.state is None else {name: self.saved_part(name) for name in self.state}
 
-    def holds(self, name: str, part: Any) -> bool:
-        """Whether a part of it is just this."""
-        return self.state is not None and self.state[name] == marshal.dumps(part, _BY_VALUE)
-
     def saved_part(self, name: str) -> Any:
         """One part of it, as it comes out of a JSON file; None if nothing was saved."""
         return None if self.state is None else json.loads(json.dumps(marshal.loads(self.state[name])))

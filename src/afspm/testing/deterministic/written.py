@@ -86,7 +86,6 @@ class Written:
         self._published_s = -1.0
         self._newest: Packet | None = None
         self._derived = _Derived()
-        self._told_now = False  # in this step
         self.entries = 0
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
@@ -102,8 +101,7 @@ class Written:
         """After each step."""
         if host.life != self._life:
             self._begin(host)
-        if self._told_now:
-            self._told_now = False
+        if any(isinstance(effect, Publish) and effect.packet.envelope == ENTRIES for effect in effects):
             is_so = _Derived.of(host.core.control, self._names)
             self._must(self._derived == is_so, f"by what is written {self._derived}, in truth {is_so}")
         now_s = self._timeline.monotonic_s()
@@ -117,7 +115,6 @@ class Written:
         self._answered.clear()
         self._awaited.clear()
         self._spare.clear()
-        self._told_now = False
         self._derived = _Derived.of(host.core.control, self._names)
         self._published_s = -1.0
         if self._newest is not None:
@@ -144,7 +141,7 @@ class Written:
         now_s = self._timeline.monotonic_s()
         self._must(bool(entries.entries), "nothing is published as if something had happened")
         self._must(now_s - self._published_s >= PERIOD_S - 1e-9, "entries are published too often")
-        self._published_s, self._newest, self._told_now = now_s, packet, True
+        self._published_s, self._newest = now_s, packet
         told = [told for _, told in self._awaited]
         for entry in entries.entries:
             self._take(entry, told)
