@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and may finish a file
 AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
 FAREWELL_S = 60.0  # but not for ever
-KILL_AFTER_S = 1.5  # after being asked
+KILL_AFTER_S = 1.5  # after being asked, or after having finished what may be finished then
 TIP_S = 15.0  # after being asked: so long the tip may take to be seen to, by a controller that answers slowly
 LEAVE_AFTER_S = 3.0  # after being killed
 
@@ -47,6 +48,7 @@ class Ending:
         latest_s: until when those who are busy may be waited for before they are asked.
         last: what has been done already.
         in_haste: somebody wants it to be over now.
+        busy_s: when somebody was last seen to be busy after being asked.
     """
 
     why: Why
@@ -56,6 +58,7 @@ class Ending:
     latest_s: float
     last: Do | None = None
     in_haste: bool = False
+    busy_s: float = -math.inf
 
     @classmethod
     def begin(cls, why: Why, text: str, now_s: float) -> Ending:
@@ -93,12 +96,15 @@ class Ending:
                 of the night, say), and then a translator, which does not leave before the tip is safe.
         """
         deadline_s = self.deadline_s()
+        seen = replace(self, busy_s=now_s) if busy and self.last is Do.ASK else self
         if deadline_s is None or now_s < deadline_s:
-            return self, None
+            return seen, None
         if self.last is None and busy and now_s < self.latest_s:
             ask_s = min(now_s + AGAIN_S, self.latest_s)
             return replace(self, ask_s=ask_s, kill_s=ask_s + KILL_AFTER_S), None
-        if self.last is Do.ASK and busy and not self.in_haste and now_s < self.ask_s + TIP_S:
-            return replace(self, kill_s=min(now_s + AGAIN_S, self.ask_s + TIP_S)), None
+        if self.last is Do.ASK and not self.in_haste:
+            kill_s = min(now_s + AGAIN_S, self.ask_s + TIP_S) if busy else self.busy_s + KILL_AFTER_S
+            if now_s < kill_s:
+                return replace(seen, kill_s=kill_s), None
         do = {None: Do.ASK, Do.ASK: Do.KILL, Do.KILL: Do.LEAVE}[self.last]
         return replace(self, last=do), do

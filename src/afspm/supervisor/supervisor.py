@@ -375,7 +375,7 @@ class Supervisor:
             self._look_after_the_last(now_s)
         busy = self._waited_for(ending, now_s)
         self._ending, do = ending.step(now_s, busy=bool(busy))
-        if do is None and self._ending != ending and not self._has_told_waiting:
+        if busy and self._ending.deadline_s() != ending.deadline_s() and do is None and not self._has_told_waiting:
             self._has_told_waiting = True
             told = f"waiting for {', '.join(busy)} to finish; Ctrl-C ends it now"
             self._log.write(SUPERVISOR, logging.INFO, told)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pytest
+
 from afspm.supervisor.ending import FAREWELL_S, KILL_AFTER_S, LEAVE_AFTER_S, OWN_PACE_S, TIP_S, Do, Ending, Why
 
 
@@ -64,6 +66,17 @@ def test_who_sees_to_the_tip_is_not_killed_meanwhile_but_not_for_ever() -> None:
         now_s = deadline_s
         ending, do = ending.step(now_s, busy=True)
     assert (do, now_s) == (Do.KILL, 100.0 + TIP_S)
+
+
+def test_who_has_seen_to_the_tip_has_as_long_to_end_as_everybody_else() -> None:
+    for busy_until_s in (101.4, 105.0):  # before others are killed, and after
+        ending, do = Ending.begin(Why.STOPPED, "", 100.0).step(100.0)
+        for tenth in range(1001, 1200):
+            now_s = tenth / 10
+            ending, do = ending.step(now_s, busy=now_s <= busy_until_s)
+            if do:
+                break
+        assert (do, now_s) == (Do.KILL, pytest.approx(busy_until_s + KILL_AFTER_S))
 
 
 def test_each_stage_comes_once_and_in_its_time() -> None:
