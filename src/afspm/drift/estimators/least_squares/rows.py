@@ -35,11 +35,16 @@ def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
     root = np.sqrt(weight)[:, None, :]
     x = np.linspace(-1.0, 1.0, columns.shape[2])
     rows, lines = columns * root, np.concatenate([root, root * x], axis=1)
-    rows_q, lines_q = (rows, lines) if metric is None else (rows @ metric, lines @ metric)
+    rows_q, lines_q = (rows, lines) if metric is None else (_along_rows(rows, metric), _along_rows(lines, metric))
     gram = lines @ lines_q.transpose(0, 2, 1) + 1e-9 * np.eye(2)  # there may be rows of which nothing is known
     fitted = np.linalg.solve(gram, lines_q @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
     found: Array = (rows_q - fitted @ lines_q) * root
     return found
+
+
+def _along_rows(columns: Array, metric: Array) -> Array:
+    """Q f of each column: one large product takes a quarter of the time of one for each row."""
+    return (columns.reshape(-1, metric.shape[0]) @ metric).reshape(columns.shape)
 
 
 def without_lines(values: Array, known: NDArray[np.bool_]) -> Array:
