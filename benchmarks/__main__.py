@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import signal
 import sys
 from pathlib import Path
 
@@ -51,4 +52,7 @@ def _line(row: Row) -> str:
 
 
 if __name__ == "__main__":
+    # a shell that runs this in the background ignores Ctrl-C for it, and so would the experiments that it ends that way
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.exit(main(sys.argv[1:]))

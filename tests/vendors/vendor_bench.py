@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import os
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -16,6 +14,7 @@ from threading import Condition, Event, Thread
 from typing import IO, Any, ClassVar, Generic, TypeVar
 
 import zmq
+from hosts import host
 
 from afspm import wire
 from afspm.clock import ExperimentClock
@@ -159,14 +158,12 @@ class TranslatorProcess:
             state_dir=str(folder / "state"),
             simulated=clock.real_s(1.0) != 1.0,
         )
-        command = [sys.executable, "-m", "afspm.runtime.host"]
         # where the lock on the controller lies, which one that is killed leaves behind
         own = {**os.environ, "TMPDIR": str(folder), "TEMP": str(folder)}
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, env=own)
+        self._process = host(own)
         self._listening = Thread(target=(said or Said()).listen, args=(self._process.stderr,))
         self._listening.start()
         stack.callback(self._end)
-        assert self._process.stdin is not None
         self._process.stdin.write(launch.to_json().encode() + b"\n")
         self._process.stdin.flush()
         self.peer = Peer(serve, publish)
@@ -179,7 +176,6 @@ class TranslatorProcess:
 
     def _end(self) -> None:
         self.kill()
-        assert self._process.stdin is not None
         self._process.stdin.close()
 
 
