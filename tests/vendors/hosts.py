@@ -28,7 +28,7 @@ class Host(Protocol):
 
 def host(environment: Mapping[str, str]) -> Host:
     """A process as `python -m afspm.runtime.host` is one; where the system can, forked from one that has imported what
-    all of them need (a tenth of the time; how one starts by itself is what the tests of experiments see to)."""
+    all of them need. (How one starts by itself is what the tests of experiments see to.)"""
     if "forkserver" in multiprocessing.get_all_start_methods():
         return _Forked(environment)
     pipes: Any = subprocess.Popen(
