@@ -34,6 +34,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
+from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
@@ -145,6 +146,8 @@ class TranslatorProcess:
         stack: ExitStack,
         clock: ExperimentClock,
         said: Said | None = None,
+        *,
+        retracts: bool = False,
     ) -> None:
         ports = FreePorts()
         serve, publish = f"tcp://127.0.0.1:{ports.take()}", f"tcp://127.0.0.1:{ports.take()}"
@@ -157,6 +160,7 @@ class TranslatorProcess:
             run_dir=str(folder),
             state_dir=str(folder / "state"),
             simulated=clock.real_s(1.0) != 1.0,
+            retracts=retracts,
         )
         # where the lock on the controller lies, which one that is killed leaves behind
         own = {**os.environ, "TMPDIR": str(folder), "TEMP": str(folder)}
@@ -173,6 +177,13 @@ class TranslatorProcess:
         self._process.kill()
         self._process.wait(DEADLINE_S)
         self._listening.join(DEADLINE_S)
+
+    def let_go(self) -> int:
+        """End its standard input, as a run that is stopped does; returns the exit code."""
+        self._process.stdin.close()
+        code = self._process.wait(DEADLINE_S)
+        self._listening.join(DEADLINE_S)
+        return code
 
     def _end(self) -> None:
         self.kill()
@@ -248,15 +259,21 @@ class VendorBench(Generic[Emulated]):
         fault = Fault(kind, 0.0, count, duration_s)
         self.at_panel(lambda emulator: emulator.faults.demand(fault, self.clock.now_s()))
 
-    def start(self, **settings: Any) -> Peer:
+    def start(self, *, retracts: bool = False, **settings: Any) -> Peer:
         """The translator, as a process of its own."""
         given = {"address": self.address, **self.settings, **settings}
-        self._process = TranslatorProcess(self.translator, given, self.folder, self._stack, self.clock, self._said)
+        self._process = TranslatorProcess(
+            self.translator, given, self.folder, self._stack, self.clock, self._said, retracts=retracts
+        )
         return self._process.peer
 
     def kill(self) -> None:
         """The translator."""
         self._process.kill()
+
+    def let_go(self) -> int:
+        """Stop the translator as a run that is stopped does; returns its exit code."""
+        return self._process.let_go()
 
     def said(self) -> str:
         """The translator's log: all of it once it is killed, before that as far as it has come."""
@@ -330,6 +347,18 @@ def moved(peer: Peer, x_m: float, y_m: float) -> list[Any]:
     heard = peer.until(ScopeState.FREE)
     assert states(heard) == ["MOVING", "FREE"]
     return heard
+
+
+def left_in_danger(made: VendorBench[Any], *, scanning: bool, retracts: bool) -> None:
+    """A run is stopped while the feedback is off, which one of its components has switched off."""
+    peer = made.start(retracts=retracts)
+    ready(peer, shape=(64, 32))
+    assert peer.set(names.FEEDBACK_ON, False).ok
+    if scanning:
+        assert peer.act(names.START_SCAN).ok
+        peer.until(ScopeState.SCANNING)
+    assert made.emulator.rig.engaged
+    assert made.let_go() == ExitCode.ORPHAN
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from asylum_bench import Bench, Emulated
-from vendor_bench import FLAT, SHAPE, TURNED, Peer, moved, ready, scanned, states
+from vendor_bench import FLAT, SHAPE, TURNED, Peer, left_in_danger, moved, ready, scanned, states
 
 from afspm.emulators.asylum.wire import Failed
 from afspm.files import read
@@ -258,6 +258,20 @@ def test_switching_feedback_on_waits_until_the_tip_is_there(bench: Make) -> None
     peer.until(FREE)
     response = peer.set(names.FEEDBACK_ON, True)
     assert response.ok, response.reason
+    assert made.emulator.rig.engaged
+
+
+@pytest.mark.parametrize("scanning", [False, True])
+def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make, scanning: bool) -> None:
+    made = bench(speed=5.0)
+    left_in_danger(made, scanning=scanning, retracts=True)
+    assert not made.emulator.rig.engaged
+    assert "the run is stopped with the feedback off: the tip is retracted" in made.said()
+
+
+def test_a_tip_without_feedback_stays_where_the_file_says_so(bench: Make) -> None:
+    made = bench(speed=5.0)
+    left_in_danger(made, scanning=False, retracts=False)
     assert made.emulator.rig.engaged
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from nanonis_bench import Bench
-from vendor_bench import FLAT, SHAPE, TURNED, moved, ready, scanned, states
+from vendor_bench import FLAT, SHAPE, TURNED, left_in_danger, moved, ready, scanned, states
 
 from afspm.files import read
 from afspm.model import (
@@ -292,6 +292,20 @@ def test_retracting_breaks_a_scan_off(bench: Make) -> None:
     assert states(heard)[:2] == ["SCANNING", "INTERRUPTED"]
     assert not any(isinstance(one, Scan) for one in heard)
     assert not made.emulator.rig.engaged
+
+
+@pytest.mark.parametrize("scanning", [False, True])
+def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make, scanning: bool) -> None:
+    made = bench(speed=5.0)
+    left_in_danger(made, scanning=scanning, retracts=True)
+    assert not made.emulator.rig.engaged
+    assert "the run is stopped with the feedback off: the tip is retracted" in made.said()
+
+
+def test_a_tip_without_feedback_stays_where_the_file_says_so(bench: Make) -> None:
+    made = bench(speed=5.0)
+    left_in_danger(made, scanning=False, retracts=False)
+    assert made.emulator.rig.engaged
 
 
 def test_drift_compensation_is_switched_on_by_a_rate_and_off_by_none(bench: Make) -> None:
