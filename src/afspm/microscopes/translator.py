@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from afspm.runtime.process import Context
 
 _RECONNECT_S = 1.0
+_TIP_S = 8.0
+"""So long, real time, it is tried to retract the tip when the run is stopped: a controller may be lost just then, or
+refuse. A little less than `runtime.parent` leaves."""
 _STARTS_S = 2.0
 """So long, real time, a controller may take that is started together with its translator (an emulated one): until then
 it is looked for every `_SOON_S`, and nothing is wrong."""
@@ -334,15 +337,28 @@ class Translator:
     def _leave(self) -> None:
         """Nobody is there any more. What is switched off at the panel is for whoever is at the panel."""
         self._trusting(self._stop_measuring)
-        if not (self._retracts and self._kept.get("feedback_off")):
-            return
+        until_s = self._clock.monotonic_s() + _TIP_S
+        while self._retracts and (self._kept.get("feedback_off") or self._may_have_switched):
+            off = "off" if self._kept.get("feedback_off") else "perhaps off"
+            why_not = self._retracted() if off == "off" else f"it is not known: {self._why_lost}"
+            if not why_not:
+                self._log.warning("the run is stopped with the feedback off: the tip is retracted")
+                return
+            if self._clock.monotonic_s() >= until_s:
+                told = "the run is stopped with the feedback %s, and the tip can't be retracted: %s"
+                self._log.critical(told, off, why_not)
+                return
+            self._port.poll(_RECONNECT_S)  # whoever asks for something now gets no answer
+            self.look()
+
+    def _retracted(self) -> str:
+        """Why the tip can't be retracted; empty: it is."""
         answered: list[Response] = []
         self._trusting(lambda: answered.append(self._retract()))
-        if answered and answered[0].ok:
-            self._log.warning("the run is stopped with the feedback off: the tip is retracted")
-        else:
-            why = answered[0].reason if answered else self._why_lost
-            self._log.critical("the run is stopped with the feedback off, and the tip can't be retracted: %s", why)
+        if not answered:
+            return self._why_lost
+        response = answered[0]
+        return "" if response.ok else response.reason or str(response.code)
 
     def _retract(self) -> Response:
         if not self._connected:

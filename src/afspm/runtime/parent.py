@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 STDIN = 0
 END_WITHIN_S = 1.5
+TIP_WITHIN_S = 14.0  # for who sees to the tip first: its controller may answer slowly, or have to be found again
 _CHUNK = 1 << 16
 
 
@@ -28,12 +29,12 @@ def read_launch_line() -> bytes:
 class Parent:
     """Watches over the parent. What was registered is called, from another thread, when it has gone or lets us go.
 
-    Should the process not have ended `END_WITHIN_S` later (a handler that computes, a library that hangs), it is ended
+    Should the process not have ended `within_s` later (a handler that computes, a library that hangs), it is ended
     the hard way, with `code_if_late`.
     """
 
-    def __init__(self, code_if_late: int) -> None:
-        self._code = code_if_late
+    def __init__(self, code_if_late: int, within_s: float = END_WITHIN_S) -> None:
+        self._code, self._within_s = code_if_late, within_s
         self._callbacks: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._gone = threading.Event()
@@ -72,7 +73,7 @@ class Parent:
                 return
             self._gone.set()
             callbacks = tuple(self._callbacks)
-        end_within(END_WITHIN_S, self._code)
+        end_within(self._within_s, self._code)
         for callback in callbacks:
             callback()
 

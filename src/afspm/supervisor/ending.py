@@ -6,11 +6,13 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
+from afspm.runtime.parent import TIP_WITHIN_S
+
 OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and may finish a file
 AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
 FAREWELL_S = 60.0  # but not for ever
 KILL_AFTER_S = 1.5  # after being asked, or after having finished what may be finished then
-TIP_S = 15.0  # after being asked: so long the tip may take to be seen to, by a controller that answers slowly
+TIP_S = TIP_WITHIN_S + 1.0  # after being asked: who sees to the tip ends by itself before
 LEAVE_AFTER_S = 3.0  # after being killed
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +169,8 @@ class FakeMicroscope(Microscope):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
+        if self.lost:
+            raise ConnectionError("unplugged")
         self.done.append("retract")
 
     def command(self, text: str) -> None:
@@ -194,9 +197,17 @@ class Bench:
         self.translator = Translator(self.microscope, self.port, memory, self.folder, log, retracts=retracts)
         self.translator.look()
 
-    def run_to_the_end(self, *last: Served) -> ExitCode:
-        """Run it until it ends, after this came to it, all at once."""
-        self.port.poll = lambda timeout_s: list(last)  # type: ignore[method-assign]
+    def run_to_the_end(self, *last: Served, after_s: tuple[float, Callable[[], None]] = (math.inf, list)) -> ExitCode:
+        """Run it until it ends, after this came to it, all at once; and some time later this happens."""
+        at_s, happens = self.clock.t_s + after_s[0], after_s[1]
+
+        def poll(timeout_s: float | None) -> list[Served]:
+            self.clock.t_s += timeout_s or 0.0
+            if self.clock.t_s >= at_s:
+                happens()
+            return list(last)
+
+        self.port.poll = poll  # type: ignore[method-assign]
         return self.translator.run()
 
     def ask(self, kind: ControlRequest, subject: Any = None, request_id: str = "", payload: bytes = b"") -> Response:

@@ -23,6 +23,7 @@ from afspm.model import (
     names,
 )
 from afspm.runtime.exit_codes import ExitCode
+from afspm.runtime.parent import TIP_WITHIN_S
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.wire.generated import feedback_pb2, scan_pb2
 
@@ -136,6 +137,23 @@ def test_without_the_feedback_that_a_request_has_switched_off_the_tip_is_retract
     assert "the feedback off: the tip is retracted" in caplog.text
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_controller_that_is_lost_or_refuses_when_the_run_is_stopped_is_asked_again(
+    bench: Any, caplog: pytest.LogCaptureFixture, lost: bool
+) -> None:
+    switched(bench, "false")
+    bench.microscope.lost = lost
+    bench.microscope.lacking = {} if lost else {names.RETRACT: "it is not possible now"}
+
+    def is_back() -> None:
+        bench.microscope.lost, bench.microscope.lacking = False, {}
+
+    assert bench.run_to_the_end(ParentGone(), after_s=(3.0, is_back)) == ExitCode.ORPHAN
+    assert bench.microscope.done == ["retract"]
+    assert "the feedback off: the tip is retracted" in caplog.text
+    assert "CRITICAL" not in caplog.text
+
+
 def test_the_tip_stays_where_the_feedback_is_on_or_was_switched_off_by_others(bench: Any) -> None:
     def left() -> list[str]:
         assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
@@ -186,7 +204,9 @@ def test_that_a_tip_without_feedback_can_not_be_retracted_is_critical(
     switched(bench, "false")
     bench.microscope.lost = lost
     bench.microscope.lacking = {names.RETRACT: "it has no coarse motor"}
+    began_s = bench.clock.t_s
     assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    assert 8.0 <= bench.clock.t_s - began_s < TIP_WITHIN_S, "it ends before it is ended"
     last = caplog.records[-1]
     assert last.levelname == "CRITICAL"
     assert ("unplugged" if lost else "it has no coarse motor") in last.getMessage()

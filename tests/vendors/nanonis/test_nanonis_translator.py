@@ -24,6 +24,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.runtime.exit_codes import ExitCode
 
 Make = Callable[..., Bench]
 
@@ -298,6 +299,20 @@ def test_retracting_breaks_a_scan_off(bench: Make) -> None:
 def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make, scanning: bool) -> None:
     made = bench(speed=5.0)
     left_in_danger(made, scanning=scanning, retracts=True)
+    assert not made.emulator.rig.engaged
+    assert "the run is stopped with the feedback off: the tip is retracted" in made.said()
+
+
+@pytest.mark.parametrize("kind", ["slow", "dialog", "refused", "cut"])
+def test_it_is_retracted_also_by_a_nanonis_that_is_slow_or_refuses_or_is_not_there_just_then(
+    bench: Make, kind: str
+) -> None:
+    made = bench(speed=5.0)
+    peer = made.start(retracts=True)
+    ready(peer)
+    assert peer.set(names.FEEDBACK_ON, False).ok
+    made.strike(kind, count=2, duration_s=10.0)  # two seconds, real time
+    assert made.let_go() == ExitCode.ORPHAN
     assert not made.emulator.rig.engaged
     assert "the run is stopped with the feedback off: the tip is retracted" in made.said()
 
