@@ -7,11 +7,9 @@ from typing import Any
 
 import pytest
 
-from afspm.clock import ExperimentClock
 from afspm.runtime.exit_codes import ExitCode
 
 GUARD = [sys.executable, "-m", "afspm.runtime.guard"]
-CLOCK = ExperimentClock.real()
 
 # other languages have no Python: these use nothing of ours
 ECHO = "import sys; print(sys.stdin.readline().strip(), flush=True); print('eof', repr(sys.stdin.read()), flush=True)"
@@ -41,10 +39,8 @@ def test_the_exit_code_is_passed_on(start: Any) -> None:
 def test_one_that_does_not_listen_is_ended(start: Any) -> None:
     child = start([*GUARD, *python(DEAF)], "{}")
     child.expect("deaf")
-    began_s = CLOCK.monotonic_s()
     child.let_go()
     assert child.exit_code() == ExitCode.ORPHAN
-    assert CLOCK.monotonic_s() - began_s < 1.9
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")

@@ -27,11 +27,9 @@ def part(name: str, **launch: Any) -> Launch:
 def test_a_component_ends_cleanly_when_its_parent_lets_go(host: Host) -> None:
     child = host(part("Diary"))
     child.expect("start")
-    began_s = CLOCK.monotonic_s()
     child.let_go()
     child.expect("end")
     assert child.exit_code() == ExitCode.ORPHAN
-    assert CLOCK.monotonic_s() - began_s < 2.0
     assert child.error_text == ""
 
 
@@ -39,10 +37,8 @@ def test_a_component_ends_cleanly_when_its_parent_lets_go(host: Host) -> None:
 def test_one_that_does_not_end_by_itself_is_ended(host: Host, name: str) -> None:
     child = host(part(name))
     child.expect("st")
-    began_s = CLOCK.monotonic_s()
     child.let_go()
     assert child.exit_code() == ExitCode.ORPHAN
-    assert CLOCK.monotonic_s() - began_s < 2.0
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")

@@ -129,14 +129,12 @@ def test_a_component_that_is_done_does_not(run_tasks: RunTasks) -> None:
     assert running.stop().why is Why.STOPPED
 
 
-def test_stopping_takes_about_two_seconds_at_most(run_tasks: RunTasks) -> None:
+def test_who_does_not_end_when_asked_is_killed_and_the_others_end_by_themselves(run_tasks: RunTasks) -> None:
+    """How long that takes, the benchmarks say."""
     running = run_tasks(peer("waits"), peer("deaf", first="deaf"))
     running.terminal.wait_for(" waits ", "life 1")
     running.terminal.wait_for(" deaf ", "life 1")
-    clock = ExperimentClock.real()
-    began_s = clock.monotonic_s()
     outcome = running.stop()
-    assert clock.monotonic_s() - began_s < 5.0  # two seconds, and some for a busy computer
     assert outcome.why is Why.STOPPED
     waits, deaf = outcome.reports
     assert waits.last_exit == "ended as it was asked to"  # by itself, since its stdin was closed
