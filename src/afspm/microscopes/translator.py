@@ -121,6 +121,10 @@ class Translator:
             self.microscope.close()
             self._port.close()
 
+    def leaves_danger(self) -> bool:
+        """Whether, as it ends, it has to retract the tip first. May be called from another thread."""
+        return self._retracts and (bool(self._kept.get("feedback_off")) or self._may_have_switched)
+
     def handle(self, arrived: RequestReceived | SubscriberJoined) -> None:
         """One thing that came over the network."""
         if isinstance(arrived, RequestReceived):
@@ -338,7 +342,7 @@ class Translator:
         """Nobody is there any more. What is switched off at the panel is for whoever is at the panel."""
         self._trusting(self._stop_measuring)
         until_s = self._clock.monotonic_s() + _TIP_S
-        while self._retracts and (self._kept.get("feedback_off") or self._may_have_switched):
+        while self.leaves_danger():
             off = "off" if self._kept.get("feedback_off") else "perhaps off"
             why_not = self._retracted() if off == "off" else f"it is not known: {self._why_lost}"
             if not why_not:
@@ -482,4 +486,6 @@ def _run_alone(microscope: Microscope, context: Context, make: Callable[..., Tra
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     run_dir = Path(launch.run_dir or ".")
     step = context.activity.step
-    return make(microscope, port, memory, run_dir, context.log, step, retracts=launch.retracts).run()
+    translator = make(microscope, port, memory, run_dir, context.log, step, retracts=launch.retracts)
+    context.tip_in_danger(translator.leaves_danger)
+    return translator.run()

@@ -20,7 +20,7 @@ from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch
 from afspm.runtime.loading import load
 from afspm.runtime.messages import register_all
-from afspm.runtime.parent import END_WITHIN_S, TIP_WITHIN_S, Parent, end_within, read_launch_line
+from afspm.runtime.parent import Parent, end_within, read_launch_line
 from afspm.runtime.process import Activity, Context
 from afspm.runtime.stopping import StopRequested
 from afspm.runtime.view import KEPT
@@ -44,7 +44,7 @@ def main() -> int:
         return ExitCode.CONFIG
     logger = log.set_up(launch.name, launch.log_level)
     _allow_many_connections()
-    parent = Parent(ExitCode.ORPHAN, TIP_WITHIN_S if launch.retracts else END_WITHIN_S)
+    parent = Parent(ExitCode.ORPHAN)
     parent.watch()
     signal.signal(signal.SIGTERM, lambda *_: parent.let_go())
     _detach_stdin()
@@ -78,6 +78,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
             log=logger,
             activity=activity,
             when_stopping=parent.when_gone,
+            tip_in_danger=parent.tip_in_danger,
             session=os.urandom(4).hex(),
         )
         return process.run_process(context)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 STDIN = 0
 END_WITHIN_S = 1.5
-TIP_WITHIN_S = 14.0  # for who sees to the tip first: its controller may answer slowly, or have to be found again
+TIP_WITHIN_S = 14.0  # with a tip to see to first: its controller may answer slowly, or have to be found again
 _CHUNK = 1 << 16
 
 
@@ -29,12 +29,13 @@ def read_launch_line() -> bytes:
 class Parent:
     """Watches over the parent. What was registered is called, from another thread, when it has gone or lets us go.
 
-    Should the process not have ended `within_s` later (a handler that computes, a library that hangs), it is ended
-    the hard way, with `code_if_late`.
+    Should the process not have ended `END_WITHIN_S` later (a handler that computes, a library that hangs), it is ended
+    the hard way, with `code_if_late`; `TIP_WITHIN_S` later, if the tip is in danger then.
     """
 
-    def __init__(self, code_if_late: int, within_s: float = END_WITHIN_S) -> None:
-        self._code, self._within_s = code_if_late, within_s
+    def __init__(self, code_if_late: int) -> None:
+        self._code = code_if_late
+        self._tip_in_danger: Callable[[], bool] = lambda: False
         self._callbacks: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._gone = threading.Event()
@@ -55,6 +56,10 @@ class Parent:
         if gone:
             callback()
 
+    def tip_in_danger(self, whether: Callable[[], bool]) -> None:
+        """Register what says so; it is called once, from another thread."""
+        self._tip_in_danger = whether
+
     def let_go(self) -> None:
         """Behave as if the parent had gone. May be called from a signal handler."""
         threading.Thread(target=self._went, name="let-go", daemon=True).start()
@@ -73,7 +78,7 @@ class Parent:
                 return
             self._gone.set()
             callbacks = tuple(self._callbacks)
-        end_within(self._within_s, self._code)
+        end_within(TIP_WITHIN_S if self._tip_in_danger() else END_WITHIN_S, self._code)
         for callback in callbacks:
             callback()
 

@@ -73,7 +73,7 @@ class _Waiting(_Block):
         self._activity.since_s = None if self._before is None else self._clock.monotonic_s()
 
 
-def _never(_: Callable[[], None]) -> None:
+def _never(_: Callable[[], object]) -> None:
     """Nobody asks a process to stop that has no host."""
 
 
@@ -89,6 +89,8 @@ class Context:
         activity: to be told of steps that take time.
         when_stopping: registers what is called, from another thread, when the parent has gone or wants us to stop
             (a port made by `open_port` is told by itself).
+        tip_in_danger: registers what says, then and from another thread, whether there is a tip to see to, which takes
+            longer than an end is given.
         session: differs between two lives of a process, for ids that must not meet.
         problems: the problems of the experiment by name.
 
@@ -102,6 +104,7 @@ class Context:
     log: logging.Logger
     activity: Activity
     when_stopping: Callable[[Callable[[], None]], None] = _never
+    tip_in_danger: Callable[[Callable[[], bool]], None] = _never
     session: str = "0"
     problems: ProblemNames = field(init=False)
 
