@@ -43,7 +43,7 @@ class Ending:
     def end(self) -> None:
         """Give the answers that were kept back."""
         self.by_s = None
-        if self._watchdog.wants_retract:
+        if self._watchdog.owes_retract:
             danger = "the experiment ends, and the tip was left in danger: the microscope did not retract it"
             self._desk.effects.append(Log("CRITICAL", danger))
         for kept in self._kept:

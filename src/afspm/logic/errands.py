@@ -45,8 +45,11 @@ class Errands:
         if not self._forwarder.up:
             self._watchdog.unsent()
             return None
-        result = self._watchdog.answered(response.code)
+        result = self._watchdog.answered(response.code, now_s)
         self.send(now_s)
         if result is Result.FAILED:
-            return Log("ERROR", f"the microscope does not {job.request.subject}: {response.reason or response.code}")
+            due_s = self._watchdog.due_s
+            again = "" if due_s is None else f"; it is asked again in {due_s - now_s:.0f} s, unless somebody sees to it"
+            why = response.reason or response.code
+            return Log("ERROR", f"the microscope does not {job.request.subject}: {why}{again}")
         return Log("INFO", f"{job.request.subject}: done") if result is Result.DONE else None

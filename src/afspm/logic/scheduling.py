@@ -182,6 +182,7 @@ class SchedulerCore:
             self._desk.unclear_until_s(),
             self._desk.mover.due_s(),
             self._malfunction()[0],
+            self._watchdog.due_s,
             self._entries_due_s(),
         )
         for deadline_s in others_s:
@@ -201,6 +202,7 @@ class SchedulerCore:
             "recent": self._cache.recent(),
             "wanted": list(self._watchdog.wanted),
             "left_to_people": self._watchdog.left_to_people,
+            "put_off": self._watchdog.put_off,
             "supervisors": self._bulletin.telling.snapshot(),
             **self._desk.snapshot(),
             **({} if self._frame is None else {"frame": self._frame.snapshot()}),
@@ -215,8 +217,9 @@ class SchedulerCore:
         self._is_restarted = True
         self._arbiter.restore(state)
         self._cache.not_before(int(state["last_ns"]))
-        left_to_people = bool(state.get("left_to_people"))  # not in what a scheduler wrote that was older
-        self._watchdog.restore(map(str, state["wanted"]), left_to_people=left_to_people)
+        left_to_people, put_off = (bool(state.get(key)) for key in ("left_to_people", "put_off"))  # older: not there
+        attended = put_off and self._is_attended()
+        self._watchdog.restore(map(str, state["wanted"]), left_to_people=left_to_people, attended=attended)
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
         self._bulletin.telling.restore(state.get("supervisors", {}))
         self._desk.restore(state)
@@ -415,6 +418,14 @@ class SchedulerCore:
                 )
             self._arbiter.decide(Ask(Event.FLAG, told_by, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
             return
+        retract_at_s = self._watchdog.due_s
+        if retract_at_s is not None and now_s >= retract_at_s:
+            told = self._watchdog.try_again(now_s, attended=self._is_attended())
+            if told is not None:
+                self._log("CRITICAL", told)
+            self._effects.append(self._save())
+            self._desk.errands.send(now_s)
+            return
         holder = self.control.holder
         dead_at_s = self._absence.dead_at_s(holder)
         if holder is not None and dead_at_s is not None and now_s >= dead_at_s:
@@ -430,6 +441,10 @@ class SchedulerCore:
 
     def _holder(self) -> str | None:
         return self.control.holder
+
+    def _is_attended(self) -> bool:
+        """Somebody is in control, or a person at the microscope."""
+        return self.control.holder is not None or self.control.mode is ControlMode.MANUAL
 
     def _save(self) -> SaveState:
         return SaveState(self.snapshot())

@@ -32,12 +32,16 @@ class WatchdogSettings:
             "feedback-off".
         retract: the action that does it; None: never.
         attempts: how often an action that gets no response is tried.
+        again_s: after how long (real) a tip that was not retracted is tried to be again; twice as long each time.
+        longest_s: but never longer than this.
     """
 
     stop_when: Collection[Cause] = _DEFAULT_STOPS
     dangerous: Collection[str] = frozenset({ScopeState.COARSE_MOTOR.name, FEEDBACK_OFF})
     retract: str | None = names.RETRACT
     attempts: int = 3
+    again_s: float = 10.0
+    longest_s: float = 300.0
 
 
 class Result(Enum):
@@ -52,7 +56,8 @@ class Watchdog:
     """Knows what the microscope is doing, and what the scheduler wants it to do.
 
     The caller sends `next_action()` before anything else, reports by `answered`, and lets nobody command while it
-    `wants_retract`.
+    `wants_retract`. A tip that the microscope does not retract stays wanted away: others may command, and unless one of
+    them sees to it `try_again` is called when it is `due_s`.
     """
 
     def __init__(self, settings: WatchdogSettings | None = None) -> None:
@@ -69,6 +74,10 @@ class Watchdog:
         self._danger_told: str | None = None
         self._refused_at = -1  # states seen when the microscope last was not free
         self._left_to_people = False
+        self._put_off = False  # the tip is in danger still, and is tried to be retracted later
+        self._due_s: float | None = None
+        self._again_s = self._settings.again_s
+        self._unstoppable = False  # what runs
 
     @property
     def retract(self) -> str | None:
@@ -85,8 +94,18 @@ class Watchdog:
         """It has retracted the tip, or could not, and nobody was called yet: to go on is for a person to decide."""
         return self._left_to_people
 
-    def restore(self, wanted: Iterable[str], *, left_to_people: bool = False) -> None:
-        self._wanted = list(wanted)
+    @property
+    def put_off(self) -> bool:
+        """The microscope did not retract the tip: others may see to it."""
+        return self._put_off
+
+    def restore(self, wanted: Iterable[str], *, left_to_people: bool = False, attended: bool = False) -> None:
+        """Want what a scheduler wanted before.
+
+        Args:
+            attended: retracting was put off, and somebody sees to the tip.
+        """
+        self._wanted = [action for action in wanted if not (attended and action == self._settings.retract)]
         self._left_to_people = left_to_people
 
     def leave_to_people(self) -> None:
@@ -99,7 +118,32 @@ class Watchdog:
 
     @property
     def wants_retract(self) -> bool:
+        """The tip is being retracted."""
+        return self.owes_retract and not self._put_off
+
+    @property
+    def owes_retract(self) -> bool:
+        """The tip is to be retracted, now or later."""
         return self._settings.retract in self._wanted
+
+    @property
+    def due_s(self) -> float | None:
+        """When, real, `try_again` is to be called; None: not."""
+        return self._due_s
+
+    def try_again(self, now_s: float, *, attended: bool) -> str | None:
+        """The tip that was not retracted is tried to be, unless it is out of danger, or somebody has `attended` to it.
+
+        Returns:
+            what people are to be told, if it is that the microscope is still not free for that.
+        """
+        if not self._put_off:
+            self._retract_later(now_s)
+            return f"{self.danger}, and the microscope is not free to retract the tip" if self.danger else None
+        self._put_off, self._due_s, self._refused_at = False, None, -1
+        if attended or self.danger is None:
+            self._forget_retract()
+        return None
 
     @property
     def state(self) -> ScopeState:
@@ -114,6 +158,7 @@ class Watchdog:
         self._state = state
         self._states_seen += 1
         self._starting = None
+        self._unstoppable = False
         self._see_danger()
         if state is ScopeState.FREE and not self._sent:  # it ended while the translator could not be told to stop it
             self._wanted = [action for action in self._wanted if action not in _STOP.values()]
@@ -180,6 +225,8 @@ class Watchdog:
         retract = self._settings.retract if self._can_retract and (had_died or not knows) else None
         if self.danger is None:
             retract = None
+        if self._put_off:
+            self._forget_retract()
         if stop is not None and (cause in self._settings.stop_when or retract is not None):
             wanted.append(stop)
         if retract is not None:
@@ -189,31 +236,39 @@ class Watchdog:
 
     def next_action(self) -> str | None:
         """The action to send now, if one is; it counts as sent."""
-        if self._sent or not self._wanted or self._refused_at == self._states_seen:
+        if self._sent or not self._wanted or self._put_off or self._refused_at == self._states_seen:
             return None
         action = self._wanted[0]
-        if action == self._settings.retract and self._state in _STOP:
+        if action == self._settings.retract and self._state in _STOP and not self._unstoppable:
             return None  # it is being stopped
-        self._sent = True
+        self._sent, self._due_s = True, None
         return action
 
-    def answered(self, code: int) -> Result:
+    def answered(self, code: int, now_s: float) -> Result:
         """The translator answered what was sent (or NO_RESPONSE)."""
         self._sent = False
+        is_retract = self._wanted[0] == self._settings.retract
         if code == ControlResponse.SUCCESS:
             self._starting = None
-            if self._wanted[0] == self._settings.retract:
+            if is_retract:
                 self._is_away = True
                 self._see_danger()
+                self._left_to_people = True
             self._forget()
             return Result.DONE
         if code == ControlResponse.NOT_FREE:
             self._refused_at = self._states_seen
+            self._due_s = now_s + self._settings.again_s if is_retract else None
             return Result.AGAIN
         self._attempts += 1
         if code == ControlResponse.NO_RESPONSE and self._attempts < self._settings.attempts:
             return Result.AGAIN
-        self._forget()
+        if is_retract and code != ControlResponse.ACTION_NOT_SUPPORTED:
+            self._retract_later(now_s)
+        else:
+            self._unstoppable = not is_retract
+            self._left_to_people |= is_retract
+            self._forget()
         return Result.FAILED
 
     def unsent(self) -> None:
@@ -223,8 +278,21 @@ class Watchdog:
         self._refused_at = -1
 
     def _forget(self) -> None:
-        self._left_to_people |= self._wanted.pop(0) == self._settings.retract
+        """What was answered is not wanted any more."""
+        if self._wanted.pop(0) == self._settings.retract:
+            self._again_s = self._settings.again_s
         self._attempts = 0
+
+    def _retract_later(self, now_s: float) -> None:
+        self._put_off, self._left_to_people = True, True
+        self._due_s = now_s + self._again_s
+        self._again_s = min(2 * self._again_s, self._settings.longest_s)
+        self._attempts = 0
+
+    def _forget_retract(self) -> None:
+        self._wanted = [action for action in self._wanted if action != self._settings.retract]
+        self._put_off, self._due_s = False, None
+        self._again_s = self._settings.again_s
 
 
 def feedback_of(request: Request) -> Feedback | None:

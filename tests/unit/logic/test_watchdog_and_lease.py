@@ -60,15 +60,15 @@ def test_a_dead_holder_s_tip_is_retracted_in_a_dangerous_state_once_it_has_stopp
     assert dog.wants_retract
     assert dog.next_action() == "stop-scan"
     assert dog.next_action() is None
-    assert dog.answered(OK) is Result.DONE
+    assert dog.answered(OK, 0.0) is Result.DONE
     assert dog.next_action() is None
     dog.scope_is(ScopeState.INTERRUPTED)
     assert dog.next_action() == "x-retract"
-    assert dog.answered(NOT_FREE) is Result.AGAIN
+    assert dog.answered(NOT_FREE, 0.0) is Result.AGAIN
     assert dog.next_action() is None
     dog.scope_is(FREE)
     assert dog.next_action() == "x-retract"
-    assert dog.answered(OK) is Result.DONE
+    assert dog.answered(OK, 0.0) is Result.DONE
     assert not dog.wants_retract
 
 
@@ -103,7 +103,7 @@ def test_a_danger_that_is_seen_to_is_not_told_nor_seen_to_again() -> None:
     dog.control_taken(Cause.PROBLEM, None)
     assert dog.left_in_danger() is None
     assert dog.next_action() == "x-retract"
-    assert dog.answered(OK) is Result.DONE
+    assert dog.answered(OK, 0.0) is Result.DONE
     assert dog.left_in_danger() is None
     assert dog.control_taken(Cause.ENDED, None) == []
 
@@ -112,7 +112,7 @@ def retracted() -> Watchdog:
     dog = off(FREE)
     dog.control_taken(Cause.PROBLEM, None)
     dog.next_action()
-    dog.answered(OK)
+    dog.answered(OK, 0.0)
     dog.scope_is(ScopeState.COARSE_MOTOR)
     dog.feedback_is(Feedback(on=False))  # as a controller says that has withdrawn its tip
     return dog
@@ -163,7 +163,7 @@ def test_silence_is_tried_again_and_given_up_loudly() -> None:
     results = []
     for _ in range(3):
         assert dog.next_action() == "stop-scan"
-        results.append(dog.answered(SILENCE))
+        results.append(dog.answered(SILENCE, 0.0))
     assert results == [Result.AGAIN, Result.AGAIN, Result.FAILED]
     assert dog.wanted == ()
 
@@ -177,6 +177,92 @@ def test_what_could_not_be_sent_is_sent_when_the_translator_is_back_unless_it_is
     dog.unsent()
     dog.scope_is(FREE)
     assert dog.next_action() is None
+
+
+ERROR = int(ControlResponse.ACTION_ERROR)
+
+
+def refused(**settings: object) -> Watchdog:
+    """One whose tip the microscope did not retract, at 100 s."""
+    dog = off(FREE, **settings)
+    dog.control_taken(Cause.DEAD, None)
+    assert dog.next_action() == "x-retract"
+    assert dog.answered(ERROR, 100.0) is Result.FAILED
+    return dog
+
+
+def test_a_tip_that_was_not_retracted_is_tried_again_and_again_ever_less_often() -> None:
+    dog = refused(again_s=10.0, longest_s=30.0)
+    times, now_s = [], 100.0
+    for _ in range(4):
+        assert dog.left_to_people
+        assert dog.next_action() is None
+        assert not dog.wants_retract, "others may command meanwhile"
+        assert dog.due_s is not None
+        times.append(dog.due_s - now_s)
+        now_s = dog.due_s
+        dog.try_again(now_s, attended=False)
+        assert dog.wants_retract
+        assert dog.next_action() == "x-retract"
+        assert dog.answered(ERROR, now_s) is Result.FAILED
+    assert times == [10.0, 20.0, 30.0, 30.0]
+    dog.try_again(now_s + 30.0, attended=False)
+    assert dog.next_action() == "x-retract"
+    assert dog.answered(OK, now_s + 30.0) is Result.DONE
+    assert (dog.due_s, dog.danger, dog.owes_retract) == (None, None, False)
+
+
+def test_who_is_there_to_see_to_a_tip_is_not_disturbed() -> None:
+    dog = refused()
+    dog.try_again(110.0, attended=True)
+    assert (dog.next_action(), dog.due_s) == (None, None)
+    for cause in (Cause.MANUAL, Cause.RELEASED):
+        dog = refused()
+        dog.control_taken(cause, None)
+        assert (dog.next_action(), dog.due_s) == (None, None)
+
+
+def test_who_came_to_see_to_a_tip_and_died_leaves_it_to_be_retracted_at_once() -> None:
+    dog = refused()
+    assert dog.control_taken(Cause.DEAD, None) == ["x-retract"]
+    assert dog.next_action() == "x-retract"
+
+
+def test_a_tip_that_is_out_of_danger_by_then_is_left_where_it_is() -> None:
+    dog = refused()
+    dog.feedback_is(Feedback(on=True))
+    dog.try_again(110.0, attended=False)
+    assert (dog.next_action(), dog.due_s) == (None, None)
+
+
+def test_a_microscope_that_is_never_free_for_it_is_left_to_people_and_tried_later() -> None:
+    dog = off(FREE, again_s=10.0)
+    dog.control_taken(Cause.DEAD, None)
+    dog.next_action()
+    assert dog.answered(NOT_FREE, 100.0) is Result.AGAIN
+    assert (dog.due_s, dog.left_to_people, dog.wants_retract) == (110.0, False, True)
+    assert (
+        dog.try_again(110.0, attended=True) == "the feedback is off, and the microscope is not free to retract the tip"
+    )
+    assert (dog.due_s, dog.left_to_people, dog.wants_retract) == (120.0, True, False)
+    dog.try_again(120.0, attended=False)
+    assert dog.next_action() == "x-retract"
+
+
+def test_what_can_not_be_stopped_does_not_keep_the_tip_at_the_surface() -> None:
+    dog = off(SCANNING)
+    dog.control_taken(Cause.DEAD, None)
+    assert dog.next_action() == "stop-scan"
+    assert dog.answered(ERROR, 0.0) is Result.FAILED
+    assert dog.next_action() == "x-retract"
+
+
+def test_what_a_microscope_can_not_do_is_not_tried_again() -> None:
+    dog = off(FREE)
+    dog.control_taken(Cause.DEAD, None)
+    dog.next_action()
+    assert dog.answered(int(ControlResponse.ACTION_NOT_SUPPORTED), 0.0) is Result.FAILED
+    assert (dog.due_s, dog.owes_retract, dog.left_to_people) == (None, False, True)
 
 
 NS = 10**9

@@ -279,6 +279,68 @@ def test_after_the_tip_was_retracted_or_could_not_be_nobody_goes_on_until_a_pers
         assert one.holder == "experiment"
 
 
+def not_retracted(settings: SchedulerSettings) -> Lab:
+    """A tip whose holder is dead, and that the microscope did not retract; people were called."""
+    lab = feedback_off(settings)
+    lab.step(ComponentDied("experiment"))
+    lab.answer(lab.forwarded[-1], ControlResponse.ACTION_ERROR, reason="a dialog is open")
+    lab.step(Tick())
+    assert Problem.DEVICE_MALFUNCTION in lab.core.control.problems
+    assert said(lab, "ERROR") == [
+        "the microscope does not x-retract: a dialog is open; it is asked again in 10 s, unless somebody sees to it"
+    ]
+    return lab
+
+
+def tried_again(lab: Lab) -> bool:
+    """Whether retracting is asked once more, when it is due."""
+    before = len(lab.forwarded)
+    lab.later(real_s=10.0)
+    lab.step(Tick())
+    return [forward.request.subject for forward in lab.forwarded[before:]] == ["x-retract"]
+
+
+def test_a_tip_that_was_not_retracted_is_until_it_is() -> None:
+    lab = not_retracted(SchedulerSettings())
+    deadline_s = lab.core.deadline_s()
+    assert deadline_s is not None
+    assert deadline_s <= lab.now_s + 10.0
+    assert tried_again(lab)
+    lab.answer(lab.forwarded[-1])
+    assert said(lab, "INFO")[-1] == "x-retract: done"
+    assert not tried_again(lab)
+
+
+def test_a_component_that_solves_it_is_not_disturbed() -> None:
+    lab = not_retracted(SchedulerSettings())
+    lab.take_control("doctor", Problem.DEVICE_MALFUNCTION)
+    assert "Forward" in kinds(lab.ask("doctor", PARAM, Parameter("x-feedback-on", "true"), "doctor/a/1"))
+    lab.answer(lab.forwarded[-1])
+    assert not tried_again(lab)
+
+
+def test_a_person_who_has_taken_over_is_not_disturbed() -> None:
+    lab = not_retracted(SchedulerSettings())
+    lab.mode("person", ControlMode.MANUAL)
+    assert not tried_again(lab)
+
+
+@pytest.mark.parametrize("attended", [False, True])
+def test_a_scheduler_that_was_killed_has_not_forgotten_such_a_tip(attended: bool) -> None:
+    lab = not_retracted(SchedulerSettings())
+    if attended:
+        lab.take_control("doctor", Problem.DEVICE_MALFUNCTION)
+    assert sent(killed(lab, SchedulerSettings())) == ([] if attended else ["x-retract"])
+
+
+def test_an_experiment_that_ends_with_such_a_tip_tries_once_more_and_says_so() -> None:
+    lab = not_retracted(SchedulerSettings())
+    lab.ask("person", END)
+    assert sent(lab) == ["x-retract", "x-retract"]
+    assert kinds(lab.answer(lab.forwarded[-1], ControlResponse.ACTION_ERROR))[-1] == "Kill"
+    assert any("did not retract" in text for text in said(lab, "CRITICAL"))
+
+
 def test_the_experiment_ends_when_the_tip_is_out_of_danger() -> None:
     lab = feedback_off()
     lab.scope_is(ScopeState.SCANNING)
