@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -26,6 +27,9 @@ _MODES: Final = {
 }
 _KINDS: Final = {"FZ": "force"}
 _NOBODY: Final = 4294967295.0
+
+
+_signature = cache(inspect.signature)  # which takes longer than most calls
 
 
 class Silence(Exception):
@@ -56,7 +60,7 @@ class Calls:
         if self._faults.strikes("error", now_s):
             raise SystemError("an emulated error")
         try:
-            inspect.signature(function).bind(*arguments)
+            _signature(getattr(Calls, f"_{method}")).bind(self, *arguments)
             found = function(*arguments)
         except RigBusy as busy:
             raise SystemError(str(busy)) from busy

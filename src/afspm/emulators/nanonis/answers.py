@@ -34,6 +34,7 @@ class Later:
 Answer = Results | Later
 Handler = Callable[..., Answer]
 HANDLERS: Final[dict[str, Handler]] = {}
+_NAMED: Final[set[Handler]] = set()
 REGISTERS_AT_FIRST: Final[dict[str, Results]] = {
     "ZCtrl.SwitchOffDelay": (0.05,),
     "ZCtrl.ZPos": (0.0,),
@@ -56,6 +57,8 @@ def answers(*names: str) -> Callable[[Handler], Handler]:
 
     def marked(handler: Handler) -> Handler:
         HANDLERS.update(dict.fromkeys(names, handler))
+        if "name" in inspect.signature(handler).parameters:
+            _NAMED.add(handler)
         return handler
 
     return marked
@@ -72,8 +75,7 @@ def answer(panel: Panel, name: str, arguments: list[Any], zeros: Results) -> Ans
     """
     handler = HANDLERS.get(name)
     if handler is not None:
-        named = "name" in inspect.signature(handler).parameters
-        return handler(panel, *([name] if named else []), *arguments)
+        return handler(panel, *([name] if handler in _NAMED else []), *arguments)
     register = name.removesuffix("Set").removesuffix("Get")
     if name.endswith("Set"):
         panel.registers[register] = tuple(arguments)
