@@ -11,11 +11,10 @@ from afspm.clock import ExperimentClock
 
 
 def test_real_time_by_default() -> None:
-    import datetime
-
     clock = ExperimentClock.real()
-    assert clock.now_s() == pytest.approx(datetime.datetime.now(datetime.UTC).timestamp(), abs=1.0)
-    assert clock.now_ns() == pytest.approx(clock.now_s() * 1e9, abs=1e8)
+    # a busy computer may do something else between any two looks, and wall clocks are set a little now and then
+    times_s = [time.time() - 1.0, clock.now_s(), clock.now_ns() / 1e9, clock.now_s(), time.time() + 1.0]
+    assert times_s == sorted(times_s)
     assert clock.real_s(5.0) == 5.0
 
 

@@ -16,9 +16,10 @@ from afspm.logic.ending import Ending
 from afspm.logic.events import Log, Publish, RequestIn, SaveState
 from afspm.logic.lease import Lease
 from afspm.logic.sessions import token_of
+from afspm.logic.trust import TRANSLATOR
 from afspm.logic.watchdog import Watchdog
 from afspm.logic.words import is_routine, said
-from afspm.model import ControlMode, ControlRequest, Feedback, Request
+from afspm.model import ControlMode, ControlRequest, Problem, Request
 
 CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): Event.REQUEST_CONTROL,
@@ -52,6 +53,10 @@ class _Change:
     ask: Ask
     row: Row
     had_died: bool
+
+    def was_cleared_by_others(self, problem: int, who: str) -> bool:
+        """Whether somebody but `who` says that there is no such problem any more."""
+        return problem in self.before.problems and problem not in self.after.problems and self.ask.who != who
 
     @property
     def cause(self) -> Cause | None:
@@ -142,7 +147,9 @@ class Arbiter:
         publish = self._stamp(now_s, now_ns) if after.published() != before.published() else None
         self._desk.effects.append(self._save())
         self._tell_people(change, wanted)
-        if before.holder is not None and after.holder is None:
+        if after.ended:
+            self._desk.call_back(None, Cause.ENDED)
+        elif before.holder is not None and after.holder is None:
             self._desk.call_back(before.holder, change.row.cause)
         self._desk.errands.send(now_s)
         if publish is not None:
@@ -151,13 +158,19 @@ class Arbiter:
     def _have_watched(self, change: _Change) -> list[str]:
         """The microscope may have been left to itself. Returns what the watchdog wants because of that."""
         cause, former = change.cause, change.before.holder
+        if change.was_cleared_by_others(Problem.DEVICE_MALFUNCTION, TRANSLATOR):
+            self._watchdog.seen_to()
         if cause is None or (former is None and cause not in (Cause.MANUAL, Cause.ENDED)):
             return []
         if self._desk.switches_feedback_off():
-            self._watchdog.feedback_is(Feedback(on=False))
-        by_holder = change.ask.who == former
-        in_flight = self._desk.action_in_flight()
-        return self._watchdog.control_taken(cause, in_flight, had_died=change.had_died, by_holder=by_holder)
+            self._watchdog.danger.feedback_may_be_off()
+        return self._watchdog.control_taken(
+            cause,
+            self._desk.action_in_flight(),
+            had_died=change.had_died,
+            by_holder=change.ask.who == former,
+            was_seen_to=change.before.sees_to_tip,
+        )
 
     def _stamp(self, now_s: float, now_ns: int) -> Publish:
         """The control state as a packet, which has its time before it is published: that is saved first."""
@@ -169,12 +182,17 @@ class Arbiter:
         routine = is_routine(before, after, ask, self._holder_told)
         self._log("DEBUG" if routine else "INFO", said(before, after, ask, change.row, self._rules))
         self._holder_told = after.holder or self._holder_told
+        is_sent = "is sent to the microscope" if self._desk.forwarder.up else "will be sent when the translator is back"
         for action in wanted:
             why = f"{before.holder} had died in control" if change.had_died else cause.value if cause else ""
-            self._log("WARNING", f"{action} is sent to the microscope, since {why}")
-        if cause is not None and (danger := self._watchdog.left_in_danger()) is not None:
-            expected = cause in (Cause.RELEASED, Cause.SOLVED, Cause.MANUAL)
-            self._log("WARNING" if expected else "CRITICAL", f"{danger}, and nobody looks after it: {cause.value}")
+            self._log("WARNING", f"{action} {is_sent}, since {why}")
+        from_hand = before.mode is ControlMode.MANUAL and after.mode is not ControlMode.MANUAL
+        if (cause is None and not from_hand) or self._watchdog.owes_retract:
+            return
+        if (danger := self._watchdog.danger.untold()) is not None:
+            expected = cause in (None, Cause.RELEASED, Cause.SOLVED, Cause.MANUAL)
+            why = cause.value if cause else "the mode is automated again"
+            self._log("WARNING" if expected else "CRITICAL", f"{danger}, and nobody looks after it: {why}")
 
     def _log(self, level: str, text: str) -> None:
         self._desk.effects.append(Log(level, text))

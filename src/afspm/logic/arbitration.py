@@ -12,7 +12,7 @@ from enum import Enum, auto
 from types import MappingProxyType
 from typing import Any
 
-from afspm.model import ControlMode, ControlResponse, ControlState, ProblemNames, component_of
+from afspm.model import ControlMode, ControlResponse, ControlState, Problem, ProblemNames, component_of
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
@@ -74,6 +74,13 @@ class Control:
     solving: int = 0
     problems: Mapping[int, str] = field(default_factory=lambda: _NO_PROBLEMS)
     ended: bool = False
+
+    @property
+    def sees_to_tip(self) -> bool:
+        """Somebody is there for a microscope that is not as it should be: a person, or who solves that."""
+        return self.mode is ControlMode.MANUAL or (
+            self.holder is not None and self.solving == Problem.DEVICE_MALFUNCTION
+        )
 
     def published(self) -> ControlState:
         """What all peers are told of it."""

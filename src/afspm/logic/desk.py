@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from afspm.logic.arbitration import Cause
+from afspm.logic.arbitration import Cause, Control
 from afspm.logic.chronicle import SCHEDULER, Chronicle
 from afspm.logic.errands import Errands
 from afspm.logic.events import Codec, Effect, Log, Reply, RequestIn, SaveState
@@ -39,7 +39,7 @@ class Desk:
         effects: what is to be done is appended here; the owner gives a new list for every step.
 
     Args:
-        holder: says who is in control.
+        control: says who is in control.
         save: says what is to be saved.
         chronicle: is told of every request that has got its answer.
         frame: the coordinates of components, where they are not those of the microscope.
@@ -51,7 +51,7 @@ class Desk:
         codec: Codec,
         watchdog: Watchdog,
         lease: Lease,
-        holder: Callable[[], str | None],
+        control: Callable[[], Control],
         save: Callable[[], SaveState],
         chronicle: Chronicle,
         frame: CoordinateFrame | None = None,
@@ -66,7 +66,7 @@ class Desk:
         self._codec = codec
         self._watchdog = watchdog
         self._lease = lease
-        self._holder = holder
+        self._control = control
         self._save = save
         self._chronicle = chronicle
         self._frame = frame
@@ -155,7 +155,7 @@ class Desk:
         # A translator that knows ids answers what became of it. Setting something twice does no harm either; an
         # action does, so what nobody knows stays unknown.
         may_send = self._ids_known or request.kind != _ACTION
-        if may_send and (self._holder() == name or reads(request)):
+        if may_send and (self._control().holder == name or reads(request)):
             return False
         reason = f"{UNKNOWN}it was sent once, and is not sent again"
         self._tell(event, Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id))
@@ -171,9 +171,9 @@ class Desk:
         self.effects.append(Reply(event.connection, event.name, response))
         self._chronicle.answered(event.name, event.request, response, event.heard_s)
 
-    def call_back(self, former: str, cause: Cause | None) -> None:
-        """Commands of a former holder that have not been sent are not sent any more."""
-        for job in self.forwarder.call_back(lambda job: job.command and job.client == former):
+    def call_back(self, former: str | None, cause: Cause | None) -> None:
+        """Commands of a former holder, or of anybody, that have not been sent are not sent any more."""
+        for job in self.forwarder.call_back(lambda job: job.command and former in (None, job.client)):
             reason = f"control was taken before this was sent: {cause.value if cause else ''}"
             self._finish(job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))
         if (event := self.mover.call_back(former)) is not None:
@@ -202,8 +202,8 @@ class Desk:
                 return
             mapped = outgoing
         if command:
-            if self._watchdog.wants_retract and self.forwarder.up:
-                self.answer(event, ControlResponse.NOT_FREE, "the tip is being retracted, as it was left in danger")
+            if (why := self._stays_out(self._control())) is not None:
+                self.answer(event, ControlResponse.NOT_FREE, why)
                 return
             if not self._is_within_limits(event, mapped, now_ns):
                 return
@@ -211,6 +211,16 @@ class Desk:
             if request.kind == _ACTION and not self._may_act_here(event, now_s, now_ns):
                 return
         self._send(event, mapped, now_s, now_ns, command=command)
+
+    def _stays_out(self, control: Control) -> str | None:
+        """Why nobody commands, since the tip was left in danger; None: whoever is in control may."""
+        if not (self._watchdog.owes_retract and self.forwarder.up):
+            return None
+        if not self._watchdog.put_off:
+            return "the tip is being retracted, as it was left in danger"
+        if control.sees_to_tip:
+            return None
+        return "the tip was left in danger and is not retracted yet; only who solves device-malfunction may see to it"
 
     def _is_within_limits(self, event: RequestIn, mapped: Mapped | None, now_ns: int) -> bool:
         """What goes to the microscope is within the limits; if not, the asker is told."""
@@ -332,8 +342,10 @@ class Desk:
         elif end is End.ANSWERED and _was_not_sent(response):
             self._forget(job, response)
         elif end is End.ANSWERED:
+            self._see_feedback(job, response)
             self._finish(job, response, _unknown_fate(response))
         elif end is End.LATE:
+            self._see_feedback(job, response)
             fate = _unknown_fate(response)
             self._once.note(job.client, job.request, fate or response)
             self._is_not_done(job, response, fate)
@@ -342,9 +354,21 @@ class Desk:
         elif end is End.UNKNOWN:
             if job.request.kind == _ACTION:
                 self._watchdog.started(str(job.request.subject), job.states_seen, certain=False)
+            self._see_feedback(job, response)
             self._finish(job, response, Fate.UNKNOWN)
         else:
             self._forget(job, response)
+
+    def _see_feedback(self, job: Job, response: Response) -> None:
+        """Whether a request has switched the feedback off, which is not known if nobody knows what became of it."""
+        feedback = feedback_of(job.request)
+        if feedback is None or feedback.on is not False or response.code == _SUCCESS:
+            return
+        if response.code == ControlResponse.NO_RESPONSE:
+            self._watchdog.danger.feedback_may_be_off()
+            self.effects.append(self._save())
+        else:
+            self._watchdog.danger.feedback_was_left()
 
     def _forget(self, job: Job, response: Response) -> None:
         """Nothing was done: asked again, with the same id too, it is."""
@@ -382,10 +406,14 @@ class Desk:
             if request.kind == _PARAM and (mapped := self._frame.answer(request, told, now_ns)) is not None:
                 response.payload = self._codec.encode_parameter(mapped)
         if request.kind == _ACTION:
-            self._watchdog.started(str(request.subject), job.states_seen)
-        if (feedback := feedback_of(request)) is not None:
-            self._watchdog.feedback_is(feedback)
-        if job.command and job.client == self._holder():
+            changed = self._watchdog.started(str(request.subject), job.states_seen)
+        elif (feedback := feedback_of(request)) is not None:
+            changed = self._watchdog.danger.feedback_is(feedback)
+        else:
+            changed = False
+        if changed:
+            self.effects.append(self._save())
+        if job.command and job.client == self._control().holder:
             self._lease.used(now_ns)
 
     def _own_ended(self, job: Job, end: End, response: Response, now_s: float, now_ns: int) -> None:

@@ -27,6 +27,7 @@ class Ending:
 
     def begin(self, now_s: float) -> None:
         """The experiment is over."""
+        self._watchdog.hurry(now_s)
         self.by_s = now_s + self._settings.request_timeout_s + self._settings.patience_s
 
     def answer(self, event: RequestIn, code: ControlResponse, why: str) -> None:
@@ -38,7 +39,7 @@ class Ending:
 
     def is_due(self, now_s: float) -> bool:
         """Whether all may leave now."""
-        return self.by_s is not None and not (self._watchdog.wants_retract and now_s < self.by_s)
+        return self.by_s is not None and not (self._watchdog.owes_retract and now_s < self.by_s)
 
     def end(self) -> None:
         """Give the answers that were kept back."""

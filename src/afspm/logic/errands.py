@@ -5,7 +5,7 @@ from __future__ import annotations
 from afspm.logic.events import Codec, Log
 from afspm.logic.forwarding import End, Forwarder, Job
 from afspm.logic.watchdog import Result, Watchdog
-from afspm.model import ControlRequest, ControlResponse, Request, Response, names
+from afspm.model import ControlRequest, ControlResponse, Request, Response
 
 _ID = "scheduler/are-ids-known"
 
@@ -21,9 +21,10 @@ class Errands:
 
     def begin(self, now_s: float) -> None:
         """The translator can be asked: does it retract, and does it know ids (ours do, those of version 1 do not)?"""
-        action = self._watchdog.retract or names.STOP_SCAN
+        action = self._watchdog.question
         request = Request(int(ControlRequest.ACTION_SUPPORT), action, self._codec.encode_action(action), _ID)
         self._question = self._forwarder.ask_own(request, now_s)
+        self._watchdog.translator_is_there(now_s)
         self.send(now_s)
 
     def send(self, now_s: float) -> None:
@@ -31,7 +32,7 @@ class Errands:
         while (action := self._watchdog.next_action()) is not None:
             request = Request(int(ControlRequest.ACTION), action, self._codec.encode_action(action))
             if self._forwarder.ask_own(request, now_s) is None:
-                self._watchdog.unsent()
+                self._watchdog.unsent(now_s)
                 return
 
     def ended(self, job: Job, end: End, response: Response, now_s: float) -> Log | None:
@@ -40,10 +41,10 @@ class Errands:
             return None
         if job is self._question:
             if response.code == ControlResponse.ACTION_NOT_SUPPORTED:
-                self._watchdog.cannot(str(job.request.subject))
+                self._watchdog.cannot_retract()
             return None
         if not self._forwarder.up:
-            self._watchdog.unsent()
+            self._watchdog.unsent(now_s)
             return None
         result = self._watchdog.answered(response.code, now_s)
         self.send(now_s)

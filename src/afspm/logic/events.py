@@ -235,7 +235,13 @@ class Log:
 
 @dataclass(slots=True)
 class Kill:
-    """The experiment ends: publish the signal KILL, and close."""
+    """The experiment ends: publish the signal KILL, and close.
+
+    Attributes:
+        tip_is_safe: the translator may leave; if not, it sees to the tip when it is asked to.
+    """
+
+    tip_is_safe: bool = True
 
 
 Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill

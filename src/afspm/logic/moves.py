@@ -63,9 +63,9 @@ class Mover:
         self._waiting = None
         return waiting.event, waiting.job.deadline_s
 
-    def call_back(self, client: str) -> RequestIn | None:
-        """Forget the action of a client that has lost control."""
-        if self._waiting is None or self._waiting.event.name != client:
+    def call_back(self, client: str | None) -> RequestIn | None:
+        """Forget the action of a client that has lost control; None: of anybody."""
+        if self._waiting is None or client not in (None, self._waiting.event.name):
             return None
         event, self._waiting = self._waiting.event, None
         return event

@@ -103,7 +103,7 @@ class SchedulerCore:
         self._chronicle = chronicle = Chronicle(settings.rules.problems)
         self._bulletin = Bulletin(codec, self._cache, chronicle, settings.rules.roles, self._save)
         self._desk = desk = Desk(
-            settings, codec, self._watchdog, self._lease, self._holder, self._save, chronicle, frame
+            settings, codec, self._watchdog, self._lease, self._control, self._save, chronicle, frame
         )
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
         self._absence = Absence(desk.sessions, settings.grace_s, settings.restart_grace_s)
@@ -140,6 +140,7 @@ class SchedulerCore:
         """Begin. The control state is published as soon as the translator's packets have been caught up with."""
         self._effects = self._desk.effects = []
         self._absence.started(now_s)
+        self._watchdog.begin(now_s)
         self._lease.held_by(self.control.holder, now_ns)
         self._cache.remember(self._recent)
         self._chronicle.at(now_s, now_ns)
@@ -164,7 +165,7 @@ class SchedulerCore:
         if self._ending.is_due(now_s):
             self._ending.end()
             self._with_forwards()
-            self._effects += [*self._bulletin.entries(now_ns), Kill()]
+            self._effects += [*self._bulletin.entries(now_ns), Kill(not self._watchdog.owes_retract)]
 
     def _with_forwards(self) -> list[Effect]:
         if self._forwarder.outbox:
@@ -200,9 +201,7 @@ class SchedulerCore:
             **self._arbiter.snapshot(),
             "last_ns": self._cache.last_ns,
             "recent": self._cache.recent(),
-            "wanted": list(self._watchdog.wanted),
-            "left_to_people": self._watchdog.left_to_people,
-            "put_off": self._watchdog.put_off,
+            "watchdog": self._watchdog.snapshot(),
             "supervisors": self._bulletin.telling.snapshot(),
             **self._desk.snapshot(),
             **({} if self._frame is None else {"frame": self._frame.snapshot()}),
@@ -217,9 +216,7 @@ class SchedulerCore:
         self._is_restarted = True
         self._arbiter.restore(state)
         self._cache.not_before(int(state["last_ns"]))
-        left_to_people, put_off = (bool(state.get(key)) for key in ("left_to_people", "put_off"))  # older: not there
-        attended = put_off and self._is_attended()
-        self._watchdog.restore(map(str, state["wanted"]), left_to_people=left_to_people, attended=attended)
+        self._watchdog.restore(state["watchdog"])
         self._recent = [(int(source_ns), int(first_ns)) for source_ns, first_ns in state["recent"]]
         self._bulletin.telling.restore(state.get("supervisors", {}))
         self._desk.restore(state)
@@ -365,8 +362,9 @@ class SchedulerCore:
             self._desk.errands.send(now_s)
             if self._desk.mover.busy:
                 self._desk.act_when_moved(now_s, now_ns)
-        elif isinstance(told, Feedback):
-            self._watchdog.feedback_is(told)
+        elif isinstance(told, Feedback) and self._watchdog.danger.feedback_is(told):
+            self._effects.append(self._save())
+            self._desk.errands.send(now_s)
         if isinstance(told, Feedback | ScanParameters | ProbePosition) and self._guard.published(told, now_ns):
             self._effects.append(self._save())
 
@@ -386,9 +384,13 @@ class SchedulerCore:
 
     def _on_stopped(self, event: Stopped, now_s: float, now_ns: int) -> None:
         """Whoever resumes the run finds the tip retracted, or worse. A person in control knows."""
-        if self.control.mode is not ControlMode.MANUAL:
-            self._watchdog.leave_to_people()
-            self._effects.append(self._save())
+        if self.control.mode is ControlMode.MANUAL:
+            return
+        danger = self._watchdog.danger.now
+        if danger is not None and not self._desk.forwarder.up:
+            self._log("CRITICAL", f"the run is stopped, {danger}, and no translator is there to retract the tip")
+        self._watchdog.leave_to_people()
+        self._effects.append(self._save())
 
     def _on_tick(self, event: Tick, now_s: float, now_ns: int) -> None:
         self._see_to_deadlines(now_s, now_ns)
@@ -418,9 +420,9 @@ class SchedulerCore:
                 )
             self._arbiter.decide(Ask(Event.FLAG, told_by, Problem.DEVICE_MALFUNCTION), None, now_s, now_ns)
             return
-        retract_at_s = self._watchdog.due_s
-        if retract_at_s is not None and now_s >= retract_at_s:
-            told = self._watchdog.try_again(now_s, attended=self._is_attended())
+        look_at_s = self._watchdog.due_s
+        if look_at_s is not None and now_s >= look_at_s:
+            told = self._watchdog.look_again(now_s, is_seen_to=self.control.sees_to_tip)
             if told is not None:
                 self._log("CRITICAL", told)
             self._effects.append(self._save())
@@ -439,12 +441,8 @@ class SchedulerCore:
 
     # --- what the parts ask of the whole, and telling people ---
 
-    def _holder(self) -> str | None:
-        return self.control.holder
-
-    def _is_attended(self) -> bool:
-        """Somebody is in control, or a person at the microscope."""
-        return self.control.holder is not None or self.control.mode is ControlMode.MANUAL
+    def _control(self) -> Control:
+        return self.control
 
     def _save(self) -> SaveState:
         return SaveState(self.snapshot())

@@ -6,20 +6,20 @@ and left it in a dangerous state: it can't put that right any more, and nobody e
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 from afspm.logic.arbitration import Cause
+from afspm.logic.danger import FEEDBACK_OFF, Danger
 from afspm.model import ControlResponse, Feedback, Parameter, Request, ScopeState, names
-
-FEEDBACK_OFF = "feedback-off"
-"""The name of the dangerous state in which the feedback is known to be switched off."""
 
 _STOP = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 _STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
 _OFF = names.OFF_WORDS | {"0.0"}  # a translator that is not ours may take a number
 _DEFAULT_STOPS = frozenset({Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE})
+_SOON_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class WatchdogSettings:
             "feedback-off".
         retract: the action that does it; None: never.
         attempts: how often an action that gets no response is tried.
-        again_s: after how long (real) a tip that was not retracted is tried to be again; twice as long each time.
+        again_s: how long (real) something that should happen is waited for: that the microscope is free, has stopped,
+            is there. After that time, too, a tip that was not retracted is tried to be again; twice as long each time.
         longest_s: but never longer than this.
     """
 
@@ -55,71 +56,67 @@ class Result(Enum):
 class Watchdog:
     """Knows what the microscope is doing, and what the scheduler wants it to do.
 
-    The caller sends `next_action()` before anything else, reports by `answered`, and lets nobody command while it
-    `wants_retract`. A tip that the microscope does not retract stays wanted away: others may command, and unless one of
-    them sees to it `try_again` is called when it is `due_s`.
+    The caller sends `next_action()` before anything else, reports by `answered` or `unsent`, and calls `look_again`
+    when it is `due_s`. While it `owes_retract` nobody commands; but when that is `put_off`, since the microscope does
+    not do it, whoever is there to see to the tip may.
+
+    Attributes:
+        danger: what is known of it.
     """
 
     def __init__(self, settings: WatchdogSettings | None = None) -> None:
         self._settings = settings or WatchdogSettings()
+        self.danger = Danger(self._settings.dangerous)
         self._state = ScopeState.UNDEFINED
-        self._feedback_on: bool | None = None
-        self._is_away = False  # the tip: neither the motor that retracts it nor a feedback that is off does harm
         self._starting: str | None = None
         self._states_seen = 0
         self._wanted: list[str] = []
-        self._sent = False
+        self._sent: str | None = None
         self._attempts = 0
         self._can_retract = True  # as far as we know
-        self._danger_told: str | None = None
         self._refused_at = -1  # states seen when the microscope last was not free
-        self._left_to_people = False
-        self._put_off = False  # the tip is in danger still, and is tried to be retracted later
+        self._told_to_stop = self._unstoppable = False  # what runs
+        self._for_feedback = False  # why the tip is to be retracted
+        self._put_off = False
         self._due_s: float | None = None
-        self._again_s = self._settings.again_s
-        self._unstoppable = False  # what runs
+        self._retries = 0
+        self._in_haste = False
+        self._left_to_people = False
 
-    @property
-    def retract(self) -> str | None:
-        """The action that retracts the tip, if it may be used."""
-        return self._settings.retract
+    def snapshot(self) -> dict[str, Any]:
+        """What must survive a kill, as plain JSON."""
+        return {
+            "wanted": list(self._wanted),
+            "for_feedback": self._for_feedback,
+            "put_off": self._put_off,
+            "left_to_people": self._left_to_people,
+            "danger": self.danger.snapshot(),
+        }
 
-    @property
-    def wanted(self) -> tuple[str, ...]:
-        """What is not done yet, to be kept over a restart of the scheduler."""
-        return tuple(self._wanted)
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take up what `snapshot` wrote."""
+        self._wanted = [str(action) for action in state["wanted"]]
+        self._for_feedback, self._put_off = bool(state["for_feedback"]), bool(state["put_off"])
+        self._left_to_people = bool(state["left_to_people"])
+        self.danger.restore(state["danger"])
+
+    def begin(self, now_s: float) -> None:
+        """After `restore`: what has happened meanwhile is heard of first."""
+        if self._put_off:
+            self._due_s = now_s + self._settings.again_s
 
     @property
     def left_to_people(self) -> bool:
         """It has retracted the tip, or could not, and nobody was called yet: to go on is for a person to decide."""
         return self._left_to_people
 
-    @property
-    def put_off(self) -> bool:
-        """The microscope did not retract the tip: others may see to it."""
-        return self._put_off
-
-    def restore(self, wanted: Iterable[str], *, left_to_people: bool = False, attended: bool = False) -> None:
-        """Want what a scheduler wanted before.
-
-        Args:
-            attended: retracting was put off, and somebody sees to the tip.
-        """
-        self._wanted = [action for action in wanted if not (attended and action == self._settings.retract)]
-        self._left_to_people = left_to_people
-
     def leave_to_people(self) -> None:
         """Nobody can be told any more what to do with a tip in danger: the translator sees to it as it leaves."""
-        self._left_to_people |= self._settings.retract is not None and self.danger is not None
+        self._left_to_people |= self._settings.retract is not None and self.danger.now is not None
 
     def people_called(self) -> None:
         """The problem was flagged."""
         self._left_to_people = False
-
-    @property
-    def wants_retract(self) -> bool:
-        """The tip is being retracted."""
-        return self.owes_retract and not self._put_off
 
     @property
     def owes_retract(self) -> bool:
@@ -127,23 +124,9 @@ class Watchdog:
         return self._settings.retract in self._wanted
 
     @property
-    def due_s(self) -> float | None:
-        """When, real, `try_again` is to be called; None: not."""
-        return self._due_s
-
-    def try_again(self, now_s: float, *, attended: bool) -> str | None:
-        """The tip that was not retracted is tried to be, unless it is out of danger, or somebody has `attended` to it.
-
-        Returns:
-            what people are to be told, if it is that the microscope is still not free for that.
-        """
-        if not self._put_off:
-            self._retract_later(now_s)
-            return f"{self.danger}, and the microscope is not free to retract the tip" if self.danger else None
-        self._put_off, self._due_s, self._refused_at = False, None, -1
-        if attended or self.danger is None:
-            self._forget_retract()
-        return None
+    def put_off(self) -> bool:
+        """The tip is to be retracted, but that is not done: it is tried again later."""
+        return self._put_off
 
     @property
     def state(self) -> ScopeState:
@@ -158,141 +141,214 @@ class Watchdog:
         self._state = state
         self._states_seen += 1
         self._starting = None
-        self._unstoppable = False
-        self._see_danger()
-        if state is ScopeState.FREE and not self._sent:  # it ended while the translator could not be told to stop it
+        self.danger.scope_is(state)
+        if state not in _STOP:
+            self._told_to_stop = self._unstoppable = False
+        if (
+            state is ScopeState.FREE and self._sent is None
+        ):  # it ended while the translator could not be told to stop it
             self._wanted = [action for action in self._wanted if action not in _STOP.values()]
 
-    def feedback_is(self, feedback: Feedback) -> None:
-        if feedback.on is not None:
-            self._feedback_on = feedback.on
-            self._is_away = self._is_away and not feedback.on
-            self._see_danger()
-
-    @property
-    def danger(self) -> str | None:
-        """What is dangerous now, in words; None: nothing, or it was seen to."""
-        dangerous = self._settings.dangerous
-        if self._is_away:
-            return None
-        if self._feedback_on is False and FEEDBACK_OFF in dangerous:
-            return "the feedback is off"
-        return f"the microscope is in {self._state.name}" if self._state.name in dangerous else None
-
-    def left_in_danger(self) -> str | None:
-        """The danger about which nothing is done, to be told: each once."""
-        danger = None if self.wants_retract else self.danger
-        if danger == self._danger_told:
-            return None
-        self._danger_told = danger
-        return danger
-
-    def _see_danger(self) -> None:
-        if self.danger is None:
-            self._danger_told = None
-
-    def started(self, action: str, states_seen: int, *, certain: bool = True) -> None:
+    def started(self, action: str, states_seen: int, *, certain: bool = True) -> bool:
         """An action succeeded, or may have, that was sent when `states_seen` states were known.
 
         The answer may overtake the state that the microscope is in by it, or be overtaken.
+
+        Returns:
+            whether what is known of the danger has changed.
         """
-        if action not in _STARTS and action not in _STOP.values():
-            self._is_away = certain and action == self._settings.retract  # what else there is may bring the tip back
         if states_seen == self._states_seen:
             self._starting = _STARTS.get(action, self._starting)
+        if action in _STARTS or action in _STOP.values():
+            return False
+        # what else there is may bring the tip back
+        return self.danger.tip_is_away(is_away=certain and action == self._settings.retract)
 
-    def cannot(self, action: str) -> None:
+    def cannot_retract(self) -> None:
         """The microscope has no such action."""
-        if action == self._settings.retract:
-            self._can_retract = False
+        self._can_retract = False
+
+    @property
+    def question(self) -> str:
+        """The action of which the translator is asked first whether the microscope has it."""
+        return self._settings.retract or names.STOP_SCAN
+
+    # --- what is wanted ---
 
     def control_taken(
-        self, cause: Cause, in_flight: str | None, *, had_died: bool = False, by_holder: bool = False
+        self,
+        cause: Cause,
+        in_flight: str | None,
+        *,
+        had_died: bool = False,
+        by_holder: bool = False,
+        was_seen_to: bool = False,
     ) -> list[str]:
         """Control was taken for `cause` while the action `in_flight` was with the translator.
 
         Args:
             had_died: the process that got control has died; who gives it back is the one started in its place.
             by_holder: it is the holder's own doing.
+            was_seen_to: the holder was there to see to a tip that was not retracted.
 
         Returns:
-            What is wanted now, in order.
+            What is wanted now and was not before, in order.
         """
-        wanted = []
-        stop = _STOP.get(self._state) or self._starting or _STARTS.get(in_flight or "")
         # whoever gives control back knows what it leaves, and so does a person who takes it
         knows = cause in (Cause.RELEASED, Cause.MANUAL) or (cause is Cause.SOLVED and by_holder)
-        retract = self._settings.retract if self._can_retract and (had_died or not knows) else None
-        if self.danger is None:
-            retract = None
-        if self._put_off:
+        if cause is Cause.MANUAL or (was_seen_to and knows and not had_died):
+            self.seen_to()
+        before = [] if self._put_off else list(self._wanted)
+        if self._can_retract and (had_died or not knows) and self.danger.now is not None:
+            self._want_retract()
+        stop = _STOP.get(self._state) or self._starting or _STARTS.get(in_flight or "")
+        if stop is not None and (cause in self._settings.stop_when or self.owes_retract) and stop not in self._wanted:
+            self._wanted.insert(0, stop)
+        return [] if self._put_off else [action for action in self._wanted if action not in before]
+
+    def _want_retract(self) -> None:
+        retract = self._settings.retract
+        if retract is None:
+            return
+        if retract not in self._wanted:
+            self._wanted.append(retract)
+        self._for_feedback = self.danger.by_feedback
+        if self._put_off:  # whoever was there to see to it is gone
+            self._put_off, self._due_s = False, None
+
+    def seen_to(self) -> None:
+        """Somebody sees to the tip: it is not retracted any more, unless it is just being."""
+        if self.owes_retract and self._sent != self._settings.retract:
             self._forget_retract()
-        if stop is not None and (cause in self._settings.stop_when or retract is not None):
-            wanted.append(stop)
-        if retract is not None:
-            wanted.append(retract)
-        self._wanted += [action for action in wanted if action not in self._wanted]
-        return wanted
+
+    def hurry(self, now_s: float) -> None:
+        """The experiment ends: nothing is waited for any longer than a moment."""
+        self._in_haste = True
+        if self._due_s is not None:
+            self._due_s = min(self._due_s, now_s + _SOON_S)
+
+    # --- what is sent ---
 
     def next_action(self) -> str | None:
         """The action to send now, if one is; it counts as sent."""
-        if self._sent or not self._wanted or self._put_off or self._refused_at == self._states_seen:
+        if self._for_feedback and self.danger.feedback_is_on:
+            self.seen_to()
+        if self._sent is not None or self._put_off or self._refused_at == self._states_seen:
             return None
-        action = self._wanted[0]
-        if action == self._settings.retract and self._state in _STOP and not self._unstoppable:
-            return None  # it is being stopped
-        self._sent, self._due_s = True, None
-        return action
+        runs = _STOP.get(self._state)
+        if self.owes_retract and runs is not None and not self._told_to_stop and runs not in self._wanted:
+            self._wanted.insert(0, runs)
+        if not self._wanted or self._waits_for_stop():
+            return None
+        self._sent, self._due_s = self._wanted[0], None
+        self._told_to_stop |= self._sent == runs
+        return self._sent
+
+    def _waits_for_stop(self) -> bool:
+        """It has been told to stop, and the tip is retracted when it has."""
+        return self._wanted[0] == self._settings.retract and self._state in _STOP and not self._unstoppable
 
     def answered(self, code: int, now_s: float) -> Result:
         """The translator answered what was sent (or NO_RESPONSE)."""
-        self._sent = False
-        is_retract = self._wanted[0] == self._settings.retract
+        action, self._sent = self._sent or "", None
+        is_retract = action == self._settings.retract
         if code == ControlResponse.SUCCESS:
             self._starting = None
             if is_retract:
-                self._is_away = True
-                self._see_danger()
+                self.danger.tip_is_away(is_away=True)
                 self._left_to_people = True
-            self._forget()
+                self._forget_retract()
+            else:
+                self._forget_stop(action)
+                self._due_s = now_s + self._wait_s if self.owes_retract else None
             return Result.DONE
         if code == ControlResponse.NOT_FREE:
             self._refused_at = self._states_seen
-            self._due_s = now_s + self._settings.again_s if is_retract else None
+            self._due_s = now_s + self._wait_s
             return Result.AGAIN
         self._attempts += 1
         if code == ControlResponse.NO_RESPONSE and self._attempts < self._settings.attempts:
             return Result.AGAIN
-        if is_retract and code != ControlResponse.ACTION_NOT_SUPPORTED:
-            self._retract_later(now_s)
+        if not is_retract:
+            self._unstoppable = True
+            self._forget_stop(action)
+        elif code == ControlResponse.ACTION_NOT_SUPPORTED:
+            self._left_to_people = True
+            self._forget_retract()
         else:
-            self._unstoppable = not is_retract
-            self._left_to_people |= is_retract
-            self._forget()
+            self._retract_later(now_s)
         return Result.FAILED
 
-    def unsent(self) -> None:
+    def unsent(self, now_s: float) -> None:
         """What `next_action` said could not be sent: the translator is not connected. Again when it is."""
-        self._sent = False
+        self._sent = None
         self._attempts = 0
         self._refused_at = -1
+        self._told_to_stop = False
+        if self.owes_retract and self._due_s is None:
+            self._due_s = now_s + self._wait_s
 
-    def _forget(self) -> None:
-        """What was answered is not wanted any more."""
-        if self._wanted.pop(0) == self._settings.retract:
-            self._again_s = self._settings.again_s
-        self._attempts = 0
+    def translator_is_there(self, now_s: float) -> None:
+        """Another, or again: what was put off is due, once it has told how it is with the microscope."""
+        if self._put_off:
+            self._due_s = now_s + _SOON_S
+
+    # --- what does not come about ---
+
+    @property
+    def due_s(self) -> float | None:
+        """When, real, `look_again` is to be called; None: not."""
+        return self._due_s
+
+    def look_again(self, now_s: float, *, is_seen_to: bool) -> str | None:
+        """What was waited for has not happened, or what was put off is due.
+
+        Args:
+            is_seen_to: somebody is there to see to the tip, if it was not retracted.
+
+        Returns:
+            what people are to be told, if that is new.
+        """
+        self._due_s = None
+        if self._put_off:
+            self._put_off, self._refused_at = False, -1
+            if is_seen_to:
+                self.seen_to()
+            return None
+        if not self._wanted or self._sent is not None:
+            return None
+        action = self._wanted[0]
+        if action != self._settings.retract:
+            self._forget_stop(action)
+            self._unstoppable, self._refused_at = True, -1
+            return f"the microscope is never free to {action}"
+        if self._refused_at != self._states_seen and self._waits_for_stop():
+            self._unstoppable = True
+            return "the microscope was told to stop, and does not"
+        is_refused, is_new = self._refused_at == self._states_seen, not self._retries
+        self._retract_later(now_s)
+        why = "the microscope is never free for that" if is_refused else "its translator is not there"
+        return f"the tip was left in danger and can't be retracted: {why}" if is_new else None
+
+    @property
+    def _wait_s(self) -> float:
+        return _SOON_S if self._in_haste else self._settings.again_s
 
     def _retract_later(self, now_s: float) -> None:
         self._put_off, self._left_to_people = True, True
-        self._due_s = now_s + self._again_s
-        self._again_s = min(2 * self._again_s, self._settings.longest_s)
+        wait_s = min(self._wait_s * 2**self._retries, self._settings.longest_s)
+        self._due_s = now_s + (_SOON_S if self._in_haste else wait_s)
+        self._retries = min(self._retries + 1, 32)
+        self._attempts = 0
+
+    def _forget_stop(self, action: str) -> None:
+        self._wanted = [other for other in self._wanted if other != action]
         self._attempts = 0
 
     def _forget_retract(self) -> None:
-        self._wanted = [action for action in self._wanted if action != self._settings.retract]
-        self._put_off, self._due_s = False, None
-        self._again_s = self._settings.again_s
+        self._wanted = [other for other in self._wanted if other != self._settings.retract]
+        self._put_off, self._due_s, self._for_feedback = False, None, False
+        self._attempts = self._retries = 0
 
 
 def feedback_of(request: Request) -> Feedback | None:

@@ -102,9 +102,10 @@ class Outbox:
         try:
             found: list[Scan | Spectrum] = list(self._microscope.load(result))
             return [encode(one) for one in found]
-        except (AfspmError, OSError) as error:
+        except Exception as error:  # whatever is wrong with a file, the microscope is to be commanded
             if result not in self._complained:
-                self._log.warning("%s can't be read (yet): %s", result, error)
+                why = error if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
+                self._log.warning("%s can't be read (yet): %s", result, why)
                 self._complained.add(result)
             return None
 

@@ -18,6 +18,7 @@ from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, FileError, WireError
 from afspm.logic.forwarding import NOT_SENT
+from afspm.logic.watchdog import feedback_of
 from afspm.microscopes import in_force
 from afspm.microscopes.ledger import Ledger
 from afspm.microscopes.live import LiveLines
@@ -97,7 +98,6 @@ class Translator:
         self._why_lost = self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
-        self._may_have_switched = False  # a request has done something since the last look at what is in force
         self._ended = False
 
     def run(self) -> ExitCode:
@@ -123,7 +123,7 @@ class Translator:
 
     def leaves_danger(self) -> bool:
         """Whether, as it ends, it has to retract the tip first. May be called from another thread."""
-        return self._retracts and (bool(self._kept.get("feedback_off")) or self._may_have_switched)
+        return self._retracts and bool(self._kept.get("feedback_off") or self._kept.get("may_have_switched"))
 
     def handle(self, arrived: RequestReceived | SubscriberJoined) -> None:
         """One thing that came over the network."""
@@ -244,15 +244,17 @@ class Translator:
         self._all_at_s = self._clock.monotonic_s() + wait_s
 
     def _take_in(self, values: dict[str, Value]) -> None:
-        """What is in force now, and whether it was a request that has switched the feedback off."""
-        was_on, is_on = self._values.get(names.FEEDBACK_ON), values.get(names.FEEDBACK_ON)
+        """What is in force now, and whether it was a request that has switched the feedback off.
+
+        One that was begun since the last look, by this process or by one that was killed then.
+        """
         self._values = values
-        if is_on is not False:
-            self._kept["feedback_off"] = False
-        elif was_on and self._may_have_switched:
-            self._kept["feedback_off"] = True
+        is_on, kept = values.get(names.FEEDBACK_ON), self._kept
+        switched_off = is_on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
+        kept["feedback_off"] = is_on is False and (switched_off or bool(kept.get("feedback_off")))
+        kept["feedback_was_on"], kept["may_have_switched"] = is_on, False
+        if switched_off:
             self._save()
-        self._may_have_switched = False
 
     def _read(self) -> dict[str, Value]:
         """What is in force; differences below the controller's precision are none."""
@@ -365,11 +367,15 @@ class Translator:
         return "" if response.ok else response.reason or str(response.code)
 
     def _retract(self) -> Response:
-        if not self._connected:
-            raise ControllerLost(self._why_lost)
+        self._reach()
         response = self._act(names.RETRACT)
         self._save()
         return response
+
+    def _reach(self) -> None:
+        """For the way out, which must always be open: a controller that is there will do, whatever else it says."""
+        if not self._connected:
+            self.microscope.connect()
 
     def _stop_measuring(self) -> None:
         """The tip does not go on scanning with nobody there."""
@@ -386,11 +392,13 @@ class Translator:
         return answer.response
 
     def _answer(self, request: Request) -> None:
-        if not self._connected:
-            raise ControllerLost(f"it is being looked for: {self._why_lost}")
         # whether it is free is decided by what it does now, not at the last look
-        if not _only_asks(request) and not self._trusting(partial(self._observe, values=False)):
-            raise ControllerLost(self._why_lost)
+        if self._connected and not _only_asks(request):
+            self._trusting(partial(self._observe, values=False))
+        if request.subject == names.RETRACT:
+            self._reach()
+        elif not self._connected:
+            raise ControllerLost(f"it is being looked for: {self._why_lost}")
         answer = self._service.answer(request)
         self._finish(request, answer.response)
         self._play(answer.steps)
@@ -399,10 +407,13 @@ class Translator:
 
     def _about_to_act(self, request: Request) -> None:
         self._acting = request
-        self._may_have_switched = True
+        is_action = request.kind == ControlRequest.ACTION
+        # whether the feedback was switched off is to be known by who comes after a kill
+        in_doubt = (is_action or feedback_of(request) is not None) and not self._kept.get("may_have_switched")
+        self._kept["may_have_switched"] = True
         self._ledger.begin(request)
         # what a kill leaves half set may be set again; an action may not be done again
-        if request.id and request.kind == ControlRequest.ACTION and not self.microscope.memory_is_all:
+        if (in_doubt or (request.id and is_action)) and not self.microscope.memory_is_all:
             self._save()
 
     def _finish(self, request: Request, response: Response) -> None:
@@ -410,7 +421,7 @@ class Translator:
         if self._acting is request:
             self._acting = None
             if request.subject == names.RETRACT and response.ok:
-                self._may_have_switched = self._kept["feedback_off"] = False  # a tip that is away needs none
+                self._kept["may_have_switched"] = self._kept["feedback_off"] = False  # a tip that is away needs none
             if response.code == ControlResponse.PARAM_ERROR:
                 self._ledger.forget(request)  # nothing was changed
             else:

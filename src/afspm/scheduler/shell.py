@@ -71,6 +71,7 @@ class Shell:
         self._replay: tuple[Packet, ...] = ()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
+        self._tip_is_safe = True
         self._leave_at_s = math.inf
         sockets.publisher.history = self._history
 
@@ -131,11 +132,19 @@ class Shell:
                 sockets.link.receive()
             elif source is sockets.link.monitor:
                 if any(isinstance(change, LinkUp) for change in sockets.link.follow()):
-                    sockets.link.send(0, [wire.CLOSE])
+                    self._let_translator_go()
             elif source is sockets.subscriber:
                 sockets.subscriber.receive()
             else:
                 sockets.subscriber.follow()
+
+    def _let_translator_go(self) -> None:
+        """It subscribes to nobody.
+
+        One whose tip is in danger is left to find that nobody is there any more: then it sees to the tip by itself.
+        """
+        if self._tip_is_safe:
+            self._sockets.link.send(0, [wire.CLOSE])
 
     def _asked_late(self, asked: PeerAsked) -> None:
         """A supervisor says its last words; all others hear that it is over."""
@@ -249,7 +258,8 @@ class Shell:
                 case events.Kill():
                     sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
                     sockets.publisher.kill()
-                    sockets.link.send(0, [wire.CLOSE])  # the translator subscribes to nobody
+                    self._tip_is_safe = effect.tip_is_safe
+                    self._let_translator_go()
                     self.ended = True
                     self._leave_at_s = self._clock.monotonic_s() + FAREWELL_S
 

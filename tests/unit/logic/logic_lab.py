@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from afspm.logic.chronicle import PERIOD_S
@@ -14,6 +15,7 @@ from afspm.logic.events import (
     Publish,
     Reply,
     RequestIn,
+    SaveState,
     Tick,
     TranslatorCaughtUp,
     TranslatorReply,
@@ -136,3 +138,32 @@ def replies(effects: list[Effect]) -> list[Reply]:
 
 def published(effects: list[Effect]) -> list[Packet]:
     return [effect.packet for effect in effects if isinstance(effect, Publish)]
+
+
+def kinds(effects: list[Effect]) -> list[str]:
+    return [type(effect).__name__ for effect in effects]
+
+
+def in_control(settings: SchedulerSettings) -> Lab:
+    lab = Lab(settings)
+    lab.translator()
+    lab.take_control("experiment")
+    return lab
+
+
+def killed(lab: Lab, settings: SchedulerSettings) -> Lab:
+    """The scheduler that is started with what was saved last."""
+    saved = [effect.state for effect in lab.effects if isinstance(effect, SaveState)][-1]
+    again = Lab(settings, state=json.loads(json.dumps(saved)))
+    again.now_s, again.now_ns = lab.now_s, lab.now_ns
+    again.translator()
+    return again
+
+
+def resumed(lab: Lab, settings: SchedulerSettings) -> Lab:
+    """The same, when it has caught up with the translator."""
+    again = killed(lab, settings)
+    for _ in range(3):  # one decision in each
+        again.later(real_s=settings.catch_up_s)
+        again.step(Tick())
+    return again

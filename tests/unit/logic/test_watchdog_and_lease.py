@@ -54,10 +54,10 @@ def test_a_start_whose_states_have_come_already_is_not_taken_for_running() -> No
 
 def test_a_dead_holder_s_tip_is_retracted_in_a_dangerous_state_once_it_has_stopped() -> None:
     dog = watchdog(FREE)
-    dog.feedback_is(Feedback(on=False))
+    dog.danger.feedback_is(Feedback(on=False))
     dog.scope_is(SCANNING)
     assert dog.control_taken(Cause.DEAD, None) == ["stop-scan", "x-retract"]
-    assert dog.wants_retract
+    assert dog.owes_retract
     assert dog.next_action() == "stop-scan"
     assert dog.next_action() is None
     assert dog.answered(OK, 0.0) is Result.DONE
@@ -69,13 +69,13 @@ def test_a_dead_holder_s_tip_is_retracted_in_a_dangerous_state_once_it_has_stopp
     dog.scope_is(FREE)
     assert dog.next_action() == "x-retract"
     assert dog.answered(OK, 0.0) is Result.DONE
-    assert not dog.wants_retract
+    assert not dog.owes_retract
 
 
 def off(*states: ScopeState, **settings: object) -> Watchdog:
     """One that knows that the feedback is off."""
     made = watchdog(*states, **settings)
-    made.feedback_is(Feedback(on=False))
+    made.danger.feedback_is(Feedback(on=False))
     return made
 
 
@@ -90,21 +90,20 @@ def test_the_tip_is_retracted_where_the_holder_could_not_put_the_danger_right(ca
 def test_what_the_holder_or_a_person_does_knowingly_is_told_once_and_left_alone(cause: Cause) -> None:
     dog = off(FREE)
     assert dog.control_taken(cause, None, by_holder=cause is not Cause.MANUAL) == []
-    assert dog.left_in_danger() == "the feedback is off"
-    assert dog.left_in_danger() is None
-    dog.feedback_is(Feedback(on=True))
-    assert dog.left_in_danger() is None
-    dog.feedback_is(Feedback(on=False))
-    assert dog.left_in_danger() == "the feedback is off"
+    assert dog.danger.untold() == "the feedback is off"
+    assert dog.danger.untold() is None
+    dog.danger.feedback_is(Feedback(on=True))
+    assert dog.danger.untold() is None
+    dog.danger.feedback_is(Feedback(on=False))
+    assert dog.danger.untold() == "the feedback is off"
 
 
 def test_a_danger_that_is_seen_to_is_not_told_nor_seen_to_again() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.PROBLEM, None)
-    assert dog.left_in_danger() is None
     assert dog.next_action() == "x-retract"
     assert dog.answered(OK, 0.0) is Result.DONE
-    assert dog.left_in_danger() is None
+    assert dog.danger.untold() is None
     assert dog.control_taken(Cause.ENDED, None) == []
 
 
@@ -114,45 +113,45 @@ def retracted() -> Watchdog:
     dog.next_action()
     dog.answered(OK, 0.0)
     dog.scope_is(ScopeState.COARSE_MOTOR)
-    dog.feedback_is(Feedback(on=False))  # as a controller says that has withdrawn its tip
+    dog.danger.feedback_is(Feedback(on=False))  # as a controller says that has withdrawn its tip
     return dog
 
 
 def test_a_tip_that_is_away_is_in_no_danger_until_it_may_be_back() -> None:
     dog = retracted()
     dog.started("start-scan", dog.states_seen)
-    assert dog.danger is None
+    assert dog.danger.now is None
     assert dog.control_taken(Cause.PROBLEM, None) == ["stop-scan"]
-    dog.feedback_is(Feedback(on=True))
-    dog.feedback_is(Feedback(on=False))
-    assert dog.danger == "the feedback is off"
+    dog.danger.feedback_is(Feedback(on=True))
+    dog.danger.feedback_is(Feedback(on=False))
+    assert dog.danger.now == "the feedback is off"
     for action in ("x-engage", "x-approach-of-mine"):
         dog = retracted()
         dog.started(action, dog.states_seen)
-        assert dog.danger == "the feedback is off"
+        assert dog.danger.now == "the feedback is off"
         dog.started("x-retract", dog.states_seen, certain=False)
-        assert dog.danger == "the feedback is off"
+        assert dog.danger.now == "the feedback is off"
         dog.started("x-retract", dog.states_seen)
-        assert dog.danger is None
+        assert dog.danger.now is None
 
 
 def test_a_danger_that_can_not_be_seen_to_is_told() -> None:
     dog = off(FREE, retract=None)
     assert dog.control_taken(Cause.PROBLEM, None) == []
-    assert dog.left_in_danger() == "the feedback is off"
-    assert watchdog(ScopeState.COARSE_MOTOR).left_in_danger() == "the microscope is in COARSE_MOTOR"
-    assert off(FREE, dangerous=()).left_in_danger() is None
+    assert dog.danger.untold() == "the feedback is off"
+    assert watchdog(ScopeState.COARSE_MOTOR).danger.untold() == "the microscope is in COARSE_MOTOR"
+    assert off(FREE, dangerous=()).danger.untold() is None
 
 
 def test_with_the_feedback_on_a_scan_of_the_dead_is_only_stopped() -> None:
     dog = watchdog(SCANNING)
-    dog.feedback_is(Feedback(on=True))
+    dog.danger.feedback_is(Feedback(on=True))
     assert dog.control_taken(Cause.DEAD, None) == ["stop-scan"]
 
 
 def test_a_microscope_that_can_not_retract_is_not_asked_to() -> None:
     dog = watchdog(ScopeState.COARSE_MOTOR)
-    dog.cannot("x-retract")
+    dog.cannot_retract()
     assert dog.control_taken(Cause.DEAD, None) == []
     assert watchdog(ScopeState.COARSE_MOTOR, retract=None).control_taken(Cause.DEAD, None) == []
 
@@ -165,16 +164,16 @@ def test_silence_is_tried_again_and_given_up_loudly() -> None:
         assert dog.next_action() == "stop-scan"
         results.append(dog.answered(SILENCE, 0.0))
     assert results == [Result.AGAIN, Result.AGAIN, Result.FAILED]
-    assert dog.wanted == ()
+    assert dog.snapshot()["wanted"] == []
 
 
 def test_what_could_not_be_sent_is_sent_when_the_translator_is_back_unless_it_is_free_by_then() -> None:
     dog = watchdog(SCANNING)
     dog.control_taken(Cause.MANUAL, None)
     dog.next_action()
-    dog.unsent()
+    dog.unsent(0.0)
     assert dog.next_action() == "stop-scan"
-    dog.unsent()
+    dog.unsent(0.0)
     dog.scope_is(FREE)
     assert dog.next_action() is None
 
@@ -196,42 +195,52 @@ def test_a_tip_that_was_not_retracted_is_tried_again_and_again_ever_less_often()
     times, now_s = [], 100.0
     for _ in range(4):
         assert dog.left_to_people
+        assert dog.put_off
         assert dog.next_action() is None
-        assert not dog.wants_retract, "others may command meanwhile"
         assert dog.due_s is not None
         times.append(dog.due_s - now_s)
         now_s = dog.due_s
-        dog.try_again(now_s, attended=False)
-        assert dog.wants_retract
+        assert dog.look_again(now_s, is_seen_to=False) is None
+        assert not dog.put_off
         assert dog.next_action() == "x-retract"
         assert dog.answered(ERROR, now_s) is Result.FAILED
     assert times == [10.0, 20.0, 30.0, 30.0]
-    dog.try_again(now_s + 30.0, attended=False)
+    dog.look_again(now_s + 30.0, is_seen_to=False)
     assert dog.next_action() == "x-retract"
     assert dog.answered(OK, now_s + 30.0) is Result.DONE
-    assert (dog.due_s, dog.danger, dog.owes_retract) == (None, None, False)
+    assert (dog.due_s, dog.danger.now, dog.owes_retract) == (None, None, False)
 
 
 def test_who_is_there_to_see_to_a_tip_is_not_disturbed() -> None:
     dog = refused()
-    dog.try_again(110.0, attended=True)
+    dog.look_again(110.0, is_seen_to=True)
     assert (dog.next_action(), dog.due_s) == (None, None)
-    for cause in (Cause.MANUAL, Cause.RELEASED):
-        dog = refused()
-        dog.control_taken(cause, None)
-        assert (dog.next_action(), dog.due_s) == (None, None)
+    dog = refused()
+    dog.control_taken(Cause.MANUAL, None)
+    assert (dog.next_action(), dog.due_s) == (None, None)
+    dog = refused()
+    dog.control_taken(Cause.RELEASED, None, was_seen_to=True)
+    assert (dog.next_action(), dog.due_s) == (None, None)
+
+
+def test_who_gives_control_back_and_was_not_there_for_the_tip_knows_nothing_of_it() -> None:
+    dog = refused()
+    dog.control_taken(Cause.SOLVED, None, by_holder=True)
+    assert dog.put_off
+    dog.look_again(110.0, is_seen_to=False)
+    assert dog.next_action() == "x-retract"
 
 
 def test_who_came_to_see_to_a_tip_and_died_leaves_it_to_be_retracted_at_once() -> None:
     dog = refused()
-    assert dog.control_taken(Cause.DEAD, None) == ["x-retract"]
+    assert dog.control_taken(Cause.DEAD, None, was_seen_to=True) == ["x-retract"]
     assert dog.next_action() == "x-retract"
 
 
 def test_a_tip_that_is_out_of_danger_by_then_is_left_where_it_is() -> None:
     dog = refused()
-    dog.feedback_is(Feedback(on=True))
-    dog.try_again(110.0, attended=False)
+    dog.danger.feedback_is(Feedback(on=True))
+    dog.look_again(110.0, is_seen_to=False)
     assert (dog.next_action(), dog.due_s) == (None, None)
 
 
@@ -240,21 +249,71 @@ def test_a_microscope_that_is_never_free_for_it_is_left_to_people_and_tried_late
     dog.control_taken(Cause.DEAD, None)
     dog.next_action()
     assert dog.answered(NOT_FREE, 100.0) is Result.AGAIN
-    assert (dog.due_s, dog.left_to_people, dog.wants_retract) == (110.0, False, True)
-    assert (
-        dog.try_again(110.0, attended=True) == "the feedback is off, and the microscope is not free to retract the tip"
-    )
-    assert (dog.due_s, dog.left_to_people, dog.wants_retract) == (120.0, True, False)
-    dog.try_again(120.0, attended=False)
+    assert (dog.due_s, dog.left_to_people, dog.put_off) == (110.0, False, False)
+    told = dog.look_again(110.0, is_seen_to=True)
+    assert told == "the tip was left in danger and can't be retracted: the microscope is never free for that"
+    assert (dog.due_s, dog.left_to_people, dog.put_off) == (120.0, True, True)
+    dog.look_again(120.0, is_seen_to=False)
     assert dog.next_action() == "x-retract"
 
 
-def test_what_can_not_be_stopped_does_not_keep_the_tip_at_the_surface() -> None:
-    dog = off(SCANNING)
+def test_nobody_who_could_retract_is_there() -> None:
+    dog = off(FREE, again_s=10.0)
+    dog.control_taken(Cause.DEAD, None)
+    dog.next_action()
+    dog.unsent(100.0)
+    assert dog.due_s == 110.0
+    told = dog.look_again(110.0, is_seen_to=False)
+    assert told == "the tip was left in danger and can't be retracted: its translator is not there"
+    assert dog.left_to_people
+    dog.translator_is_there(115.0)
+    assert dog.due_s == 116.0, "what it says of the feedback is heard first"
+
+
+@pytest.mark.parametrize("answer", [OK, ERROR, NOT_FREE])
+def test_a_scan_that_goes_on_whatever_it_is_told_does_not_keep_the_tip_at_the_surface(answer: int) -> None:
+    dog = off(SCANNING, again_s=10.0)
     dog.control_taken(Cause.DEAD, None)
     assert dog.next_action() == "stop-scan"
-    assert dog.answered(ERROR, 0.0) is Result.FAILED
+    dog.answered(answer, 100.0)
+    dog.scope_is(SCANNING)
+    if answer == NOT_FREE:
+        assert dog.next_action() == "stop-scan"
+        dog.answered(answer, 100.0)
+    if answer != ERROR:
+        assert dog.next_action() is None
+        assert dog.due_s == 110.0
+        assert dog.look_again(110.0, is_seen_to=False) is not None
     assert dog.next_action() == "x-retract"
+
+
+def test_a_scan_that_was_not_seen_when_control_was_taken_is_stopped_first() -> None:
+    dog = off(ScopeState.UNDEFINED)
+    assert dog.control_taken(Cause.PROBLEM, None) == ["x-retract"]
+    dog.scope_is(SCANNING)
+    assert dog.next_action() == "stop-scan"
+    dog.answered(OK, 0.0)
+    dog.scope_is(ScopeState.INTERRUPTED)
+    assert dog.next_action() == "x-retract"
+
+
+def test_a_lost_microscope_goes_on_with_what_it_did() -> None:
+    dog = watchdog(ScopeState.COARSE_MOTOR, ScopeState.UNDEFINED)
+    assert dog.danger.now == "the microscope is in COARSE_MOTOR"
+    assert dog.control_taken(Cause.PROBLEM, None) == ["x-retract"]
+
+
+def test_what_nobody_knows_of_the_feedback_counts_as_off_until_it_is_known() -> None:
+    dog = watchdog(FREE)
+    dog.danger.feedback_is(Feedback(on=True))
+    dog.danger.feedback_may_be_off()
+    assert dog.danger.now == "the feedback is off"
+    dog.danger.feedback_was_left()
+    assert dog.danger.now is None
+    dog.danger.feedback_may_be_off()
+    dog.danger.feedback_is(Feedback(on=False))
+    dog.danger.feedback_was_left()
+    assert dog.danger.now == "the feedback is off"
 
 
 def test_what_a_microscope_can_not_do_is_not_tried_again() -> None:

@@ -137,6 +137,47 @@ def test_without_the_feedback_that_a_request_has_switched_off_the_tip_is_retract
     assert "the feedback off: the tip is retracted" in caplog.text
 
 
+class Killed(BaseException):
+    """The process, just here."""
+
+
+@pytest.mark.parametrize("answered", [False, True])
+def test_one_that_is_killed_while_it_switches_the_feedback_off_does_not_leave_that_to_nobody(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, answered: bool
+) -> None:
+    set_ = bench.microscope.set
+
+    def kill(*what: Any) -> None:
+        if not answered:
+            set_(*what)
+        raise Killed
+
+    whom, what = (bench.translator, "_observe_values") if answered else (bench.microscope, "set")
+    with monkeypatch.context() as patched:
+        patched.setattr(whom, what, kill)
+        with pytest.raises(Killed):
+            switched(bench, "false")
+    bench.start()
+    assert bench.translator.leaves_danger()
+    assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    assert bench.microscope.done == ["retract"]
+
+
+def broken(*_: Any) -> Any:
+    raise ValueError("a bug of the implementer, or a controller that makes no sense")
+
+
+@pytest.mark.parametrize("what", ["status", "load"])
+def test_the_way_out_is_open_whatever_else_is_wrong(bench: Any, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    switched(bench, "false")
+    bench.microscope.files["one.dat"] = []
+    monkeypatch.setattr(bench.microscope, what, broken)
+    for _ in range(3):
+        bench.look(after_s=1.0)
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    assert bench.microscope.done == ["retract"]
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_controller_that_is_lost_or_refuses_when_the_run_is_stopped_is_asked_again(
     bench: Any, caplog: pytest.LogCaptureFixture, lost: bool

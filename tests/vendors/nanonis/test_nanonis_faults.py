@@ -316,7 +316,7 @@ def test_a_tip_on_its_way_is_still_on_it_when_the_connection_comes_back(bench: M
     made.strike("cut")
     heard = peer.until(FREE)
     assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
-    assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((600e-9, 0.0))
+    assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((600e-9, 0.0), abs=1e-9)
 
 
 def test_software_that_vanishes_and_is_started_again_is_found_with_what_is_in_force_then(bench: Make) -> None:
