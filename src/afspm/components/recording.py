@@ -8,7 +8,7 @@ import sqlite3
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from afspm.clock import Clock
 from afspm.errors import FileError
 from afspm.model import Packet
 from afspm.record import ahead
-from afspm.record.journal import JOURNAL_FILE, SCHEDULER
+from afspm.record.journal import JOURNAL_FILE, SCHEDULER, damaged, is_damage
 from afspm.record.store import About, Store
 
 MOST_BYTES = 256 << 20
@@ -141,17 +141,30 @@ class Writer:
 
     def _run(self) -> None:
         try:
-            store = self._opened()
-            if store is None:
-                return
-            try:
-                while self._go_on(store):
-                    pass
-            finally:
-                store.close()
+            while (store := self._opened()) is not None and (damage := self._record_all(store)) is not None:
+                self._put_aside(damage)
+                # what was taken and is not recorded is written ahead, or kept by the scheduler
+                self._held, self._began_s = [], self._clock.monotonic_s()
+                with self._changed:
+                    self._wants_replay = True
+                self._wake()
         except BaseException as error:
             self._error = error
             self._wake()
+
+    def _record_all(self, store: Store) -> FileError | None:
+        """Record until it is over, or the journal turns out to be damaged: then it is said how."""
+        try:
+            while self._go_on(store):
+                pass
+        except sqlite3.DatabaseError as error:
+            if not is_damage(error):
+                raise
+            return damaged(self._folder / JOURNAL_FILE, error)
+        finally:
+            with suppress(sqlite3.DatabaseError):
+                store.close()
+        return None
 
     def _opened(self) -> Store | None:
         while True:

@@ -14,7 +14,8 @@ WANTED, TOLD = "DriftRescan", "DriftMapping"
 AGAIN, OPPOSITE, SEARCH = 1, 2, 3
 """The numbers of RescanKind."""
 FLAGGED_WITHIN_S = 5.0
-_BEFORE = "direction_before"
+BACK_WITHIN_S = 60.0
+_BEFORE, _FRAME_BEFORE = "direction_before", "frame_before"
 Pixels = tuple[int, int] | None
 
 _IN_WORDS = {AGAIN: "the same region again", OPPOSITE: "the other direction", SEARCH: "a wider region"}
@@ -49,6 +50,7 @@ class Rescanner(Component):
 
     def run(self) -> None:
         with self.scope.events(WANTED) as wanted, self.scope.events(TOLD, timeout_s=0.0) as told:
+            self._put_back_at_last()
             for event in wanted:
                 if event.message.timestamp.ToNanoseconds() <= int(self.memory.get("done_ns", -1)):
                     continue  # of a scan of ours, or from before a restart
@@ -56,6 +58,7 @@ class Rescanner(Component):
                     self._obey(event.message, told)
                 except ControlLost as lost:
                     self.log.info("no more to be scanned again: %s", lost.what)
+                self._put_back_at_last()
                 self.memory["done_ns"] = self.clock.now_ns()
                 self.memory.save()
 
@@ -90,8 +93,10 @@ class Rescanner(Component):
         region, shape = parameters.region, parameters.shape
         assert isinstance(region, Region)
         assert shape is None or isinstance(shape, tuple)
-        direction = self._turn(message)
         try:
+            self._turn(message)
+            if message.kind == SEARCH:
+                self._note_before(_FRAME_BEFORE, [*region.top_left_m, *region.size_m, list(shape) if shape else None])
             for attempt in range(self.attempts):
                 self._forget(told)
                 if message.kind == SEARCH:
@@ -102,21 +107,38 @@ class Rescanner(Component):
                     return True
             return False
         finally:
-            if direction is not None:
-                self.scope.set(names.SCAN_DIRECTION, direction)
-            self.memory.pop(_BEFORE, None)
-            if message.kind == SEARCH:
-                self._set_back(region, shape)
+            self._put_back()
 
-    def _turn(self, message: Any) -> str | None:
-        """Set the direction that is wanted; returns that in force before, where it is another."""
-        if not message.HasField("upwards"):
-            return None
-        wanted = names.UP if message.upwards else names.DOWN
-        before: str = self.memory.setdefault(_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
-        self.memory.save()  # else one that was killed meanwhile would take what it has set for what was there
-        self.scope.set(names.SCAN_DIRECTION, wanted)
-        return None if before == wanted else before
+    def _turn(self, message: Any) -> None:
+        """Set the direction that is wanted."""
+        if message.HasField("upwards"):
+            self._note_before(_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
+            self.scope.set(names.SCAN_DIRECTION, names.UP if message.upwards else names.DOWN)
+
+    def _note_before(self, name: str, value: Any) -> None:
+        """What was there before is kept until it is put back, also by one that is started after a kill."""
+        self.memory.setdefault(name, value)
+        self.memory.save()
+
+    def _put_back(self) -> None:
+        """What was changed to scan again: the next scan may take what it finds."""
+        if (direction := self.memory.get(_BEFORE)) is not None:
+            self.scope.set(names.SCAN_DIRECTION, direction)
+            self.memory.pop(_BEFORE)
+        if (frame := self.memory.get(_FRAME_BEFORE)) is not None:
+            self._set_back(*frame)
+            self.memory.pop(_FRAME_BEFORE)
+        self.memory.save()
+
+    def _put_back_at_last(self) -> None:
+        """The same where control was lost before that: somebody else has said that there is no drift."""
+        if _BEFORE not in self.memory and _FRAME_BEFORE not in self.memory:
+            return
+        try:
+            with self.scope.control(timeout_s=BACK_WITHIN_S):
+                self._put_back()
+        except (ControlLost, Refused) as error:
+            self.log.warning("direction and region of the scans before could not be set again: %s", error.what)
 
     def _search(self, region: Region, shape: Pixels, times: int) -> None:
         """Scan a wider region, or the widest that the limits and the scanner allow."""
@@ -140,9 +162,7 @@ class Rescanner(Component):
         rows, columns = (min(round((n - 1) * factor) + 1, max(self.most_pixels, n)) for n in shape)
         return wider, (rows, columns)
 
-    def _set_back(self, region: Region, shape: Pixels) -> None:
-        """The region of the scans before: the next scan may take what it finds."""
-        (left, low), (width, height) = region.top_left_m, region.size_m
+    def _set_back(self, left: float, low: float, width: float, height: float, shape: list[int] | None) -> None:
         values = {names.SCAN_SIZE_X: width, names.SCAN_SIZE_Y: height}
         values |= {names.SCAN_TOP_LEFT_X: left, names.SCAN_TOP_LEFT_Y: low}
         try:

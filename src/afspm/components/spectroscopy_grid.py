@@ -18,8 +18,8 @@ class SpectroscopyGrid(Component):
     Args:
         counts: (columns, rows) of the grid.
         spacing: (x, y) from one point to the next.
-        center: (x, y) of the middle of the grid.
-        angle: of the grid, counter-clockwise.
+        center: (x, y) of the middle of the grid; (0, 0) if not told.
+        angle: of the grid, counter-clockwise; 0 if not told.
         positions: a list of (x, y) instead of a grid.
         kind: what is measured, where the microscope can choose, e.g. "IV" or "force".
         repeats: how many spectra at each point.
@@ -32,8 +32,8 @@ class SpectroscopyGrid(Component):
         self,
         counts: tuple[int, int] | None = None,
         spacing: tuple[Length, Length] | None = None,
-        center: tuple[Length, Length] = (0.0, 0.0),
-        angle: Angle = 0.0,
+        center: tuple[Length, Length] | None = None,
+        angle: Angle | None = None,
         positions: list[tuple[Length, Length]] | None = None,
         kind: str | None = None,
         repeats: int = 1,
@@ -41,10 +41,18 @@ class SpectroscopyGrid(Component):
     ) -> None:
         if (positions is None) == (counts is None):
             raise ConfigError("either `positions` or `counts` says where to measure")
+        of_grid = {"spacing": spacing, "center": center, "angle": angle}
         if positions is not None:
+            for name, value in of_grid.items():
+                if value is not None:
+                    raise ConfigError(
+                        "is of a grid, and says nothing of `positions`, which are in scan coordinates", where=name
+                    )
             self.positions = tuple(pair(position) for position in positions)
         elif counts is not None and spacing is not None:
-            self.positions = grid_centers(pair(center), (counts[0], counts[1]), pair(spacing), angle)
+            self.positions = grid_centers(
+                pair(center or (0.0, 0.0)), (counts[0], counts[1]), pair(spacing), angle or 0.0
+            )
         else:
             raise ConfigError("a grid needs its `spacing`", hint='e.g. spacing = ["10 nm", "10 nm"]')
         if not self.positions:

@@ -57,7 +57,7 @@ class TipClassifier(Component):
         self.judge = TipJudge(reference_scans, Tolerance(detail, ghost, unrest, worn, sigmas))
         self.counter = Counter(flag_after, clear_after)
         self.problem = problem
-        self._problems: tuple[int, ...] = ()
+        self._problems: tuple[int, ...] | None = None  # not known yet
 
     def on_start(self) -> None:
         if "judge" in self.memory:
@@ -68,6 +68,8 @@ class TipClassifier(Component):
         was, self._problems = self._is_flagged, control_state.problems
         if self._is_flagged and not was and self.counter.bad < self.counter.flag_after:
             self.counter.good = 0  # somebody else saw something: only scans from now on can tell that it is over
+        elif was and not self._is_flagged:
+            self.counter.bad = 0  # somebody has seen to it: only scans from now on can tell that it is bad again
 
     def on_scan(self, scan: Scan) -> None:
         pair = self.pairing.add(scan)
@@ -78,11 +80,13 @@ class TipClassifier(Component):
 
     @property
     def _is_flagged(self) -> bool:
-        return self.scope.problems.number(self.problem) in self._problems
+        return self.scope.problems.number(self.problem) in (self._problems or ())
 
     def _judge(self, pair: HeightPair) -> None:
-        if not self.judge.has_learnt and self._problems:
-            self.log.info("not learnt from %s: a problem is flagged", _name(pair.trace))
+        if not self.judge.has_learnt and self._problems != ():
+            known = "a problem is flagged" if self._problems else "whether a problem was flagged is not known yet"
+            self.log.info("not learnt from %s: %s", _name(pair.trace), known)
+            self._remember(pair.trace)
             return
         try:
             verdict = pair.judged_by(self.judge)
@@ -96,7 +100,7 @@ class TipClassifier(Component):
     def _tell(self, scan: Scan, verdict: Verdict) -> None:
         """Flag or clear; then the verdict, so that who waits for it finds the flag as it should be."""
         self.log.info("%s: %s (%s)", _name(scan), verdict.opinion.value, verdict.why)
-        if self.counter.wants_flag and not self._is_flagged:
+        if verdict.opinion is Opinion.BAD and self.counter.wants_flag and not self._is_flagged:
             self.log.warning("the tip has changed: %s", verdict.why)
             self.scope.flag(self.problem)
         elif self.counter.wants_clear and self._is_flagged:

@@ -12,7 +12,7 @@ from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.components.tip_scans import Pairing
 from afspm.components.treatments import XY, Pulse, Treatment, clearance_m, fresh_place, treatments
 from afspm.components.verdicts import read_verdict
-from afspm.errors import ConfigError, ControlLost, FileError, NoResponse, Refused
+from afspm.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
 from afspm.model import Problem, Region, Scan, ScanSet, ScopeState, names
 from afspm.runtime.component import Component
 from afspm.runtime.events import Events
@@ -98,10 +98,12 @@ class TipCorrector(Component):
         wanted = ("ControlState",) if self.judge is None else ("ControlState", "Scan2d")
         with self.scope.events(*wanted) as events:
             self._look()
+            problems = self.scope.control_state.problems
             for event in events:
                 if isinstance(event.message, Scan):
-                    self._learn(event.message)
+                    self._learn(event.message, problems)
                 else:
+                    problems = event.message.problems  # as it was when the scans after it came
                     self._look()
 
     def _look(self) -> None:
@@ -131,15 +133,15 @@ class TipCorrector(Component):
         tried = int(self.memory.get("tried", 0))
         self.log.info("repairing the tip%s", f" ({tried} treatments were tried already)" if tried else "")
         with self.scope.events("ControlState", verdicts.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
-            if tried and self._is_cured(looks, shape, answers):  # a kill may have come between treatment and test
-                return
             try:
+                if tried and self._is_cured(looks, shape, answers):  # a kill may have come between treatment and test
+                    return
                 for number, treatment in enumerate(self.allowed[tried:], tried + 1):
                     if self._treat(number, treatment, (region, test)) and self._is_cured(looks, shape, answers):
                         self.log.info("the tip is repaired")
                         return
                 why = f"all {len(self.allowed)} treatments that are allowed were tried"
-            except FileError as error:
+            except (FileError, _Blind) as error:
                 why = error.what
         self._restore(region)
         self._give_up(why)
@@ -242,9 +244,21 @@ class TipCorrector(Component):
             self.scope.set(names.CRASH_SPEED, treatment.speed_m_per_s, "m/s")
 
     def _is_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
-        """Test scans until it is known whether the tip is good."""
+        """Test scans until it is known whether the tip is good.
+
+        Raises:
+            _Blind: none can be taken.
+        """
+        refused: list[str] = []
         for place in looks:
-            scans = self.scope.scan(place, shape=shape)
+            try:
+                scans = self.scope.scan(place, shape=shape)
+            except (Refused, NoResponse) as error:
+                self.log.warning("no test scan at %s: %s", _nm(place.center_m), error.what)
+                refused.append(error.what)
+                if len(refused) == len(looks):
+                    raise _Blind(f"no test scan can be taken: {error.what}") from error
+                continue
             score = self._own_score(scans) if self.judge is not None else self._score_of_others(scans, answers)
             if not self._is_flagged(self.problem):
                 return True
@@ -279,8 +293,8 @@ class TipCorrector(Component):
         self.log.warning("nobody judged the test scan within %.0f s: taken for bad", VERDICT_WITHIN_S)
         return verdicts.BAD
 
-    def _learn(self, scan: Scan) -> None:
-        if self.judge is None or self.judge.has_learnt or self.scope.control_state.problems:
+    def _learn(self, scan: Scan, problems: tuple[int, ...]) -> None:
+        if self.judge is None or self.judge.has_learnt or problems:
             return
         pair = self.pairing.add(scan)
         if pair is not None and pair.judged_by(self.judge).opinion is Opinion.LEARNING:
@@ -316,6 +330,10 @@ class TipCorrector(Component):
 
     def _is_flagged(self, problem: int | str) -> bool:
         return self.scope.problems.number(problem) in self.scope.control_state.problems
+
+
+class _Blind(AfspmError):
+    """Nobody can tell what the tip is like."""
 
 
 def _nm(place: XY) -> str:

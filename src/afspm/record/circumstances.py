@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,15 +56,21 @@ def stood(journal: sqlite3.Connection, time_ns: int, doing: ScopeState, measured
     )
 
 
-def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filename: str) -> dict[str, Any] | None:
-    """The mapping between tip and sample coordinates that a scan gave, which is published before it; None: none."""
+def drift(
+    journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str]
+) -> dict[str, Any] | None:
+    """The mapping between tip and sample coordinates that a scan gave, which is published before it; None: none.
+
+    Args:
+        filenames: of the channels of the scan.
+    """
     row = journal.execute(
         "SELECT payload FROM packets WHERE message = 'DriftMapping' AND time_ns <= ? AND time_ns > ?"
         " ORDER BY time_ns DESC LIMIT 1",
         (time_ns, -1 if since_ns is None else since_ns),
     ).fetchone()
     mapping = None if row is None else _decoded("DriftMapping", row[0])
-    if mapping is None or (mapping.filename and filename and mapping.filename != filename):
+    if mapping is None or (mapping.filename and any(filenames) and mapping.filename not in filenames):
         return None
     return {
         "time_ns": mapping.timestamp.ToNanoseconds(),

@@ -103,6 +103,11 @@ def read_only(path: PurePath) -> str:
     return f"{scheme}{'//' if place.startswith('/') else '////'}{place}?mode=ro"
 
 
+def is_damage(error: sqlite3.DatabaseError) -> bool:
+    """Whether it says that the file is damaged; others say that the disk is full, or that we made a mistake."""
+    return type(error) is sqlite3.DatabaseError
+
+
 def damaged(path: Path, error: Exception) -> FileError:
     """What to say of a journal that can't be read."""
     return error if isinstance(error, FileError) else FileError(f"is damaged: {error}", where=str(path))

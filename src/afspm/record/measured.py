@@ -103,7 +103,8 @@ class MeasuredFiles:
         filename = scans[0].filename if scans else ""
         number, name = self._next(SCANS, time_ns)
         facts = {**self._facts, **stood.facts(self._problems), "number": number, "interrupted": interrupted}
-        mapping = circumstances.drift(self._journal, published_ns, stood.began_ns, filename)
+        filenames = {scan.filename for scan in scans}  # some controllers write one for each channel
+        mapping = circumstances.drift(self._journal, published_ns, stood.began_ns, filenames)
         if mapping is not None:
             facts["drift"] = mapping
         at = Circumstances(time_ns, stood.began_ns, facts, header_of(filename, self._folder))

@@ -73,7 +73,16 @@ class Store:
         self._folder = folder
         self._about = about
         self._journal = journal.open_to_write(folder)
-        self._files = MeasuredFiles(folder, self._journal, about.facts, about.problems)
+        try:
+            self._begin(about)
+        except BaseException as error:
+            self._journal.close()
+            if isinstance(error, sqlite3.DatabaseError) and journal.is_damage(error):
+                raise journal.damaged(folder / journal.JOURNAL_FILE, error) from error
+            raise
+
+    def _begin(self, about: About) -> None:
+        self._files = MeasuredFiles(self._folder, self._journal, about.facts, about.problems)
         self._gathering = Gathering(circumstances.last_state(self._journal))
         newest = self._journal.execute("SELECT max(time_ns) FROM packets WHERE source = ?", (SCHEDULER,)).fetchone()[0]
         self._newest_ns = -1 if newest is None else int(newest)

@@ -121,6 +121,9 @@ class Measuring:
     def _taken_up(self, progress: _Progress) -> Cycle | None:
         """What an earlier life, or an earlier call, was at, if it was this."""
         intent, cycle = self._results.pending, self._resumed
+        if progress.key is None and cycle is not None:
+            self._keep_resumed(cycle, progress.until_s)
+            return None
         self._resumed = None
         if intent is None or intent["key"] != progress.key or intent["plan"] != progress.plan.facts:
             self._forget_resumed()
@@ -130,6 +133,13 @@ class Measuring:
         if cycle is not None:
             self._link.log.info("%s %s: taken up where it was", progress.plan.what, progress.key)
         return cycle
+
+    def _keep_resumed(self, cycle: Cycle, until_s: float | None) -> None:
+        """What comes now is not of it; what has come is kept for who asks by its key."""
+        if cycle.begun and cycle.outcome is None:
+            self._link.wait(lambda: cycle.outcome is not None, until_s)
+        self._forget_resumed()
+        self._resumed = cycle if cycle.outcome is not None else None
 
     def _is_complete(self, progress: _Progress, cycle: Cycle) -> bool:
         """Whether what was begun in an earlier life is, or gets, complete without asking again."""

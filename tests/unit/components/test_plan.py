@@ -122,6 +122,15 @@ def test_a_list_takes_the_tables_of_an_experiment_file() -> None:
 def test_spectra_need_either_a_grid_or_positions() -> None:
     assert SpectroscopyGrid(positions=[(1.0, 2.0)]).positions == ((1.0, 2.0),)
     assert len(SpectroscopyGrid(counts=(2, 3), spacing=(1.0, 1.0)).positions) == 6
-    for settings in ({}, {"positions": []}, {"counts": (2, 2)}, {"counts": (1, 1), "positions": [(0.0, 0.0)]}):
+    listed = {"positions": [(0.0, 0.0)]}
+    for settings in (
+        {},
+        {"positions": []},
+        {"counts": (2, 2)},
+        {"counts": (1, 1), **listed},
+        {"center": (1e-6, 0.0), **listed},
+        {"angle": 0.1, **listed},
+        {"spacing": (1e-6, 1e-6), **listed},
+    ):
         with pytest.raises(ConfigError):
             SpectroscopyGrid(**settings)  # type: ignore[arg-type]

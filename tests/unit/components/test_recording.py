@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
+import sqlite3
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -151,6 +152,31 @@ def test_a_damaged_journal_is_put_aside_and_told(bench: Bench, caplog: pytest.Lo
     assert bench.times() == [1]
     assert (bench.folder / f"{JOURNAL_FILE}.damaged-1").exists()
     assert any(record.levelname == "CRITICAL" and "put aside" in record.message for record in caplog.records)
+
+
+@pytest.mark.parametrize("table", ["packets", "packets_once", "packets_by_message"])
+def test_a_journal_that_is_damaged_further_in_is_put_aside_too(
+    bench: Bench, caplog: pytest.LogCaptureFixture, table: str
+) -> None:
+    writer = bench.writer()
+    writer.caught_up()
+    for number in range(1, 400):
+        writer.put(control(number), "")
+    writer.finish(ended=False)
+    journal = bench.folder / JOURNAL_FILE
+    with contextlib.closing(sqlite3.connect(journal)) as opened:
+        (page,) = opened.execute("SELECT rootpage FROM sqlite_master WHERE name = ?", (table,)).fetchone()
+    content = bytearray(journal.read_bytes())
+    size = int.from_bytes(content[16:18], "big")
+    content[(page - 1) * size : page * size] = b"\xff" * size
+    journal.write_bytes(content)
+    again = bench.writer()
+    again.caught_up()
+    again.put(control(1000), "")
+    again.finish(ended=True)
+    assert (bench.folder / f"{JOURNAL_FILE}.damaged-1").exists()
+    assert any("put aside" in record.message for record in caplog.records)
+    assert again.wants_replay or bench.times() == [1000], "what was lost with it is asked for again"
 
 
 def test_what_ends_the_writing_is_raised_where_it_is_noticed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

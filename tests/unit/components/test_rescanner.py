@@ -92,6 +92,19 @@ def test_the_other_direction_is_scanned_and_the_direction_set_back() -> None:
     assert lab.problems == ()
 
 
+@pytest.mark.parametrize("kind", [OPPOSITE, SEARCH])
+def test_direction_and_region_are_set_back_when_somebody_else_says_that_there_is_no_drift(kind: int) -> None:
+    lab = Drifting([])
+    lab.at(10.0, lambda: lab.wants(kind, upwards=False))
+    lab.at(60.0, lambda: lab.clear(DRIFT))
+    lab.at(5000.0, lab.kill)
+    assert run(Rescanner(), lab) == ExitCode.ENDED
+    assert lab.values[names.SCAN_DIRECTION] == names.UP
+    if kind == SEARCH:
+        assert float(lab.values[names.SCAN_SIZE_X]) == pytest.approx(REGION.size_m[0])
+        assert float(lab.values[names.SCAN_RESOLUTION_X]) == 8
+
+
 def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_back() -> None:
     lab = asked(SEARCH, ["lost", "lost", "unmatched"])
     assert [region.size_m[0] for region in lab.finished] == pytest.approx([2e-6, 4e-6, 8e-6])

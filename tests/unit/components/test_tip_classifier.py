@@ -10,7 +10,8 @@ from tip_scans_lab import channels
 from afspm import wire
 from afspm.components.tip_classifier import TipClassifier
 from afspm.components.verdicts import BAD, GOOD, MESSAGE, read_verdict
-from afspm.model import ControlRequest, Problem, Scan
+from afspm.logic.arbitration import Event
+from afspm.model import ControlRequest, Problem, Region, Scan
 from afspm.runtime.exit_codes import ExitCode
 
 TIP = Problem.TIP_SHAPE_CHANGED
@@ -100,6 +101,36 @@ def test_nothing_is_learnt_while_a_problem_is_flagged() -> None:
     component = classifier()
     run(component, lab)
     assert component.judge.reference is None
+
+
+def test_a_tip_that_somebody_has_seen_to_is_flagged_by_what_is_bad_from_then_on() -> None:
+    lab = Lab("tip_classifier")
+    pairs = channels(1, "double", 5)
+    for number, pair in enumerate((*pairs[:3], pairs[5])):
+        publish_at(lab, 100.0 * (number + 1), pair)
+    lab.at(500.0, lambda: lab.clear(TIP))
+    elsewhere = Region((0.0, 0.0), (5e-6, 5e-6))  # an overview, of which it can't tell
+    for scan in pairs[3]:
+        overview = Scan(elsewhere, scan.channel, scan.unit, scan.values, (pairs[5][0].time_ns or 0) + 10**9)
+        lab.at(600.0, lambda overview=overview: lab.publish(overview))
+    lab.at(800.0, lab.kill)
+    run(classifier(), lab)
+    assert lab.control.published().problems == ()
+    assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 1
+
+
+def test_what_was_rightly_not_learnt_from_is_not_after_a_restart_either(tmp_path: Path) -> None:
+    lab = Lab("tip_classifier")
+    lab.at(50.0, lambda: lab.flag(TIP))
+    publish_at(lab, 100.0, channels(1, "double", 5)[5])
+    lab.at(120.0, lambda: lab.does(Event.REQUEST_CONTROL, "tip_corrector", TIP))  # who is in control is told after it
+    lab.at(200.0, lab.parent_goes)
+    run(classifier(), lab, tmp_path)
+    lab.restart_component()
+    lab.at(50.0, lab.kill)
+    again = classifier()
+    run(again, lab, tmp_path)
+    assert again.judge.reference is None
 
 
 def test_channels_of_two_scans_are_not_taken_for_one() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from runtime_lab import REGION, Kill9, Lab, LabPort, context_of, run
+from tip_scans_lab import HOME, channels
 
 from afspm import wire
 from afspm.components.tip_corrector import TipCorrector
@@ -164,6 +165,57 @@ def test_a_treatment_that_a_limit_refuses_is_left_out(caplog: pytest.LogCaptureF
     run(corrector(), lab)
     assert len(lab.actions) == 1  # the second pulse, of -4 V
     assert "above the limit of 2 V" in caplog.text
+
+
+def test_a_test_scan_that_is_refused_is_told_and_the_next_taken_instead(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Repairs([GOOD])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(5000.0, lab.kill)
+    lab.intercept = lambda request: out_of_limits(request, lambda region: region.center_m[1] > 3e-6)
+    assert run(corrector(test_center=(0.0, 4e-6)), lab) == ExitCode.ENDED
+    assert lab.finished == [REGION]
+    assert lab.problems == ()
+    assert "no test scan at (0, 4000) nm" in caplog.text
+
+
+def test_a_tip_of_which_no_test_scan_can_be_taken_is_not_treated_any_further() -> None:
+    lab = Repairs([])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(5000.0, lab.kill)
+    lab.intercept = lambda request: (
+        Response(ControlResponse.ACTION_ERROR, reason="outside") if request.subject == "start-scan" else "go on"
+    )
+    assert run(corrector(), lab) == ExitCode.ENDED
+    assert len(lab.actions) == 1
+    assert lab.problems == (TIP, MALFUNCTION)
+
+
+def out_of_limits(request: Request, is_out: Callable[[Region], bool]) -> Response | str:
+    frame = request.subject
+    if isinstance(frame, ScanParameters) and isinstance(frame.region, Region) and is_out(frame.region):
+        return Response(ControlResponse.PARAM_ERROR, reason="outside the limits")
+    return "go on"
+
+
+def test_its_own_judge_learns_nothing_from_the_test_scans_of_a_bad_tip() -> None:
+    pairs = channels(1, "double", 6)
+
+    class OfDoubleTip(Repairs):
+        def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
+            for scan in pairs[6 + len(self.finished) % 4]:
+                self.publish(Scan(region, scan.channel, scan.unit, scan.values, self.clock.now_ns()))
+
+    lab = OfDoubleTip([])
+    lab.parameters = ScanParameters(HOME, (96, 96))
+    lab.publish(lab.parameters)
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(400.0, lambda: lab.clear(TIP))
+    lab.at(4000.0, lab.kill)
+    repairing = corrector(judge="self", reference_scans=3, crash_depths=())
+    run(repairing, lab)
+    assert len(lab.finished) >= 3
+    assert repairing.judge is not None
+    assert repairing.judge.reference is None
 
 
 def test_no_treatment_near_what_is_scanned() -> None:

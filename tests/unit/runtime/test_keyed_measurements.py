@@ -115,6 +115,24 @@ def test_a_scan_that_was_finished_during_the_death_is_found_in_the_cache(tmp_pat
     assert lab.control.holder is None, "control of the earlier life is given back"
 
 
+def test_what_is_measured_without_a_key_first_does_not_forget_the_scan_with_one(tmp_path: Path) -> None:
+    def measure(scope: Scope) -> None:
+        scope.spectrum()
+        scope.scan(TILES[0], shape=(8, 8), key="tile-0")
+
+    lab = Lab()
+    port = LabPort(lab)
+    kill_in(lab, 155.0, port)  # the spectrum took 100 s
+    with pytest.raises(Kill9):
+        measure(scope_of(lab, tmp_path, 0, port))
+    while lab._happenings:  # it ends while nobody is there
+        lab.poll(1000.0)
+    assert len(lab.finished) == 1
+    lab.restart_component()
+    measure(scope_of(lab, tmp_path, 1))
+    assert len(lab.finished) == 1
+
+
 def test_a_scan_that_is_finished_while_a_later_life_waits_for_control_is_taken_up(tmp_path: Path) -> None:
     lab = Lab()
     lab.begin_unheard(TILES[0], in_s=20.0)

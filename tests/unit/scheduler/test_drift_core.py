@@ -54,6 +54,24 @@ def test_all_channels_of_a_scan_wait_for_it_and_get_the_same_mapping(lab: Lab) -
     np.testing.assert_array_equal(lab.published("Scan2d")[0].values, np.ones(SHAPE))
 
 
+@pytest.mark.parametrize("channels", [("ADC", "Topo", "Topo Retrace"), ("Topo", "Topo Retrace", "ADC", "ADC Retrace")])
+def test_channels_that_come_in_files_of_their_own_are_of_one_scan(lab: Lab, channels: tuple[str, ...]) -> None:
+    """As GXSM writes them."""
+    lab.take_control()
+    lab.scope_is(ScopeState.SCANNING)
+    lab.now_s += 256.0
+    end_ns = lab.now_ns
+    for channel in channels:
+        unit = "m" if channel.startswith("Topo") else "V"
+        lab.publish(Scan(HERE, channel, unit, np.ones(SHAPE), end_ns, f"scan001-{channel}.nc"))
+    lab.scope_is(ScopeState.FREE)
+    (job,) = lab.worker.jobs
+    lab.says(registered(job, forecast(DRIFT)))
+    assert centers(lab) == [pytest.approx(BACK, abs=1e-16)] * len(channels)
+    assert not rescans(lab), "none of them counts as a scan without a height"
+    assert not problems(lab)
+
+
 def test_the_middle_of_a_scan_is_between_its_beginning_and_its_own_end(lab: Lab) -> None:
     """However late its file comes."""
     lab.scope_is(ScopeState.SCANNING)

@@ -401,6 +401,8 @@ class DriftCore:
 
 
 def scan_key(scan: Scan, packet: Packet) -> str:
-    """What all channels of a scan share, and no other scan has."""
-    time_ns = packet.time_ns if scan.time_ns is None else scan.time_ns
-    return f"{scan.filename} {time_ns}"
+    """What all channels of a scan share, and no other scan has: its time, since some controllers write a file for each
+    channel; the file where there is no time."""
+    if scan.time_ns is None and scan.filename:
+        return scan.filename
+    return f"at {packet.time_ns if scan.time_ns is None else scan.time_ns} ns"
