@@ -41,7 +41,7 @@ def ask(rig: Any, socket: Any, frames: list[bytes]) -> list[bytes]:
 
 def test_a_plain_component_takes_control_and_commands_with_the_golden_requests(rig: Any, plain: Any) -> None:
     rig.start()
-    rig.component("Ours")
+    rig.linked(rig.component("Ours"))
     peer = requester(rig, plain, "Peer")
     forwarded = [frames for frames in REQUESTS.values() if frames[0][0] in (1, 2, 3, 4, 5, 12)]
     assert ask(rig, peer, REQUEST_CONTROL)[0] == SUCCESS
@@ -52,7 +52,7 @@ def test_a_plain_component_takes_control_and_commands_with_the_golden_requests(r
 
 def test_a_restarted_plain_component_is_the_same_client(rig: Any, plain: Any) -> None:
     rig.start()
-    rig.component("Ours")
+    rig.linked(rig.component("Ours"))
     first = requester(rig, plain, "Peer")
     assert ask(rig, first, REQUEST_CONTROL)[0] == SUCCESS
     first.close()
