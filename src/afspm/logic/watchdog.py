@@ -101,8 +101,8 @@ class Watchdog:
         self.danger.restore(state["danger"])
 
     def begin(self, now_s: float) -> None:
-        """After `restore`: what has happened meanwhile is heard of first."""
-        if self._put_off:
+        """After `restore`: what has happened meanwhile is heard of first, and the translator may not be there."""
+        if self.owes_retract:
             self._due_s = now_s + self._settings.again_s
 
     @property

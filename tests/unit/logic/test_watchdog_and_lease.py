@@ -270,6 +270,16 @@ def test_nobody_who_could_retract_is_there() -> None:
     assert dog.due_s == 116.0, "what it says of the feedback is heard first"
 
 
+def test_nor_is_one_there_for_a_scheduler_that_is_restarted() -> None:
+    dog = off(FREE)
+    dog.control_taken(Cause.DEAD, None)
+    again = Watchdog()
+    again.restore(dog.snapshot())
+    again.begin(100.0)
+    assert again.look_again(110.0, is_seen_to=False) is not None
+    assert again.left_to_people
+
+
 @pytest.mark.parametrize("answer", [OK, ERROR, NOT_FREE])
 def test_a_scan_that_goes_on_whatever_it_is_told_does_not_keep_the_tip_at_the_surface(answer: int) -> None:
     dog = off(SCANNING, again_s=10.0)
