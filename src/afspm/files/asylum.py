@@ -57,11 +57,22 @@ def parsed_note(text: str) -> dict[str, str]:
 
 
 def center_and_angle(note: Note) -> tuple[tuple[float, float], float]:
-    """Of the scan: (x, y) in m, and radians counter-clockwise. Raises FileError if the note does not say."""
+    """Of the scan: (x, y) in m, and radians counter-clockwise. Raises FileError if the note does not say where."""
     center = (number(note, "XOffset"), number(note, "YOffset"))
     if center[0] is None or center[1] is None:
         raise FileError("the note does not say where it was scanned (XOffset, YOffset)")
-    return (center[0], center[1]), math.radians(number(note, "ScanAngle") or 0.0)
+    return (center[0], center[1]), counter_clockwise(number(note, "ScanAngle") or 0.0)
+
+
+def counter_clockwise(scan_angle_deg: float) -> float:
+    """ScanAngle in radians as everybody else counts them: Asylum turns the fast axis to (cos, -sin) of it, clockwise,
+    about a centre that is not turned (so its software reckons where a scan begins, and where lithography goes)."""
+    return 0.0 - math.radians(scan_angle_deg)
+
+
+def clockwise(angle_rad: float) -> float:
+    """The reverse, in degrees."""
+    return 0.0 - math.degrees(angle_rad)
 
 
 def number(note: Note, key: str) -> float | None:

@@ -30,12 +30,7 @@ MOVES: Final = frozenset(FRAME + POSITION)
 
 def watched(table: ParameterTable) -> list[str]:
     """The parameters whose changes are published, as far as the microscope has them."""
-    return [name for name in FRAME + FEEDBACK + POSITION if name in table]
-
-
-def differ(a: Mapping[str, Value], b: Mapping[str, Value], table: ParameterTable) -> bool:
-    """Whether any watched value differs by more than the controller's precision."""
-    return a.keys() != b.keys() or any(not table[name].same(a[name], b[name]) for name in a)
+    return [name for name in (*FRAME, *FEEDBACK, names.ENGAGED, *POSITION) if name in table]
 
 
 def messages(values: Mapping[str, Value]) -> dict[str, Published]:
@@ -74,10 +69,12 @@ def frame(values: Mapping[str, Value]) -> tuple[Region, tuple[int, int]]:
 
 
 def feedback(values: Mapping[str, Value]) -> Feedback:
-    """The z feedback that values describe."""
+    """The z feedback that values describe. Of a tip that is known to be withdrawn nobody is told that it is without
+    feedback, which would be a danger at the sample."""
     on = values.get(FEEDBACK_ON)
+    is_away = values.get(names.ENGAGED) is False
     return Feedback(
-        on=None if on is None else bool(on),
+        on=None if on is None or (is_away and not on) else bool(on),
         proportional_gain=_optional(values, names.ZCTRL_PGAIN),
         integral_gain=_optional(values, names.ZCTRL_IGAIN),
         setpoint=_optional(values, names.ZCTRL_SETPOINT),

@@ -249,7 +249,7 @@ class Translator:
         One that was begun since the last look, by this process or by one that was killed then.
         """
         self._values = values
-        is_on, kept = values.get(names.FEEDBACK_ON), self._kept
+        is_on, kept = in_force.feedback(values).on, self._kept
         switched_off = is_on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
         kept["feedback_off"] = is_on is False and (switched_off or bool(kept.get("feedback_off")))
         kept["feedback_was_on"], kept["may_have_switched"] = is_on, False

@@ -72,6 +72,8 @@ FEEDBACK_ON: Final = "x-feedback-on"
 ON_WORDS: Final = frozenset({"true", "1", "on", "yes"})
 OFF_WORDS: Final = frozenset({"false", "0", "off", "no"})
 """How a peer may say what a switch is to be, in lower case."""
+ENGAGED: Final = "x-engaged"
+"""Whether the tip is at the sample, where a microscope tells; it can only be read."""
 CONTROLLER: Final = "x-controller"
 """The controller's name and version, as a text that can only be read."""
 

@@ -68,7 +68,7 @@ def wave(values: np.ndarray, unit: str, steps: tuple[float, ...], labels: list[s
 
 
 NOTE = (
-    f"XOffset: 3e-07\rYOffset: -2e-07\rScanAngle: {ANGLE_DEG!r}\rScanDown: 1\rScanRate: 2\rNapMode: 0\r"
+    f"XOffset: 3e-07\rYOffset: -2e-07\rScanAngle: {-ANGLE_DEG!r}\rScanDown: 1\rScanRate: 2\rNapMode: 0\r"
     "StartHeadTemp: 30 °C\rSeconds:3782844800\rXLVDT:1e-6\rYLVDT:-2e-6\rInitial ScanRate: 7"
 )
 

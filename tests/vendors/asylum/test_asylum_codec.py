@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from afspm.emulators.asylum import wire
 from afspm.errors import AfspmError, ConfigError, InvalidValue
+from afspm.files.asylum import center_and_angle
 from afspm.microscopes.asylum import Asylum, xop
 from afspm.microscopes.asylum.folders import local
 from afspm.microscopes.asylum.frame import NAMES, asylums, from_image, generic, on_image
@@ -209,6 +210,17 @@ def test_a_frame_that_never_ends_is_refused(value: float) -> None:
     before = generic(there | {"ScanPoints": 8, "ScanLines": 8, "ScanRate": 1.0})
     with pytest.raises(InvalidValue):
         asylums({names.SCAN_SPEED: value}, before)
+
+
+def test_angles_are_clockwise_at_asylum() -> None:
+    """As its software reckons where a scan begins: the fast axis lies along (cos, -sin) of ScanAngle."""
+    there = {"XOffset": 0.0, "YOffset": 0.0, "FastScanSize": 2e-6, "SlowScanSize": 1e-6, "ScanAngle": 90.0}
+    told = generic(there | {"ScanPoints": 8, "ScanLines": 8, "ScanRate": 1.0})
+    corner = (told[names.SCAN_TOP_LEFT_X], told[names.SCAN_TOP_LEFT_Y])
+    region = Region.from_top_left(corner, (2e-6, 1e-6), float(told[names.SCAN_ANGLE]))
+    first, along = region.corners_m()[:2]
+    assert along - first == pytest.approx((0.0, -2e-6), abs=1e-18)
+    assert math.degrees(center_and_angle({"XOffset": "0", "YOffset": "0", "ScanAngle": "30"})[1]) == pytest.approx(-30)
 
 
 @given(places, places, st.floats(-math.pi, math.pi))

@@ -201,7 +201,7 @@ def test_the_frame_as_asylum_has_it(bench: Make) -> None:
     assert values.get("ScanSize") == pytest.approx(300e-9)
     assert values.get("SlowRatio") / values.get("FastRatio") == pytest.approx(1 / 3)
     assert values.size() == pytest.approx((300e-9, 100e-9))
-    assert values.get("ScanAngle") == pytest.approx(30.0)
+    assert values.get("ScanAngle") == pytest.approx(-30.0), "clockwise"
     assert (values.get("ScanPoints"), values.get("ScanLines")) == (32, 12)
 
 
@@ -229,6 +229,21 @@ def test_feedback_is_set_and_switched(bench: Make) -> None:
     assert made.emulator.controller.values.get("AmplitudeSetpointVolts") == pytest.approx(0.6)
     assert peer.set(names.FEEDBACK_ON, True).ok
     assert peer.get(names.FEEDBACK_ON) == "true"
+
+
+def test_of_a_withdrawn_tip_it_is_not_told_that_it_is_without_feedback(bench: Make) -> None:
+    """It is in no danger: a scheduler would have it retracted, and call a person."""
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.act(names.STOP_SCAN).ok
+    heard = [*peer.until(lambda one: isinstance(one, Feedback)), *peer.until(FREE)]
+    assert [one.on for one in heard if isinstance(one, Feedback)] == [None]
+    assert (peer.get(names.FEEDBACK_ON), peer.get(names.ENGAGED)) == ("false", "false")
+    assert peer.act(names.ENGAGE).ok
+    peer.until(lambda one: isinstance(one, Feedback) and one.on is True)
 
 
 def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,7 +281,8 @@ def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make
     made = bench(speed=5.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
-    assert "the run is stopped with the feedback off: the tip is retracted" in made.said()
+    why = "Asylum has withdrawn the tip" if scanning else "the run is stopped with the feedback off"
+    assert why in made.said()
 
 
 def test_a_tip_without_feedback_stays_where_the_file_says_so(bench: Make) -> None:
@@ -394,6 +410,15 @@ def test_the_probe_goes_where_it_is_sent_also_on_a_turned_image(bench: Make) -> 
     assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
 
 
+def test_the_probe_goes_where_it_is_sent_whatever_spot_is_chosen_at_the_panel(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    made.at_panel(lambda emulator: emulator.controller.values.put("ForceSpotNumber", 0))
+    moved_exactly(peer, 70e-9, 10e-9)
+    assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
+
+
 def test_before_the_first_scan_spots_count_on_the_image_that_is_open(bench: Make) -> None:
     made = bench()
     peer = made.start()
@@ -457,6 +482,21 @@ def test_a_force_curve_comes_with_the_place_where_it_was_taken(bench: Make) -> N
     raw, deflection = curve.values[:, 0], curve.values[:, 1]
     assert raw[0] == raw[-1] == 0.0
     assert deflection[raw.argmax()] == pytest.approx(deflection.max(), rel=0.1)
+
+
+def test_of_a_force_curve_after_a_scan_the_place_is_told_that_its_file_has(
+    bench: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scan leads the tip away from where it was sent."""
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    moved_exactly(peer, 70e-9, 10e-9)
+    scanned(peer)
+    monkeypatch.setattr(made.emulator.rig, "_probe_m", (120e-9, 5e-9))
+    assert peer.act(names.START_SPEC).ok
+    (curve,) = [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
+    assert curve.position_m == pytest.approx((120e-9, 5e-9), rel=1e-4)
 
 
 def test_a_force_curve_that_is_stopped_gives_none(bench: Make) -> None:

@@ -443,6 +443,36 @@ def test_a_scan_started_at_the_panel_is_published(bench: Make) -> None:
     assert {scan.region for scan in scans(heard)} == {TURNED}
 
 
+def test_a_scan_ends_though_repeat_is_on_at_the_panel(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    made.at_panel(lambda emulator: setattr(emulator.program, "repeats", True))
+    assert len(scanned(peer)) == 4
+
+
+def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Make) -> None:
+    """An hour back is more than a scan lasts: each of them seems to have begun before the one before it."""
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    for behind_s in (0.0, 3600.0, 7200.0):
+        made.at_panel(lambda emulator, behind_s=behind_s: setattr(emulator.program, "behind_s", behind_s))
+        assert len(scanned(peer)) == 4
+
+
+def test_what_a_redpitaya_measures_at_its_panel_does_not_publish_the_scan_before_again(bench: Make) -> None:
+    """It does not tell a spectrum from a scan, and what is in its memory is saved again when it is over."""
+    made = bench(speed=5.0, card="RPSPMC")
+    peer = made.start()
+    ready(peer)
+    assert len(scanned(peer)) == 4
+    made.at_panel(lambda emulator: emulator.program.take_curve("IV"))
+    heard = peer.until(FREE)
+    assert states(heard)[0] == "SCANNING", "it is taken for one"
+    assert not scans(heard)
+
+
 def test_busy_is_said(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start()

@@ -284,6 +284,19 @@ def test_after_the_safe_tip_nothing_is_measured_until_the_tip_is_brought_back(be
     assert scans(peer.until(FREE))
 
 
+def test_a_scan_that_goes_on_in_the_air_is_none(bench: Make) -> None:
+    made = bench(speed=SEEN)
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.strike("safe-tip-unnoticed")
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"]
+    assert not scans(heard)
+    made.until_said("Nanonis' safe tip has withdrawn the tip")
+    assert "safe tip" in peer.act_once_free(names.START_SCAN).reason
+
+
 def test_a_scan_that_ended_while_the_connection_was_lost_is_not_lost(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = small(made)

@@ -295,6 +295,17 @@ def test_retracting_breaks_a_scan_off(bench: Make) -> None:
     assert not made.emulator.rig.engaged
 
 
+def test_retracting_ends_an_auto_approach_which_would_bring_the_tip_back(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = made.start(actions={"x-approach": {"command": "AutoApproach.OnOffSet 1"}})
+    peer.until(FREE)
+    assert peer.act("x-approach").ok
+    peer.until(ScopeState.COARSE_MOTOR)
+    assert peer.act(names.RETRACT).ok
+    peer.until(FREE)
+    assert not made.emulator.rig.engaged
+
+
 @pytest.mark.parametrize("scanning", [False, True])
 def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make, scanning: bool) -> None:
     made = bench(speed=5.0)

@@ -156,7 +156,7 @@ class Controller:
     def _frame(self) -> Region:
         """Of the next image."""
         center = (self.values.get("XOffset"), self.values.get("YOffset"))
-        return Region(center, self.values.size(), math.radians(self.values.get("ScanAngle")))
+        return Region(center, self.values.size(), 0.0 - math.radians(self.values.get("ScanAngle")))  # clockwise
 
     def _image_done(self, now_s: float) -> None:
         scan = self.rig.scan

@@ -48,6 +48,8 @@ class Program:
         auto_save: of scans; probe_auto_save of spectra.
         channels: that a scan records.
         dialogs: what dialogs on the screen say.
+        behind_s: how much the clock of its computer, which files tell, is behind; it may be set at any time.
+        repeats: a scan is followed by the next.
     """
 
     def __init__(
@@ -66,6 +68,8 @@ class Program:
         self.rig, self.faults, self.clock, self.folder = rig, faults, clock, folder
         self.version, self.card = version, card
         self.dialogs: list[str] = []
+        self.behind_s = 0.0
+        self.repeats = False
         self.entries = Entries(version, user_unit, decimal_comma=decimal_comma, dialogs=self.dialogs.append)
         self.auto_save, self.probe_auto_save = True, True
         self.channels: list[Channel] = [one for one in CHANNELS[version] if one.source in rig.channels]
@@ -131,6 +135,8 @@ class Program:
             self._scanning = False
             if self.auto_save:
                 self.save(now_s)
+            if self.repeats:
+                self.start_scan()
         if self.curve is not None and not self.curve.running(now_s):
             curve, self.curve = self.curve, None
             if self.probe_auto_save:
@@ -203,8 +209,8 @@ class Program:
             channel.dz,
             channel.unit,
             self.last_frame,
-            scan.start_s,
-            scan.end_s,
+            scan.start_s - self.behind_s,
+            scan.end_s - self.behind_s,
             CARDS[self.card],
             scan.bias_v,
         )

@@ -102,6 +102,9 @@ def _z_controllers(panel: Panel) -> Answer:
 
 @answers("ZCtrl.Withdraw")
 def _withdraw(panel: Panel, wait: int, timeout_ms: int) -> Answer:
+    """An auto-approach that goes on meanwhile brings the tip back."""
+    if _approaches(panel):
+        return until_free(panel, wait, timeout_ms)
     panel.rig.withdraw()
     panel.z_controller = "off"
     panel.rig.feedback = replace(panel.rig.feedback, on=False)
@@ -113,12 +116,18 @@ def _approach_set(panel: Panel, on: int) -> Answer:
     if on:
         panel.rig.engage()
         panel.set_z_controller(panel.clock.now_s(), on=True)
+    elif _approaches(panel):
+        panel.rig.withdraw()
     return ()
 
 
 @answers("AutoApproach.OnOffGet")
 def _approach_get(panel: Panel) -> Answer:
-    return (int(panel.rig.engaged and panel.rig.doing(panel.clock.now_s()) == "approach"),)
+    return (int(_approaches(panel)),)
+
+
+def _approaches(panel: Panel) -> bool:
+    return panel.rig.engaged and panel.rig.doing(panel.clock.now_s()) == "approach"
 
 
 @answers("Bias.Set")

@@ -28,6 +28,7 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
     "no-start": "a scan does not begin, and nobody is told",
     "ends-at-once": "for the duration, who waits for the end of a scan while there is none is answered at once",
     "safe-tip": "the safe tip withdraws the tip and ends the scan",
+    "safe-tip-unnoticed": "the safe tip withdraws the tip, and the scan goes on in the air",
     "panel-stop": "somebody stops the scan at the panel",
 }
 MODULES: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
@@ -125,6 +126,9 @@ class Panel:
             self.rig.stop_scan()
         if self.faults.strikes("safe-tip", now_s):
             self.rig.withdraw()
+            self.z_controller = "safe"
+        if self.scanning is not None and self.faults.strikes("safe-tip-unnoticed", now_s):
+            self.rig.engaged = False
             self.z_controller = "safe"
 
     def begin_scan(self, upwards: bool) -> None:

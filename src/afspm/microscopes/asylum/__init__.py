@@ -22,10 +22,9 @@ from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
 
-ENGAGED: Final = "x-engaged"
-
 _AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC_KIND: FORCE}
 _SPOTS: Final = ("image", "scanner", "none")
+_OUR_SPOT: Final = 1.0
 _NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
 """Of a wave of Igor's, with room for the number; it is a file's name, too."""
 
@@ -46,7 +45,7 @@ class Asylum(Microscope):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    translated = (*NAMES, *POSITION, *_AT_FIRST, FEEDBACK_ON, ENGAGED, names.CONTROLLER)
+    translated = (*NAMES, *POSITION, *_AT_FIRST, FEEDBACK_ON, names.ENGAGED, names.CONTROLLER)
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 
@@ -84,7 +83,7 @@ class Asylum(Microscope):
         self._session: Session | None = None
         self._own: dict[str, Callable[[Session], Value]] = {
             FEEDBACK_ON: Session.feedback_on,
-            ENGAGED: lambda session: session.doing().engaged,
+            names.ENGAGED: lambda session: session.doing().engaged,
             names.CONTROLLER: Session.controller,
         }
 
@@ -198,6 +197,7 @@ class Asylum(Microscope):
     def _send_probe(self, place: Mapping[str, Value]) -> None:
         x, y = (float(place.get(name, was)) for name, was in zip(POSITION, self._probe_m(), strict=True))
         self._put_spot((x, y))
+        self._igor.put("ForceSpotNumber", _OUR_SPOT)  # whatever is chosen at the panel
         if not self._igor.do("DoForceFunc", "Go"):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum refuses to move the tip")
         self._activity.moves(self._move_s)

@@ -30,7 +30,8 @@ class Activity:
 
     Args:
         harvest: takes what comes of it.
-        kept: JSON-able, and lasts: the frame of the image that spots are counted on, and until when the tip moves.
+        kept: JSON-able, and lasts: the frame of the image that spots are counted on, until when the tip moves, and
+            whether a scan has led it away since.
         folders: see `folders.local`.
         frame_in_force: as it was set.
     """
@@ -99,10 +100,11 @@ class Activity:
         """A measurement begins, with what is in force now.
 
         Args:
-            position_m: of a force curve; None: it is left to the file to know.
+            position_m: of a force curve, where the tip was sent; None: it is left to the file to know.
         """
-        taken: dict[str, Any] = {"position": position_m and list(position_m)}
+        taken: dict[str, Any] = {"position": None if self._led_away else position_m and list(position_m)}
         if what == SCAN:
+            self._kept["led_away"] = True
             taken = {"frame": as_list(self._frame_in_force())}
         self._harvest.begin(what, self._target(what), taken)
 
@@ -173,6 +175,12 @@ class Activity:
     def moves(self, lasts_s: float) -> None:
         """The tip was sent away; it arrives, which Asylum does not tell, after so long at the latest."""
         self._kept["moving_until_s"] = self._clock.now_s() + lasts_s
+        self._kept["led_away"] = False
+
+    @property
+    def _led_away(self) -> bool:
+        """Whether a scan has taken the tip from where it was sent."""
+        return bool(self._kept.get("led_away"))
 
     def _target(self, what: str) -> Target:
         suffix = self._session.values(["BaseSuffix"])["BaseSuffix"]

@@ -1,7 +1,8 @@
-"""The frame and the speed as Asylum has them, and as everybody else. Pure; lengths in m, angles of Asylum's in deg.
+"""The frame and the speed as Asylum has them, and as everybody else. Pure; lengths in m.
 
 Asylum's XOffset and YOffset are the centre of the frame (seen in images that were zoomed into). ScanSize is its longer
-side, and how long the other one is, is told by two ratios; FastScanSize and SlowScanSize are what comes of it.
+side, and how long the other one is, is told by two ratios; FastScanSize and SlowScanSize are what comes of it. Its
+angles are in degrees, clockwise.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from afspm.errors import InvalidValue
+from afspm.files.asylum import clockwise, counter_clockwise
 from afspm.microscopes.in_force import FRAME, frame
 from afspm.microscopes.parameters import Value
 from afspm.model import Region, names
@@ -27,7 +29,7 @@ PATH_OF_A_LINE: Final = 2.5
 def generic(found: Mapping[str, float]) -> dict[str, Value]:
     """Of Asylum's `GLOBALS`, the generic parameters in SI."""
     size_m = (found["FastScanSize"], found["SlowScanSize"])
-    region = Region((found["XOffset"], found["YOffset"]), size_m, math.radians(found["ScanAngle"]))
+    region = Region((found["XOffset"], found["YOffset"]), size_m, counter_clockwise(found["ScanAngle"]))
     return {
         names.SCAN_TOP_LEFT_X: region.top_left_m[0],
         names.SCAN_TOP_LEFT_Y: region.top_left_m[1],
@@ -64,7 +66,7 @@ def asylums(wanted: Mapping[str, Value], before: Mapping[str, Value]) -> dict[st
         "SlowRatio": slow_m / shorter_m,
         "FastScanSize": fast_m,
         "SlowScanSize": slow_m,
-        "ScanAngle": math.degrees(region.angle_rad),
+        "ScanAngle": clockwise(region.angle_rad),
         "ScanPoints": float(columns),
         "ScanLines": float(rows),
         "ScanRate": speed_m_s / (PATH_OF_A_LINE * fast_m),

@@ -45,8 +45,8 @@ class Doing:
 
     @property
     def engaged(self) -> bool:
-        """Whether the tip is at the sample."""
-        return bool((self.bits or 0) & (_ENGAGED | _SCANNING)) or self.scanning
+        """Whether the tip is at the sample; where that can't be known it is to be taken care of as if it were."""
+        return self.bits is None or bool(self.bits & (_ENGAGED | _SCANNING)) or self.scanning
 
 
 class Session:

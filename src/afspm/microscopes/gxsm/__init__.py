@@ -10,7 +10,16 @@ from typing import Any, ClassVar, Final
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.gxsm.activity import SHOWS_S, Activity
 from afspm.microscopes.gxsm.frame import PIXELS, REFNAMES, Frame, number, send, user_unit_m
-from afspm.microscopes.gxsm.hardware import ABORT, APPROACH, AUTOSAVE_OFF, Hardware, available, execute, recognised
+from afspm.microscopes.gxsm.hardware import (
+    ABORT,
+    APPROACH,
+    AUTOSAVE_OFF,
+    REPEAT_OFF,
+    Hardware,
+    available,
+    execute,
+    recognised,
+)
 from afspm.microscopes.gxsm.harvest import SOON_S, Harvest
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
 from afspm.microscopes.gxsm.live import new_lines
@@ -253,6 +262,8 @@ class Gxsm(Microscope):
     @action(names.START_SCAN)
     def start_scan(self) -> None:
         """Scan the frame once, with the channels and the direction of GXSM's panel."""
+        if REPEAT_OFF in self._actions:  # it would never end
+            self._ask.call("action", REPEAT_OFF)
         self._activity.start_scan()
 
     @action(names.STOP_SCAN)

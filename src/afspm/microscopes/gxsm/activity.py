@@ -63,6 +63,7 @@ class Activity:
         self._stopping = False
         self._execute = ""
         self._kept = kept
+        self._idle_ns = 0  # when it was last seen to measure nothing
         self._shows_until_s = 0.0
         self._endings: list[str] = []
 
@@ -141,8 +142,9 @@ class Activity:
             if not doing.moving and now_s >= self._arrives_s:
                 self._take_curve(now_s)
             return ScopeStatus(ScopeState.SPEC)
-        if doing.measuring:
+        if doing.measuring and not (led and not self._harvest.what):
             return self._measuring(doing)
+        self._idle_ns = self._clock.now_ns()
         moving = doing.moving or now_s < self._arrives_s
         if self._stopping and moving:  # a spectrum that was to be taken at the end of the way
             return ScopeStatus(ScopeState.INTERRUPTED)
@@ -162,7 +164,7 @@ class Activity:
         self._shows_until_s = 0.0
         if not self._harvest.what and not self._stopping:  # somebody began it at the panel
             if doing.scanning:
-                self._begin_scan(0)
+                self._begin_scan(self._idle_ns)
             else:
                 self._begin_curve("VP", self._frame.tip())
         curve = doing.probing and (self._harvest.what not in ("", SCAN) or not doing.scanning)

@@ -19,6 +19,8 @@ METHODS = {
 }
 LONGEST = 10_000
 CALLS_A_LOOK = 50  # at script-control
+LOOK_S = 0.5
+SILENT_LOOKS = 20  # one that says nothing for so long is gone if another comes: its connection may have been lost
 gxsm = globals().get("gxsm")  # the console has it
 
 
@@ -45,13 +47,16 @@ def wanted() -> bool:
     return gxsm is not None and gxsm.get("script-control") > 0.5
 
 
-def serve(client: socket.socket) -> None:
+def serve(client: socket.socket, listener: socket.socket) -> None:
     """Answer one client until it goes, or the script is to end."""
-    received, calls = b"", 0
+    received, calls, silent = b"", 0, 0
     while calls % CALLS_A_LOOK or wanted():
-        if not select.select([client], [], [], 0.5)[0]:
-            calls = 0
+        if not select.select([client], [], [], LOOK_S)[0]:
+            calls, silent = 0, silent + 1
+            if silent >= SILENT_LOOKS and select.select([listener], [], [], 0.0)[0]:
+                return
             continue
+        silent = 0
         part = client.recv(65536)
         received += part
         if not part or len(received) > LONGEST:
@@ -72,12 +77,12 @@ def run() -> None:
         listener.listen(1)
         print("afspm bridge: listening at {}:{}".format(*listener.getsockname()))  # noqa: T201
         while wanted():
-            if select.select([listener], [], [], 0.5)[0]:
+            if select.select([listener], [], [], LOOK_S)[0]:
                 client, _ = listener.accept()
                 client.settimeout(10.0)  # one that does not take its answers is let go
                 try:
                     with client:
-                        serve(client)
+                        serve(client, listener)
                 except OSError as error:
                     print(f"afspm bridge: the client is gone: {error}")  # noqa: T201
     print("afspm bridge: ended")  # noqa: T201

@@ -14,6 +14,7 @@ STATUS: Final = "s"
 ABORT: Final = "DSP_VP_ABORT_EXECUTE"
 APPROACH: Final = "DSP_CMD_AUTOAPP"
 AUTOSAVE_OFF: Final = "UNCHECK-MainAutoSave"
+REPEAT_OFF: Final = "UNCHECK-SCAN-REPEAT"
 _MODES: Final = {"force": "FZ"}  # other kinds of spectra are called as GXSM calls them
 _MOST_BITS: Final = 1 << 24
 

@@ -43,10 +43,12 @@ class Harvest(Measurements):
         self._soon_s = soon_s
         self._rewritten = rewritten
         self._sizes: dict[Path, tuple[int, int]] = {}
+        self._before: set[int] = set()
         self._whole: dict[Path, FileContent] = {}
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
         kept.setdefault("program", "")
+        kept.setdefault("starts", [])
 
     @property
     def scanning(self) -> tuple[Region, tuple[int, int]] | None:
@@ -73,7 +75,7 @@ class Harvest(Measurements):
 
         Args:
             folder: where its files will be; None: GXSM does not say yet.
-            begun_ns: not before this; 0: it was found running.
+            begun_ns: not before this; 0: it was found running, and nobody knows since when.
             taken: "frame" and "shape" of a scan, "position" of a spectrum.
         """
         newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
@@ -93,7 +95,7 @@ class Harvest(Measurements):
         if ended["folder"] is None and paths:  # a scan's: old ones in there are told by when they began
             ended["folder"] = str(paths[0].parent)
             ended["begun_ns"] = ended["begun_ns"] or now_ns
-        self._sizes, self._whole = {}, {}
+        self._sizes, self._whole, self._before = {}, {}, set()
 
     def next_s(self) -> float | None:
         """When to look again at the latest."""
@@ -145,11 +147,20 @@ class Harvest(Measurements):
                 except (AfspmError, OSError):
                     continue  # not yet
             content = self._whole.get(file)
-            if content is not None and not _older(content, ended["begun_ns"]):
+            if content is not None and not self._is_of_before(content, ended["begun_ns"]):
                 found[file] = content
         if ended["what"] == SCAN:  # one for each channel, should somebody have it saved again
             return {file: found[file] for file in endings(found).values()}
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
+
+    def _is_of_before(self, content: FileContent, begun_ns: int) -> bool:
+        """Whether it is a scan of before, saved again: one that began when the last did, by the clock of GXSM's
+        computer, which may be another than ours, and be set meanwhile. Before there was one, an older one."""
+        start_ns, known = content.start_ns, self._kept["starts"]
+        if start_ns is None or not (start_ns in known if known else start_ns < begun_ns - _CLOCK_NS):
+            return False
+        self._before.add(start_ns)
+        return True
 
     def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
         """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
@@ -163,6 +174,8 @@ class Harvest(Measurements):
             return "GXSM does not say where it saves: did it begin at all, is a channel set?"
         if not folder.is_dir():
             return f"its folder {folder} can't be seen from here (scan_dir, probe_dir)"
+        if self._before:
+            return f"what GXSM saved in {folder} is a scan of before: did it begin at all?"
         if ended["what"] == SCAN:
             return f"no new file in {folder} is of it: did it begin at all, is a channel set, and saved (AS)?"
         return f"no new .vpdata in {folder}: is probe Auto Save on at GXSM's panel, and this its folder (probe_dir)?"
@@ -170,6 +183,7 @@ class Harvest(Measurements):
     def _give_up(self, why: str) -> None:
         self._log.error("nothing comes of the %s: %s", self._kept["ended"]["what"], why)
         self._kept["ended"] = None
+        self._kept["starts"] = sorted(self._before) or self._kept["starts"]
         self.broken_off = True
 
     def _add(self, ended: Mapping[str, Any], files: Mapping[Path, FileContent]) -> None:
@@ -178,6 +192,7 @@ class Harvest(Measurements):
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
             self._kept["absent"] = absent
+            self._kept["starts"] = sorted({content.start_ns for content in files.values() if content.start_ns})
             for ending, file in endings(files).items():
                 scan, header = files[file].scans[0], files[file].header
                 self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()
@@ -202,11 +217,6 @@ def _files(folder: Path | None, what: str) -> list[Path]:
     if folder is None or not folder.is_dir():
         return []
     return list(folder.glob("*.nc" if what == SCAN else "*.vpdata"))
-
-
-def _older(content: FileContent, begun_ns: int) -> bool:
-    """A scan of before, saved again. Its own clock is that of this computer, as GXSM runs on it."""
-    return content.start_ns is not None and content.start_ns < begun_ns - _CLOCK_NS
 
 
 def _gaps(content: FileContent) -> bool:

@@ -220,10 +220,7 @@ class Nanonis(Microscope):
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
         """Break the scan off."""
-        stop, no_direction = 1, 0
-        self._ask("Scan.Action", stop, no_direction)
-        self._activity.stopping = True
-        self._harvest.forget()
+        self._activity.stop_scan()
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
@@ -267,15 +264,19 @@ class Nanonis(Microscope):
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Withdraw the tip by its piezo, whatever is going on, and whether that can be stopped or not."""
-        try:
-            if self._harvest.what == SCAN or self._ask("Scan.StatusGet")[0]:
-                self.stop_scan()
-            elif self._harvest.what:
-                self.stop_spec()
-        except protocol.NanonisError as error:
-            self.log.error("what is going on can't be stopped, the tip is withdrawn all the same: %s", error)
+        for stop in (self._activity.stop_approach, self._stop_measuring):
+            try:
+                stop()
+            except protocol.NanonisError as error:
+                self.log.error("what is going on can't be stopped, the tip is withdrawn all the same: %s", error)
         no_timeout = -1
         self._ask("ZCtrl.Withdraw", _AT_ONCE, no_timeout)
+
+    def _stop_measuring(self) -> None:
+        if self._harvest.what == SCAN or self._ask("Scan.StatusGet")[0]:
+            self.stop_scan()
+        elif self._harvest.what:
+            self.stop_spec()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:

@@ -46,7 +46,7 @@ class Activity:
         self._kind_asked = ""
         self._told: str | None = None
         self._occupied = (ScopeState.FREE, 0.0)
-        self._was_safe = False
+        self._was_safe = self._cut_off = False
         self._shows_until_s = 0.0
 
     # --- what is begun ---
@@ -93,6 +93,13 @@ class Activity:
                 self._take(heard)
                 return
 
+    def stop_scan(self) -> None:
+        """Break it off."""
+        stop, no_direction = 1, 0
+        self._ask("Scan.Action", stop, no_direction)
+        self.stopping = True
+        self._harvest.forget()
+
     def forget(self) -> None:
         """Nothing comes of what was begun."""
         self._kind_asked = ""
@@ -133,8 +140,8 @@ class Activity:
             told = None
         if self._harvest.what == SCAN or told is not None:
             self._end(told)
-        state = self._besides_scans()
-        return ScopeStatus(ScopeState.INTERRUPTED if self._harvest.broken_off else state)
+        state, cut_off, self._cut_off = self._besides_scans(), self._cut_off, False
+        return ScopeStatus(ScopeState.INTERRUPTED if cut_off or self._harvest.broken_off else state)
 
     def refuse_safe_tip(self) -> None:
         """Raises Refused: nothing is to be measured with a tip that has been withdrawn in an emergency."""
@@ -150,6 +157,9 @@ class Activity:
                 self.begin_scan(frame(ScanFrame().read(self._ask))[0])
             self._harvest.seen()
             self._listener.scan()
+            if self._watch_safe_tip(self._ask("ZCtrl.StatusGet")[0]):
+                self.stop_scan()  # it may go on in the air, and look well
+                self._cut_off = True
         return ScopeStatus(ScopeState.SCANNING)
 
     def _besides_scans(self) -> ScopeState:
@@ -166,9 +176,18 @@ class Activity:
             return state
         z_controller = self._ask("ZCtrl.StatusGet")[0]
         self._watch_safe_tip(z_controller)
-        if z_controller == _WITHDRAWING or (APPROACH in self._opened and self._ask("AutoApproach.OnOffGet")[0]):
+        if z_controller == _WITHDRAWING or self._approaches():
             return ScopeState.COARSE_MOTOR
         return ScopeState.FREE if self._is_there() else ScopeState.MOVING
+
+    def stop_approach(self) -> None:
+        """It would bring a tip back that is withdrawn meanwhile."""
+        if self._approaches():
+            off = 0
+            self._ask("AutoApproach.OnOffSet", off)
+
+    def _approaches(self) -> bool:
+        return APPROACH in self._opened and bool(self._ask("AutoApproach.OnOffGet")[0])
 
     def _kind_running(self) -> str:
         if self._kind_asked:
@@ -187,11 +206,13 @@ class Activity:
         self._probe.give_up()
         return True
 
-    def _watch_safe_tip(self, z_controller: int) -> None:
+    def _watch_safe_tip(self, z_controller: int) -> bool:
+        """Whether it has withdrawn the tip, which is said once."""
         safe = z_controller == _SAFE_TIP
         if safe and not self._was_safe:
             self._log.error("Nanonis' safe tip has withdrawn the tip: nothing is measured until that is put right")
         self._was_safe = safe
+        return safe
 
     def _take(self, heard: Heard) -> None:
         """What the second connection has to say."""

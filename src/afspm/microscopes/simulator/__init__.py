@@ -50,7 +50,7 @@ _AT_FIRST: dict[str, Any] = {
     names.PULSE_DURATION: "100 ms",
     names.CRASH_SPEED: "50 nm/s",
     names.CRASH_DEPTH: "5 nm",
-    "x-engaged": True,
+    names.ENGAGED: True,
     "x-fault-kind": "slow",
     "x-fault-count": 1,
     "x-fault-duration": 1.0,

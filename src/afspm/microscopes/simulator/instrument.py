@@ -248,13 +248,13 @@ class Instrument:
     def retract(self, now_s: float) -> None:
         """Take the tip away from the sample, whatever is going on."""
         self.stop(now_s)
-        self._kept["values"]["x-engaged"] = False
+        self._kept["values"][names.ENGAGED] = False
         self._begin("approach", now_s, self._approach_s)
 
     def engage(self, now_s: float) -> None:
         """Bring the tip to the sample."""
         self.stop(now_s)
-        self._kept["values"]["x-engaged"] = True
+        self._kept["values"][names.ENGAGED] = True
         self._begin("approach", now_s, self._approach_s)
 
     def _treated(self, what: str, now_s: float, lasts_s: float, facts: dict[str, Any]) -> None:
@@ -266,7 +266,7 @@ class Instrument:
         """Raises Refused if the tip can't be used now; waits for what is left of a scan that was stopped."""
         if self._kept["doing"] is not None:
             raise Refused(ControlResponse.NOT_FREE, f"the instrument is busy: {self._kept['doing']['what']}")
-        if not self._kept["values"]["x-engaged"]:
+        if not self._kept["values"][names.ENGAGED]:
             raise Refused(ControlResponse.ACTION_ERROR, f"the tip is retracted: {names.ENGAGE} it first")
         self._settle()
 
