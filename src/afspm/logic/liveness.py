@@ -89,4 +89,5 @@ class Liveness:
 
     def next_check_s(self) -> float:
         """When to check at the latest."""
-        return min(self._deadline_s, self._checked_s + self._policy.beat_period_s)
+        next_s = self._checked_s + self._policy.beat_period_s
+        return next_s if not self._beats and self._vital is not Vital.NOT_CLOSING else min(self._deadline_s, next_s)

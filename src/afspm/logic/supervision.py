@@ -19,8 +19,10 @@ class Policy:
     restart: RestartPolicy = field(default_factory=RestartPolicy)
     beats: bool = True
     """Whether it sends heartbeats."""
-    final_codes: Collection[int] = frozenset({0, 78, 80, 81})
-    """Exit codes after which it is not started again: done, bad settings, the experiment ended, asked to stop."""
+    final_codes: Collection[int] = frozenset({0, 78, 80})
+    """Exit codes after which it is not started again: done, bad settings, the experiment ended."""
+    asked_code: int = 81
+    """Of one that was asked to stop. If it was not us who asked, it is needed as before."""
     quiet_codes: Collection[int] = frozenset({78, 80})
     """Those of them that others tell: who gives it up for its settings, the scheduler that the experiment has ended."""
 
@@ -109,7 +111,7 @@ class ChildWatch:
 
     def died(self, code: int) -> bool:
         """Whether a process that ended with this code had not finished."""
-        return code not in self._policy.final_codes
+        return code not in (*self._policy.final_codes, self._policy.asked_code)
 
     def begin(self, now_s: float) -> list[Effect]:
         """Start it, the first time or after it was over."""

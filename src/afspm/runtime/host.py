@@ -21,13 +21,14 @@ from afspm.runtime.launch import Launch
 from afspm.runtime.loading import load
 from afspm.runtime.messages import register_all
 from afspm.runtime.parent import Parent, end_within, read_launch_line
-from afspm.runtime.process import Activity, Context
+from afspm.runtime.process import DEFAULT_LONGEST_STEP_S, Activity, Context
 from afspm.runtime.stopping import StopRequested
 from afspm.runtime.view import KEPT
 from afspm.transport.heartbeat import HeartbeatSender
 from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
 
+LOADED_WITHIN_S = 300.0  # a large library off a slow disk, the weights of a network
 FAREWELL_S = 1.0  # that exit handlers and threads of libraries have, once everything of ours is done
 MOST_FILES = 65_536  # more than anybody needs; some programs that are started by ours walk through all that may be
 MEASURED = frozenset({"Scan2d", "Spec1d"})
@@ -68,9 +69,11 @@ def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
     clock = ExperimentClock.from_dict(launch.clock)
     activity = Activity(clock)
     with _beating(launch, activity, logger), _telling(launch, clock):
-        with activity.step():  # importing may take its time
+        activity.longest_step_s = LOADED_WITHIN_S
+        with activity.step():
             register_all(launch.messages)
             process = load(launch)
+        activity.longest_step_s = DEFAULT_LONGEST_STEP_S
         context = Context(
             launch,
             clock,

@@ -44,15 +44,15 @@ class Ended:
 def follow(
     experiment: Experiment, ended: Ended, starts: Sequence[Start], clock: Clock, log: RunLog, *, with_report: bool
 ) -> None:
-    """Write the report if it is wanted and there is a record, and tell whoever [notify] names.
+    """Tell whoever [notify] names, and write the report if it is wanted and there is a record: it may take long.
 
     Of the end of an experiment on several computers that one tells where its scheduler ran.
     """
-    if with_report:
-        report(ended.folder, log)
     notify = experiment.resolved.notify
     if any(start.role is Role.SCHEDULER for start in starts):
         tell(ended, notifying.targets(notify, experiment.folder), notify.on, clock, log)
+    if with_report:
+        report(ended.folder, log)
 
 
 def report(folder: Path, log: RunLog) -> None:

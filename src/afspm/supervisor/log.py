@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import queue
 import re
 import sys
+import threading
 import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 SUPERVISOR = "afspm"
+MOST_UNSHOWN = 10_000
+SHOWN_WITHIN_S = 2.0
 COLOURS = ("cyan", "green", "magenta", "blue", "bright_cyan", "bright_green", "bright_magenta", "bright_blue")
 LEVEL_STYLES = {logging.WARNING: "yellow", logging.ERROR: "bold red", logging.CRITICAL: "bold red"}
 _LEVELS = {name: getattr(logging, name) for name in ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")}
@@ -53,7 +57,8 @@ class LineReader:
 class RunLog:
     """Writes every line to `file`, and those of `level` and above to the terminal; `names` are made equally wide.
 
-    A terminal that has gone away is no reason to end a measurement: what can't be written there is still in the file.
+    A terminal that has gone away is no reason to end a measurement, nor is one that takes nothing more to stop it, as
+    somebody has marked text in it or pressed Ctrl-S: what can't be written there is still in the file.
     """
 
     def __init__(
@@ -72,7 +77,7 @@ class RunLog:
         terminal = terminal or sys.stdout
         self.listener: Callable[[str, int, str], None] = lambda name, level, text: None
         """Called with each line, as `write` is."""
-        self._show = _coloured(terminal) if terminal.isatty() else _plain(terminal)
+        self._shown = _Shown(_coloured(terminal) if terminal.isatty() else _plain(terminal))
         self._widest = max(map(len, (SUPERVISOR, *names)))
 
     def write(self, name: str, level: int, text: str) -> None:
@@ -84,8 +89,7 @@ class RunLog:
             self._file.flush()
         self.listener(name, level, text)
         if level >= self._level:
-            with contextlib.suppress(OSError, ValueError):
-                self._show(time_of_day(wall_ns), f"{name:{self._widest}}", level, text)
+            self._shown.add(time_of_day(wall_ns), f"{name:{self._widest}}", level, text)
 
     def _experiment_time(self) -> str:
         """The time in the experiment, where it is another than the one on the wall."""
@@ -95,7 +99,8 @@ class RunLog:
         return f" [{day_and_time(now_ns)}]"
 
     def close(self) -> None:
-        """Close the file."""
+        """Show what is left to show, and close the file."""
+        self._shown.close()
         with contextlib.suppress(OSError):  # what waits for room on a full disk is lost with us
             self._file.close()
 
@@ -106,6 +111,32 @@ def colour_of(name: str) -> str:
 
 
 Show = Callable[[str, str, int, str], None]
+
+
+class _Shown:
+    """Shows lines in a thread of its own, which may have to wait for the terminal."""
+
+    def __init__(self, show: Show) -> None:
+        self._show = show
+        self._lines: queue.Queue[tuple[str, str, int, str] | None] = queue.Queue(MOST_UNSHOWN)
+        self._thread = threading.Thread(target=self._run, name="terminal", daemon=True)
+        self._thread.start()
+
+    def add(self, time: str, name: str, level: int, text: str) -> None:
+        """A line; left out where too many wait already."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait((time, name, level, text))
+
+    def close(self) -> None:
+        """Show what waits, if the terminal takes it."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(SHOWN_WITHIN_S)
+
+    def _run(self) -> None:
+        while (line := self._lines.get()) is not None:
+            with contextlib.suppress(OSError, ValueError):
+                self._show(*line)
 
 
 def _plain(terminal: TextIO) -> Show:

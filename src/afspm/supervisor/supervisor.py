@@ -135,7 +135,10 @@ class Supervisor:
         self._wakeup: WakeUp[ChildEvent | signals.Signalled | News] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
         self._children = {
-            task.name: _Child(task, self._beats.listen(task.name), supervision.ChildWatch(policy)) for task in tasks
+            task.name: _Child(
+                task, self._beats.listen(task.name), supervision.ChildWatch(replace(policy, beats=task.beats))
+            )
+            for task in tasks
         }
         self._ending: Ending | None = None
         self._has_told_waiting = False

@@ -42,6 +42,14 @@ class Stuck(Component):
             threading.Event().wait(0.001)
 
 
+class SlowToMake(Component):
+    """Loads the weights of a network, say."""
+
+    def __init__(self) -> None:
+        say("made")
+        threading.Event().wait()
+
+
 class Hanging(Stuck):
     """Computes for longer than it says that it may."""
 

@@ -155,6 +155,17 @@ def test_a_busy_component_beats_with_the_age_of_its_step_and_how_long_it_may_tak
         listener.close()
 
 
+def test_what_takes_long_to_be_made_is_not_frozen(host: Host) -> None:
+    """The class is not known yet: it can't say how long it takes to import it."""
+    listener = HeartbeatListener()
+    try:
+        address = listener.listen("slow")
+        host(part("SlowToMake", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
+        beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.1 and beat.longest_step_s == 300.0)
+    finally:
+        listener.close()
+
+
 def test_a_step_that_takes_too_long_is_told_with_the_line_it_is_at(host: Host) -> None:
     listener = HeartbeatListener()
     try:

@@ -9,10 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from supervisor_lab import DEADLINE_S, RunTasks, peer
+from supervisor_lab import DEADLINE_S, QUICK, RunTasks, peer
 
 from afspm.clock import ExperimentClock
 from afspm.experiment import Role
+from afspm.runtime.exit_codes import ExitCode
 from afspm.supervisor.ending import Why
 from afspm.supervisor.task import Task
 
@@ -188,3 +189,21 @@ def test_what_a_program_of_another_kind_writes_is_in_the_log(run_tasks: RunTasks
     running.terminal.wait_for(" script ", "to stdout")
     running.terminal.wait_for(" script ", "WARNING to stderr")
     assert running.outcome().duration_s < DEADLINE_S
+
+
+def test_a_program_that_sends_no_heartbeats_is_not_waited_for(run_tasks: RunTasks) -> None:
+    """It lives on when all that do would have been killed for their silence."""
+    silent = "import sys; sys.stdin.readline(); print('here', flush=True); sys.stdin.read()"
+    deaf = replace(peer("program"), command=(sys.executable, "-c", silent), beats=False)
+    policy = replace(QUICK, liveness=replace(QUICK.liveness, start_s=0.5))
+    running = run_tasks(deaf, replace(deaf, launch=replace(deaf.launch, name="beating"), beats=True), policy=policy)
+    running.terminal.wait_for(" beating ", "no first heartbeat", count=2)
+    reports = {report.name: report.starts for report in running.stop().reports}
+    assert reports["program"] == 1
+
+
+@posix_only
+def test_a_scheduler_that_somebody_asks_to_end_is_started_again(run_tasks: RunTasks) -> None:
+    running = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=int(ExitCode.ORPHAN)))
+    running.terminal.wait_for(" scheduler ", "it is started again")
+    assert running.stop().why is Why.STOPPED

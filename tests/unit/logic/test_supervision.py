@@ -73,7 +73,9 @@ def test_while_we_slept_ourselves_nobody_is_judged() -> None:
 
 
 def test_a_process_without_beats_is_only_known_by_its_exit() -> None:
-    assert checked(Liveness(QUICK, 0.0, beats=False), 1000.0) is Vital.ALIVE
+    life = Liveness(QUICK, 0.0, beats=False)
+    assert checked(life, 1000.0) is Vital.ALIVE
+    assert life.next_check_s() == 1000.0 + QUICK.beat_period_s, "nobody is to look all the time"
 
 
 def test_the_first_restart_is_at_once_and_later_ones_wait_longer_and_longer() -> None:
@@ -108,7 +110,7 @@ def test_a_child_is_started_watched_killed_when_frozen_and_started_again() -> No
     assert watch.phase is Phase.RUNNING
 
 
-@pytest.mark.parametrize("code", [0, 78, 80, 81])
+@pytest.mark.parametrize("code", [0, 78, 80])
 def test_one_that_meant_to_end_is_not_started_again(code: int) -> None:
     watch = ChildWatch(Policy(QUICK))
     watch.begin(0.0)
@@ -118,11 +120,18 @@ def test_one_that_meant_to_end_is_not_started_again(code: int) -> None:
     assert watch.deadline_s() is None
 
 
-@pytest.mark.parametrize("code", [1, -9, -11, 137, 3])
+@pytest.mark.parametrize("code", [1, -9, -11, 137, 3, 81])
 def test_one_that_crashed_is(code: int) -> None:
     watch = ChildWatch(Policy(QUICK))
     watch.begin(0.0)
     assert Start() in watch.exited(code, 1.0)
+
+
+def test_one_that_was_asked_to_stop_had_not_crashed() -> None:
+    """By somebody else it is started again, as it is needed; at the end it is not."""
+    watch = ChildWatch(Policy(QUICK))
+    assert watch.died(1)
+    assert not watch.died(81)
 
 
 def test_one_that_crashes_again_and_again_is_given_up_loudly() -> None:

@@ -12,11 +12,13 @@ import pytest
 from afspm.clock import ExperimentClock
 from afspm.components import notices
 from afspm.components.notices import OCCASIONS, Targets
+from afspm.experiment import load
 from afspm.record.report import REPORT_FILE
 from afspm.record.store import Store
 from afspm.supervisor import aftermath
 from afspm.supervisor.aftermath import Ended
 from afspm.supervisor.ending import Why
+from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.supervisor import Outcome, Report
 
 
@@ -108,3 +110,18 @@ def test_a_report_that_fails_is_a_warning(tmp_path: Path) -> None:
     ((level, text),) = log.lines
     assert level == logging.WARNING
     assert text.startswith("no report: ")
+
+
+def test_people_are_told_before_the_report_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """That may take two minutes, and who is in a hurry presses Ctrl-C."""
+    done: list[str] = []
+    monkeypatch.setattr(aftermath, "tell", lambda *_: done.append("told"))
+    monkeypatch.setattr(aftermath, "report", lambda *_: done.append("reported"))
+    file = tmp_path / "experiment.toml"
+    parts = [f'[{name}]\ncomponent = true\nclass = "{name.capitalize()}"\n' for name in ("simulator", "scheduler")]
+    file.write_text("\n".join(parts))
+    experiment = load(file)
+    starts = experiment.launches(take_address=FreePorts().address)
+    ended = Ended("night", tmp_path, Outcome(Why.ALL_DONE, "all is done", (), 1.0), True)
+    aftermath.follow(experiment, ended, starts, ExperimentClock.real(), Log(), with_report=True)  # type: ignore[arg-type]
+    assert done == ["told", "reported"]

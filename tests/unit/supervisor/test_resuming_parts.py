@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ import pytest
 
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
-from afspm.supervisor.resuming import Resumable
+from afspm.supervisor.resuming import Resumable, _wait_until_gone
 from afspm.supervisor.run import ONLY, WITHOUT, Options, dry_run, to_resume
 
 PARTS = """
@@ -85,3 +87,19 @@ def test_what_was_added_when_it_was_resumed_is_there_in_that_life(tmp_path: Path
     facts = to_resume(added.experiment, starts, added.options(Options()))
     again = replace(plain, facts=facts)
     assert {start.launch.name for start in dry_run(again.experiment, again.options(Options()))} == before
+
+
+def test_all_processes_are_asked_at_once_whether_they_are_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Where it takes seconds to be refused, one after the other would take longer than anybody waits."""
+    all_asked = threading.Barrier(12, timeout=10.0)
+
+    def refused(address: tuple[str, int], timeout: float) -> None:
+        all_asked.wait()
+        raise ConnectionRefusedError
+
+    monkeypatch.setattr(socket, "create_connection", refused)
+    address = "tcp://127.0.0.1:{}"
+    processes = {
+        f"part {n}": {"publish": address.format(29000 + n), "serve": address.format(29100 + n)} for n in range(6)
+    }
+    _wait_until_gone({"processes": processes}, tmp_path)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import logging
+import threading
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,18 @@ def test_a_terminal_that_is_gone_does_not_end_the_run(tmp_path: Path) -> None:
     assert "still here" in (tmp_path / "log.txt").read_text(encoding="utf-8")
 
 
+def test_a_terminal_that_takes_nothing_more_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody has marked text in it, or pressed Ctrl-S."""
+    monkeypatch.setattr("afspm.supervisor.log.SHOWN_WITHIN_S", 0.01)
+    terminal = _Stopped()
+    log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=terminal)
+    for number in range(3):
+        log.write("scheduler", logging.INFO, f"line {number}")
+    log.close()
+    terminal.goes_on.set()
+    assert "line 2" in (tmp_path / "log.txt").read_text(encoding="utf-8")
+
+
 def test_a_terminal_shows_the_name_in_its_colour(tmp_path: Path) -> None:
     terminal = _Colourful()
     log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=terminal)
@@ -81,6 +94,16 @@ def test_a_terminal_shows_the_name_in_its_colour(tmp_path: Path) -> None:
 def test_a_name_keeps_its_colour() -> None:
     assert colour_of("scheduler") == "cyan"
     assert {colour_of(f"component {n}") for n in range(200)} == set(COLOURS)
+
+
+class _Stopped(io.StringIO):
+    def __init__(self) -> None:
+        super().__init__()
+        self.goes_on = threading.Event()
+
+    def write(self, text: str) -> int:
+        self.goes_on.wait()
+        return len(text)
 
 
 class _Gone(io.StringIO):
