@@ -65,7 +65,8 @@ class Ahead:
         try:
             segment.append(written)
         except OSError:
-            self._finish()  # half a packet at the end of a file is no harm, in the middle it would be
+            if not segment.take_back():
+                self._finish()  # half a packet at the end of a file is no harm, in the middle it would be
             raise
         return True
 

@@ -132,13 +132,19 @@ class _OfCopy(sqlite3.Connection):
 
 
 def _checked_copy(path: Path) -> sqlite3.Connection:
-    folder = Path(tempfile.mkdtemp(prefix="afspm-record-"))
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="afspm-record-"))
+    except OSError as error:
+        raise FileError(f"can't be read, there is no room for a copy: {error}", where=str(path)) from error
     try:
         for suffix in ("", "-wal"):
             with suppress(FileNotFoundError):
                 shutil.copy(f"{path}{suffix}", folder / f"{path.name}{suffix}")
         connection = _checked(read_only(folder / path.name), path, _OfCopy)
         assert isinstance(connection, _OfCopy)
+    except OSError as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise FileError(f"can't be read, no copy can be made of it: {error}", where=str(path)) from error
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise

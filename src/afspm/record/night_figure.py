@@ -1,15 +1,9 @@
-"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close look at each repair.
-
-    python -m afspm.record.night_figure RUN_FOLDER
-
-draws it again from what a run has left.
-"""
+"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close look at each repair."""
 
 from __future__ import annotations
 
 import io
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC
 from pathlib import Path
@@ -18,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.model import ProblemNames, names
+from afspm.model import names
 from afspm.model.words import from_to, time_of_day
 from afspm.record.night_record import BAD, Mark, NightRecord, Shot, Span
 
@@ -301,16 +295,3 @@ def _palette() -> NDArray[np.uint8]:
 
 def _rgb(colour: str) -> tuple[int, int, int]:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-def main(folder: str) -> None:
-    """Draw the night of a run again."""
-    run = Path(folder)
-    for file in sorted((run / "state").glob("*.night.jsonl")):
-        record = NightRecord.from_lines(file.read_text(encoding="utf-8").splitlines())
-        known = {number: name for name, number in ProblemNames().items()}
-        draw(record, run / "night.png", known, simulated=(run / "truth.jsonl").exists())
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])

@@ -66,11 +66,12 @@ class Segment:
         self.path = path
         self.size = 0
         self.newest_ns = 0
+        self._whole = 0
         self._number = number_of(path)
         self._file = path.open("xb" if spare is None else "r+b", buffering=0)
 
     def append(self, written: Written) -> None:
-        """Write a packet behind the others. Raises OSError: the disk is full …; nothing may be appended then."""
+        """Write a packet behind the others. Raises OSError: the disk is full …; it is to be taken back then."""
         payload = written.packet.payload
         head = _head(written, self._number)
         if len(payload) <= _SMALL:
@@ -78,7 +79,19 @@ class Segment:
         else:
             self._write(head)
             self._write(payload)
+        self._whole = self.size
         self.newest_ns = max(self.newest_ns, written.packet.time_ns or 0)
+
+    def take_back(self) -> bool:
+        """Remove what was written of a packet that could not be written as a whole: whether that was possible, so that
+        more can be appended."""
+        try:
+            self._file.seek(self._whole)
+            self._file.truncate()
+        except OSError:
+            return False
+        self.size = self._whole
+        return True
 
     def close(self) -> None:
         """Safe to repeat."""

@@ -71,17 +71,16 @@ def write_whole(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool
 
 
 class ToldOnce:
-    """A disk that is full must not end an experiment: what can't be written is told once, until it can be again.
+    """A disk that is full, or away for a while, must not end an experiment: what can't be written is told once, until
+    it can be again.
 
     Args:
         loss: what it means, for people.
-        only_full: whatever else is wrong, such as a folder that is gone, is raised.
     """
 
-    def __init__(self, loss: str, log: logging.Logger, *, only_full: bool = False) -> None:
+    def __init__(self, loss: str, log: logging.Logger) -> None:
         self._loss = loss
         self._log = log
-        self._only_full = only_full
         self._is_failing = False
 
     @contextlib.contextmanager
@@ -90,20 +89,13 @@ class ToldOnce:
         try:
             yield
         except FileError as error:
-            if self._only_full and not is_full(error):
-                raise
             if not self._is_failing:
                 self._log.critical("%s: %s", self._loss, error)
             self._is_failing = True
         else:
             if self._is_failing:
-                self._log.info("there is room again, no longer so: %s", self._loss)
+                self._log.info("it can be written again, no longer so: %s", self._loss)
             self._is_failing = False
-
-
-def is_full(error: FileError) -> bool:
-    """Whether nothing could be written since there was no room for it."""
-    return isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def former(path: Path) -> Path:
@@ -203,11 +195,14 @@ def load(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
         What was read, and what was wrong with the last generation, if it is one before: "" else.
 
     Raises:
-        FileError: the file can't be read, and there is no generation before that can.
+        FileError: the file can't be read, and there is no generation before that can; or its folder is away.
     """
     try:
         generations = path.read_bytes().splitlines() or [b""]
-    except FileNotFoundError:
+    except FileNotFoundError as error:
+        if not any(folder.is_dir() for folder in (path.parent, path.parent.parent)):
+            # a drive of another computer: what is on it must not be begun anew
+            raise FileError(f"the folder of the run is not there: {error}", where=str(path)) from error
         return None, ""
     except OSError as error:
         generations, damage = [], f"{error!r}"

@@ -32,7 +32,7 @@ class Memory(MutableMapping[str, Any]):
     def __init__(self, path: Path | None, *, synced: bool = True) -> None:
         self._path = path
         self._generations = Generations(path) if path and not synced else None
-        self._told = ToldOnce("a restart would not know what was done until now", _log, only_full=True)
+        self._told = ToldOnce("a restart would not know what was done until now", _log)
         self.damage = ""
         self._values: dict[str, Any] = {}
         if path is not None:
@@ -47,11 +47,10 @@ class Memory(MutableMapping[str, Any]):
         that must not happen twice looks at what is returned, and doesn't do it.
 
         Returns:
-            Whether it was written: False if the disk is full.
+            Whether it was written: False if the disk is full, or away.
 
         Raises:
             InvalidValue: a value is not of JSON's types.
-            FileError: the folder is gone …
         """
         return self._write(self._text())
 

@@ -45,7 +45,7 @@ class Results:
 
     def __init__(self, folder: Path | None, name: str) -> None:
         self._folder = folder / f"{name}.results" if folder else None
-        self._told = ToldOnce("what is measured can't be kept", _log, only_full=True)
+        self._told = ToldOnce("what is measured can't be kept", _log)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
     @property
@@ -77,11 +77,7 @@ class Results:
         return Result(things, head["interruptions"])
 
     def fulfil(self, key: str, plan: dict[str, Any], result: Result) -> None:
-        """Keep the result; the intent is fulfilled. Where the disk is full, another life measures it again.
-
-        Raises:
-            FileError: the folder is gone …
-        """
+        """Keep the result; the intent is fulfilled. Where the disk is full, another life measures it again."""
         path = self._path(key)
         if path is not None:
             head = {"key": key, "plan": plan, "interruptions": result.interruptions}

@@ -25,7 +25,7 @@ from afspm.record.night_record import (
 from afspm.runtime.exit_codes import ExitCode
 
 pytest.importorskip("matplotlib")
-from afspm.record.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by, main
+from afspm.record.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by
 
 MINUTE_NS = 60_000_000_000
 TIP = int(Problem.TIP_SHAPE_CHANGED)
@@ -167,15 +167,6 @@ def test_a_restart_loses_nothing_and_doubles_nothing(tmp_path: Path) -> None:
     run(component, lab, tmp_path / "state", run_dir=str(tmp_path))
     times = [shot.time_ns for shot in component.record.shots]
     assert len(times) == len(set(times)) == 3
-
-
-def test_the_picture_can_be_drawn_again_from_the_run_folder(tmp_path: Path) -> None:
-    lab = _lab()
-    lab.at(500.0, lab.kill)
-    run(NightPicture(), lab, tmp_path / "state", run_dir=str(tmp_path))
-    (tmp_path / "night.png").unlink()
-    main(str(tmp_path))
-    assert (tmp_path / "night.png").exists()
 
 
 def test_simulated_is_written_on_the_picture_only_where_it_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -154,6 +156,33 @@ def test_no_more_than_a_bound_waits_and_it_is_said(
     assert sum(file.stat().st_size for file in folder.iterdir()) <= 500
     say_recorded(recorded, 19)
     assert noted.note(packet(20), None, cached=True), "there is room again"
+
+
+def test_a_full_disk_is_not_filled_with_files_nor_with_halves(noting: Noting, folder: Path) -> None:
+    noted = noting()
+    noted.note(packet(1), None, cached=True)
+    segment = noted._segment
+    assert segment is not None
+    real = segment._file
+
+    class Full:
+        """Has room for a few bytes more."""
+
+        def write(self, data: memoryview) -> int:
+            real.write(data[:3])
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(real, name)
+
+    segment._file = Full()  # type: ignore[assignment]
+    for time_ns in range(2, 20):
+        with pytest.raises(OSError, match="No space"):
+            noted.note(packet(time_ns), None, cached=True)
+    assert len(list(folder.iterdir())) == 1
+    segment._file = real
+    noted.note(packet(20), None, cached=True)
+    assert [written.packet.time_ns for written in written_ahead(folder)] == [1, 20]
 
 
 def test_at_the_end_nothing_is_left_if_all_is_recorded(noting: Noting, folder: Path, recorded: Path) -> None:
