@@ -33,7 +33,7 @@ class Bulletin:
 
     def control(self, state: ControlState, now_ns: int) -> Publish:
         """The control state as a packet, to be published once it is saved."""
-        packet, cached = self._cache.stamp(CONTROL_STATE, self._codec.encode_control_state(state), now_ns)
+        packet, cached = self._cache.stamp(CONTROL_STATE, self._codec.encode(state), now_ns)
         return Publish(packet, None, cached)
 
     def announce(self, envelope: str, payload: bytes, time_ns: int) -> list[Effect]:

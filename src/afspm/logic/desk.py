@@ -404,7 +404,7 @@ class Desk:
         if self._frame is not None:
             self._frame.carried_out(sent, told, now_ns)
             if request.kind == _PARAM and (mapped := self._frame.answer(request, told, now_ns)) is not None:
-                response.payload = self._codec.encode_parameter(mapped)
+                response.payload = self._codec.encode(mapped)
         if request.kind == _ACTION:
             changed = self._watchdog.started(str(request.subject), job.states_seen)
         elif (feedback := feedback_of(request)) is not None:

@@ -10,7 +10,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from afspm.model import ControlState, Packet, PacketHeader, Parameter, Request, Response
+from afspm.model import Packet, PacketHeader, Parameter, Request, Response
 
 # --- inputs ---------------------------------------------------------------------------------------------------------
 
@@ -256,14 +256,8 @@ class Codec(Protocol):
     def encode_orders(self, restart: Sequence[str]) -> bytes:
         """The object of the answer to a supervisor: processes that it is to start anew."""
 
-    def encode_control_state(self, state: ControlState) -> bytes:
-        """A ControlState as the payload of a packet."""
-
     def encode_action(self, name: str) -> bytes:
         """An ActionMsg as the payload of a request."""
-
-    def encode_parameter(self, parameter: Parameter) -> bytes:
-        """A ParameterMsg as the payload of a response."""
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         """A ParameterMsg out of a response; None if it is not one."""

@@ -7,20 +7,14 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import AfspmError
-from afspm.model import ControlState, Parameter
+from afspm.model import Parameter
 
 
 class WireCodec:
     """See `logic.events.Codec`."""
 
-    def encode_control_state(self, state: ControlState) -> bytes:
-        return wire.encode(state)[1]
-
     def encode_action(self, name: str) -> bytes:
         return wire.encode_subject(name)
-
-    def encode_parameter(self, parameter: Parameter) -> bytes:
-        return wire.encode(parameter)[1]
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         try:

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from trackers_lab import FRAME_S, INTERVAL_S, SIZE_M, World, follow, scan_at, steady
 
+from afspm.drift.registration import DriftScan, Prior, Registration
 from afspm.drift.trackers import BankTracker, PaperTracker, forecast_from_dict, tracker
 from afspm.drift.tracking import Prediction
 from afspm.errors import ConfigError, InvalidValue
@@ -345,6 +346,29 @@ def test_a_wide_scan_and_narrow_ones_in_it() -> None:
     assert all(update.matched for update in updates)
     assert all("wide" in update.registrations for update in updates[:3])
     assert np.linalg.norm(error_m(world, updates[-1].after)) < 2.0 * NM
+
+
+def test_a_zoom_that_can_not_be_compared_with_the_overview_begins_a_row_of_its_own() -> None:
+    """It is as far from the overview as it is, and to scan it again would not change that."""
+    world = World(night(4))
+    following = BankTracker(world)
+    following.add(scan_at(FRAME_S, pixels=16, key="overview"))
+    asked, updates = [], []
+    plain = world.register
+
+    def register(reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        asked.append(prior)
+        return plain(reference, scan, prior)
+
+    world.register = register  # type: ignore[method-assign]
+    for k in range(1, 12):
+        time_s = FRAME_S + k * INTERVAL_S
+        tip = following.forecast.at(time_s).mapping.inverse.apply((0.0, 0.0))
+        updates.append(following.add(scan_at(time_s, tip, size_m=SIZE_M / 10, pixels=16, key=f"zoom {k}")))
+    assert updates[0].after.sd_m > 0.35 * SIZE_M / 10, "it is not known better than that"
+    assert not any(update.lost for update in updates)
+    assert all(update.matched for update in updates[3:])
+    assert None not in asked[-5:], "its place among the others is known"
 
 
 def test_without_correction_anchors_follow_each_other() -> None:

@@ -9,6 +9,7 @@ from drift_lab import HERE, NS, SHAPE, Lab, forecast, registered
 from afspm import wire
 from afspm.logic.events import Log, PacketIn, Publish, RequestIn, Tick, TranslatorCaughtUp
 from afspm.model import (
+    ControlMode,
     ControlRequest,
     ControlResponse,
     Packet,
@@ -391,6 +392,41 @@ def test_where_nothing_is_corrected_scans_need_not_be_registered() -> None:
     for _ in range(MOST_ENDS):
         lab.says(WorkerGone("no memory"))
     assert not problems(lab)
+
+
+def test_a_person_is_called_though_correction_has_not_begun_yet() -> None:
+    """When it begins, nobody would correct anything."""
+    lab = Lab(DriftSettings(correct_after=1000.0))
+    lab.in_force()
+    for _ in range(MOST_ENDS):
+        lab.says(WorkerGone("another tracker's state"))
+    assert problems(lab) == (Problem.DEVICE_MALFUNCTION,)
+
+
+def test_what_a_person_scans_is_followed_and_not_scanned_again(lab: Lab) -> None:
+    lab.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL), name="dashboard:Ada")
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT), rescan="it is 400 nm off"))
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT), lost=True))
+    for _ in range(5):
+        fail(lab)
+    assert not lab.published("DriftRescan")
+    assert not problems(lab)
+    assert lab.published("DriftMapping")
+
+
+def test_a_microscope_that_is_lost_for_a_moment_does_not_begin_its_scan_anew(lab: Lab) -> None:
+    lab.scope_is(ScopeState.SCANNING)
+    began_s = lab.now_s
+    lab.now_s += 128.0
+    lab.scope_is(ScopeState.UNDEFINED)
+    lab.now_s += 10.0
+    lab.scope_is(ScopeState.SCANNING)
+    lab.now_s += 118.0
+    lab.publish(Scan(HERE, "Height", "m", np.ones(SHAPE), lab.now_ns, "1.nc"))
+    (job,) = lab.worker.jobs
+    assert job.start_s == pytest.approx(began_s, abs=0.01)
 
 
 def test_a_person_is_called_where_nothing_will_be_registered_any_more_and_who_removes_that_has_it_tried_again(

@@ -82,7 +82,7 @@ class BankTracker:
         filters = self._filters.moved(scan.mid_s, followed_m)
         before = self._known(filters)
         newest = Newest(scan, self._turned(filters, scan), self._compensation.velocity_m_s(scan.mid_s))
-        anywhere = self._lost or before.sd_m > self._limit_m(scan)
+        anywhere = self._lost or self._is_blind(newest)
         tried = self._tried(newest, anywhere=anywhere)
         registrations = {self._references.kept[number].scan.key: found for number, found in tried.items()}
         found = self._compared(newest, tried)
@@ -91,7 +91,9 @@ class BankTracker:
         self._unmatched = 0 if placed else self._unmatched + bool(tried)
         self._learn(newest, used, tried, placed=placed)
         after = self._known(self._filters)
-        self._lost = after.sd_m > self._limit_m(scan) or self._unmatched >= self._settings.lost_after
+        # a scan that could be compared with none begins a row of its own, which is as far from the others as it is
+        missed = bool(tried) and not placed
+        self._lost = (missed and after.sd_m > self._limit_m(scan)) or self._unmatched >= self._settings.lost_after
         return Update(
             key=scan.key,
             before=before,
@@ -161,6 +163,13 @@ class BankTracker:
         # The displacement between them will be compared like any other.
         velocity = found.by_shear_m_s + self._compensation.velocity_m_s(found.time_s)
         return self._with_velocity(filters, found.time_s, velocity, found.by_shear_covariance)
+
+    def _is_blind(self, newest: Newest) -> bool:
+        """Whether it is too uncertain where to look, against each of the scans that it can be compared with."""
+        kept = self._references.kept
+        comparable = self._references.candidates(newest.scan, *_drifts(newest.filters), anywhere=True)
+        spreads = (newest.expected(number, kept[number])[1] for number in comparable)
+        return min((np.linalg.eigvalsh(one)[-1] for one in spreads), default=0.0) > self._limit_m(newest.scan) ** 2
 
     def _tried(self, newest: Newest, *, anywhere: bool) -> dict[int, Registration]:
         """What the estimator says of the scan and each reference, by its number, the best first."""

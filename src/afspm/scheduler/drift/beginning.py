@@ -31,7 +31,9 @@ class Beginning:
         self._is_scanning = False
 
     def state(self, status: ScopeStatus, time_s: float, upwards: bool | None) -> None:
-        """The microscope has told its state; `upwards`: the direction in force."""
+        """The microscope has told its state; `upwards`: the direction in force. One that is lost scans on."""
+        if status.state is ScopeState.UNDEFINED:
+            return
         is_new, self._is_scanning = not self._is_scanning, status.state is ScopeState.SCANNING
         if not self._is_scanning:
             return

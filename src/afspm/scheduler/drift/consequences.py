@@ -10,7 +10,7 @@ import numpy as np
 from afspm.logic.desk import OwnEnd
 from afspm.logic.events import Announced, Effect, Input, Log, ProblemSeen
 from afspm.logic.scheduling import SchedulerCore
-from afspm.model import ControlRequest, ControlResponse, Parameter, Problem, Request, Response, names
+from afspm.model import ControlMode, ControlRequest, ControlResponse, Parameter, Problem, Request, Response, names
 from afspm.scheduler.drift.frame import DriftFrame
 from afspm.scheduler.drift.knowledge import Knowledge
 from afspm.scheduler.drift.settings import DriftSettings
@@ -55,8 +55,10 @@ class Consequences:
         self._accepted: dict[str, float] = {}
 
     def of(self, registered: Registered, job: ScanJob, step: Step, now_ns: int) -> list[Effect]:
-        """What is done after a scan was published."""
+        """What is done after a scan was published. What a person scans is followed, and not scanned again."""
         self._unregistered = 0
+        if self._core.control.mode is ControlMode.MANUAL:
+            return []
         if not self._knowledge.corrects(now_ns * 1e-9):
             self._started = True  # until it is corrected there is time enough to learn the velocity
             return []
@@ -71,7 +73,7 @@ class Consequences:
 
     def unregistered(self, why: str, step: Step, now_ns: int) -> list[Effect]:
         """What is done after a scan was published as predicted, since it could not be registered."""
-        if not self._knowledge.corrects(now_ns * 1e-9):
+        if not self._knowledge.corrects(now_ns * 1e-9) or self._core.control.mode is ControlMode.MANUAL:
             return []
         self._unregistered += 1
         if self._unregistered < _MOST_UNREGISTERED:
@@ -152,7 +154,7 @@ class Consequences:
 
     def _set(self, name: str, value_m_s: float) -> Request:
         parameter = Parameter(name, f"{value_m_s:.9g}", "m/s")
-        return Request(int(ControlRequest.PARAM), parameter, self._codec.encode_parameter(parameter))
+        return Request(int(ControlRequest.PARAM), parameter, self._codec.encode(parameter))
 
     def _told(self, axis: str) -> OwnEnd:
         return lambda response, now_s, now_ns: _refusal(axis, response)

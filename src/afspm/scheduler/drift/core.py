@@ -389,14 +389,15 @@ class DriftCore:
         return effects
 
     def _wait_for_a_person(self, step: Step, now_ns: int) -> list[Effect]:
-        """Nothing will be registered any more, until somebody has looked why."""
-        self._waits_for_a_person = self.knowledge.corrects(now_ns * 1e-9)
+        """Nothing will be registered any more, until somebody has looked why; where drift is never corrected, that
+        holds up nobody."""
+        self._waits_for_a_person = self._settings.correct
         return self._consequences.give_up(step) if self._waits_for_a_person else []
 
     def _ask_direction(self, now_s: float) -> list[Effect]:
         """In which direction it scans, where it tells."""
         parameter = Parameter(names.SCAN_DIRECTION)
-        request = Request(int(ControlRequest.PARAM), parameter, self._codec.encode_parameter(parameter))
+        request = Request(int(ControlRequest.PARAM), parameter, self._codec.encode(parameter))
         return self.core.ask_own(request, now_s, lambda response, now_s, now_ns: ())
 
 

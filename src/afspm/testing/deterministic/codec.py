@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from afspm.model import ControlState, Parameter
+from afspm.model import Parameter
 
 
 class TableCodec:
@@ -28,14 +28,8 @@ class TableCodec:
     def encode_orders(self, restart: Sequence[str]) -> bytes:
         return self.encode(tuple(restart))
 
-    def encode_control_state(self, state: ControlState) -> bytes:
-        return self.encode(state)
-
     def encode_action(self, name: str) -> bytes:
         return self.encode(name)
-
-    def encode_parameter(self, parameter: Parameter) -> bytes:
-        return self.encode(parameter)
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         thing = self.decode(payload)
