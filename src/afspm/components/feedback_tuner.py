@@ -54,8 +54,8 @@ class FeedbackTuner(Component):
                 self.log.info("the search is over: %s", lost.what)
 
     def _is_wanted(self) -> bool:
-        problems = self.scope.control_state.problems
-        return Problem.FEEDBACK_NON_OPTIMAL in problems and Problem.DEVICE_MALFUNCTION not in problems
+        scope = self.scope
+        return scope.is_flagged(Problem.FEEDBACK_NON_OPTIMAL) and not scope.is_flagged(Problem.DEVICE_MALFUNCTION)
 
     def _tune(self) -> None:
         feedback = self.scope.feedback

@@ -77,16 +77,14 @@ class Rescanner(Component):
             except Refused as refused:
                 self.log.error("it can't be scanned again: %s", refused.reason)
                 found = False
+            if not found and message.kind == SEARCH:  # before the other flag is gone: nobody is to go on in between
+                self.log.critical("the sample is not found again: a person has to look, nothing is scanned until then")
+                self.scope.flag(Problem.DEVICE_MALFUNCTION)
+            elif not found:
+                self.log.error(
+                    "%d scans did not help: the experiment goes on as it is. A person should look", self.attempts
+                )
             self.scope.clear(self.problem)
-        if found:
-            return
-        if message.kind == SEARCH:
-            self.log.critical("the sample is not found again: a person has to look, nothing is scanned until then")
-            self.scope.flag(Problem.DEVICE_MALFUNCTION)
-        else:
-            self.log.error(
-                "%d scans did not help: the experiment goes on as it is. A person should look", self.attempts
-            )
 
     def _take(self, message: Any, parameters: ScanParameters, told: Events) -> bool:
         """Scan until it is as it was asked for. What was changed for that is set back."""
@@ -96,7 +94,7 @@ class Rescanner(Component):
         try:
             self._turn(message)
             if message.kind == SEARCH:
-                self._note_before(_FRAME_BEFORE, [*region.top_left_m, *region.size_m, list(shape) if shape else None])
+                self._note_before(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
             for attempt in range(self.attempts):
                 self._forget(told)
                 if message.kind == SEARCH:
@@ -162,15 +160,10 @@ class Rescanner(Component):
         rows, columns = (min(round((n - 1) * factor) + 1, max(self.most_pixels, n)) for n in shape)
         return wider, (rows, columns)
 
-    def _set_back(self, left: float, low: float, width: float, height: float, shape: list[int] | None) -> None:
-        values = {names.SCAN_SIZE_X: width, names.SCAN_SIZE_Y: height}
-        values |= {names.SCAN_TOP_LEFT_X: left, names.SCAN_TOP_LEFT_Y: low}
+    def _set_back(self, x: float, y: float, width: float, height: float, angle: float, shape: list[int] | None) -> None:
+        rows_columns = None if shape is None else (shape[0], shape[1])
         try:
-            for name, value_m in values.items():
-                self.scope.set(name, value_m, "m")
-            if shape is not None:
-                self.scope.set(names.SCAN_RESOLUTION_Y, shape[0])
-                self.scope.set(names.SCAN_RESOLUTION_X, shape[1])
+            self.scope.set_scan_region(Region((x, y), (width, height), angle), shape=rows_columns)
         except Refused as refused:
             self.log.warning("the region of the scans before could not be set again: %s", refused.reason)
 
@@ -192,4 +185,4 @@ class Rescanner(Component):
             pass
 
     def _is_flagged(self) -> bool:
-        return self.scope.problems.number(self.problem) in self.scope.control_state.problems
+        return self.scope.is_flagged(self.problem)

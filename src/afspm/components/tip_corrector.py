@@ -21,7 +21,6 @@ from afspm.units import Duration, Length, Speed, Voltage
 VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
 SETTLED_WITHIN_S = 2.0  # real time: a microscope that does not say that it is busy is taken to be ready then
 DONE_ACTION = "ActionMsg"
-_REGION_PARAMETERS = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
 
 
 class TipCorrector(Component):
@@ -109,11 +108,11 @@ class TipCorrector(Component):
     def _look(self) -> None:
         """Repair if that is wanted."""
         if self.memory.get("given_up"):
-            if self._is_flagged(self.problem) and self._is_flagged(Problem.DEVICE_MALFUNCTION):
+            if self.scope.is_flagged(self.problem) and self.scope.is_flagged(Problem.DEVICE_MALFUNCTION):
                 return
             self.log.info("somebody has looked after the tip: it may be repaired again")
             self._begin_anew()
-        if not self._is_flagged(self.problem):
+        if not self.scope.is_flagged(self.problem):
             if self.memory.get("tried"):
                 self._begin_anew()
             return
@@ -171,7 +170,7 @@ class TipCorrector(Component):
                 self.log.warning("no %s, it was refused: %s", treatment, refused.reason)
                 return False
             except ControlLost as lost:
-                if not self._is_flagged(self.problem):
+                if not self.scope.is_flagged(self.problem):
                     raise
                 self.log.warning("no %s yet: %s; it is begun again at a fresh place", treatment, lost.what)
 
@@ -260,7 +259,7 @@ class TipCorrector(Component):
                     raise _Blind(f"no test scan can be taken: {error.what}") from error
                 continue
             score = self._own_score(scans) if self.judge is not None else self._score_of_others(scans, answers)
-            if not self._is_flagged(self.problem):
+            if not self.scope.is_flagged(self.problem):
                 return True
             if score == verdicts.BAD:
                 return False
@@ -285,7 +284,7 @@ class TipCorrector(Component):
         """Wait for the verdict on these scans, or for the flag to be removed."""
         times = {scan.time_ns for scan in scans.values()}
         for event in answers:
-            if not self._is_flagged(self.problem):
+            if not self.scope.is_flagged(self.problem):
                 return verdicts.GOOD
             verdict = read_verdict(event.message) if event.envelope.startswith(verdicts.MESSAGE) else None
             if verdict is not None and verdict[0] in times:
@@ -305,10 +304,8 @@ class TipCorrector(Component):
         """Set the scan region back to the experiment's: its next scan may take what it finds."""
         if region is None:
             return
-        values = zip(_REGION_PARAMETERS, (*region.size_m, *region.top_left_m), strict=True)
         try:
-            for name, value_m in values:
-                self.scope.set(name, value_m, "m")
+            self.scope.set_scan_region(region)
         except Refused as refused:
             self.log.warning("the experiment's region could not be set again: %s", refused.reason)
 
@@ -321,15 +318,12 @@ class TipCorrector(Component):
 
     def _wait_flag(self, problem: int | str, *, flagged: bool) -> None:
         """Until the scheduler's word for it is here: what is older must not be taken for a change."""
-        self.scope.wait_until(lambda: self._is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
+        self.scope.wait_until(lambda: self.scope.is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
 
     def _begin_anew(self) -> None:
         for key in ("tried", "region", "shape", "given_up"):
             self.memory.pop(key, None)
         self.memory.save()
-
-    def _is_flagged(self, problem: int | str) -> bool:
-        return self.scope.problems.number(problem) in self.scope.control_state.problems
 
 
 class _Blind(AfspmError):

@@ -101,7 +101,7 @@ class Cache:
         out = Packet(envelope, payload, self._next_ns(now_ns))
         return out, self._keep(out, None, self._envelopes.history(envelope))
 
-    def restore(self, packets: Iterable[tuple[Packet, int | None]], history_of: dict[str, int] | None = None) -> None:
+    def restore(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
         """Take up what was kept before a restart, oldest first.
 
         How many are kept of an envelope is known again with its next packet; until then all of them are.
@@ -114,7 +114,7 @@ class Cache:
             self.not_before(newest_ns)
             if source_ns is not None:
                 self._saw(source_ns)
-            self._keep(packet, source_ns, (history_of or {}).get(packet.envelope, _TIMES_REMEMBERED))
+            self._keep(packet, source_ns, _TIMES_REMEMBERED)
 
     def holds(self, envelope: str, payload: bytes) -> bool:
         """Whether one of the newest packets of an envelope is just this."""

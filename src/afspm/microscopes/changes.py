@@ -1,6 +1,6 @@
 """What a request asks to be set, as generic parameters: only the fields that are present (wire format).
 
-The messages are read here as they came, since a model object can't say that only the x of a position was given.
+The messages are read here as they came, each number with the unit that its peer gave: a refusal is told in that.
 """
 
 from __future__ import annotations
@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from afspm.errors import Refused
 from afspm.microscopes.parameters import FEEDBACK_ON, ParameterTable, Value
 from afspm.model import ControlRequest, ControlResponse, names
+from afspm.wire.convert import shortest
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
 
@@ -51,7 +51,7 @@ def _feedback(message: feedback_pb2.ZCtrlParameters) -> Iterator[Asked]:
     ):
         if message.HasField(field):
             value = getattr(message, field)
-            yield Asked(name, value if isinstance(value, bool) else _shortest(value), None)
+            yield Asked(name, value if isinstance(value, bool) else shortest(value), None)
 
 
 def _probe_position(message: spectroscopy_pb2.ProbePosition) -> Iterator[Asked]:
@@ -63,11 +63,6 @@ def _probe_position(message: spectroscopy_pb2.ProbePosition) -> Iterator[Asked]:
 def _parameter(message: control_pb2.ParameterMsg) -> Iterator[Asked]:
     if message.HasField("value"):
         yield Asked(message.parameter, message.value, message.units or None)
-
-
-def _shortest(number: float) -> float:
-    """The decimal number that was meant by a float32: 0.1, not 0.10000000149011612."""
-    return float(str(np.float32(number)))
 
 
 _READERS = {

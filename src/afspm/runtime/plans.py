@@ -49,8 +49,7 @@ class Plans:
         self._set: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def scan(self, region: Region | None, shape: tuple[int, int] | None) -> Plan:
-        if isinstance(region, Region) and self._frame is Frame.SAMPLE:
-            region = replace(region, frame=Frame.SAMPLE)
+        region = self._in_our_frame(region)
         wanted = ScanParameters(region, shape)
         facts = {
             "what": "scan",
@@ -102,6 +101,15 @@ class Plans:
         count = self._view.count("ProbePosition")
         self._asker.ask(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), until_s=until_s)
         self._asker.settle("ProbePosition", count, until_s)
+
+    def set_scan(self, region: Region, shape: tuple[int, int] | None, until_s: float | None) -> None:
+        """Set region and shape of the next scan as a whole, unless they are set."""
+        self._set_scan(ScanParameters(self._in_our_frame(region), shape), until_s)
+
+    def _in_our_frame(self, region: Region | None) -> Region | None:
+        if isinstance(region, Region) and self._frame is Frame.SAMPLE:
+            return replace(region, frame=Frame.SAMPLE)
+        return region
 
     def _set_scan(self, wanted: ScanParameters, until_s: float | None) -> None:
         """Set region and shape, unless they are set."""

@@ -183,6 +183,16 @@ class Scope:
             with self._holding.hold(until_s=until_s):
                 self._plans.move_probe(xy_m, until_s)
 
+    def set_scan_region(
+        self, region: Region, *, shape: tuple[int, int] | None = None, timeout_s: float | None = None
+    ) -> None:
+        """Set where the next scan is taken, and with `shape` (rows, columns) its pixels, all at once: one after the
+        other, they would be frames of their own, that may be refused. Returns when it is in force."""
+        with self._call():
+            until_s = self._link.until(timeout_s)
+            with self._holding.hold(until_s=until_s):
+                self._plans.set_scan(region, shape, until_s)
+
     def action(self, name: str, *, timeout_s: float | None = None) -> None:
         """Have the microscope do something by its name; returns when it has accepted it."""
         with self._call():
@@ -234,6 +244,10 @@ class Scope:
     def clear(self, problem: int | str) -> None:
         """Remove the flag of a problem; that it was not flagged is no error."""
         self._tell(ControlRequest.RMV_EXP_PRBLM, self.problems.number(problem))
+
+    def is_flagged(self, problem: int | str) -> bool:
+        """Whether a problem is, by name or number, as far as it was heard."""
+        return self.problems.number(problem) in self.control_state.problems
 
     def set_mode(self, mode: ControlMode) -> None:
         """Set MANUAL (nobody has control) or AUTOMATED."""

@@ -6,6 +6,7 @@ We send metres, degrees and full presence; any unit and any absence is read.
 from __future__ import annotations
 
 import math
+import struct
 
 from google.protobuf.timestamp_pb2 import Timestamp
 
@@ -18,6 +19,7 @@ from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectrosco
 LENGTH_UNIT = "m"
 ANGLE_UNIT = "deg"
 _TIMES = 2**63
+_FLOAT32 = struct.Struct("<f")
 
 
 def timestamp(time_ns: int) -> Timestamp:
@@ -147,10 +149,20 @@ def feedback_from_wire(message: feedback_pb2.ZCtrlParameters) -> model.Feedback:
             raise InvalidValue(f"{name} is {getattr(message, name)}")
     return model.Feedback(
         message.feedbackOn if message.HasField("feedbackOn") else None,
-        message.proportionalGain if message.HasField("proportionalGain") else None,
-        message.integralGain if message.HasField("integralGain") else None,
-        message.setPoint if message.HasField("setPoint") else None,
+        *(
+            shortest(getattr(message, name)) if message.HasField(name) else None
+            for name in ("proportionalGain", "integralGain", "setPoint")
+        ),
     )
+
+
+def shortest(number: float) -> float:
+    """The decimal number that was meant by a float32: 0.1, not 0.10000000149011612, which is above a limit of 0.1."""
+    for digits in range(6, 9):
+        told = float(f"{number:.{digits}g}")
+        if _FLOAT32.unpack(_FLOAT32.pack(told)) == (number,):
+            return told
+    return float(f"{number:.9g}")  # which tells any two of them apart
 
 
 def position_to_wire(position: model.ProbePosition) -> spectroscopy_pb2.ProbePosition:

@@ -11,7 +11,7 @@ from runtime_lab import REGION, Lab, run
 from afspm import wire
 from afspm.components.rescanner import AGAIN, OPPOSITE, SEARCH, Rescanner
 from afspm.errors import ConfigError
-from afspm.model import ControlResponse, Problem, Region, Request, Response, ScanParameters, names
+from afspm.model import ControlRequest, ControlResponse, Problem, Region, Request, Response, ScanParameters, names
 from afspm.runtime.exit_codes import ExitCode
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
@@ -28,9 +28,6 @@ class Drifting(Lab):
         self.told = iter(told)
         self.parameters = ScanParameters(REGION, (8, 8))
         self.publish(self.parameters)
-        self.values |= dict.fromkeys((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), "0")
-        self.values |= dict.fromkeys((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), "0")
-        self.values |= dict.fromkeys((names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y), "0")
         self.values[names.SCAN_DIRECTION] = names.UP
         self.directions: list[str] = []
 
@@ -101,8 +98,7 @@ def test_direction_and_region_are_set_back_when_somebody_else_says_that_there_is
     assert run(Rescanner(), lab) == ExitCode.ENDED
     assert lab.values[names.SCAN_DIRECTION] == names.UP
     if kind == SEARCH:
-        assert float(lab.values[names.SCAN_SIZE_X]) == pytest.approx(REGION.size_m[0])
-        assert float(lab.values[names.SCAN_RESOLUTION_X]) == 8
+        assert (lab.parameters.region, lab.parameters.shape) == (REGION, (8, 8))
 
 
 def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_back() -> None:
@@ -110,15 +106,16 @@ def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_bac
     assert [region.size_m[0] for region in lab.finished] == pytest.approx([2e-6, 4e-6, 8e-6])
     assert {region.center_m for region in lab.finished} == {REGION.center_m}
     assert lab.problems == ()
-    assert float(lab.values[names.SCAN_SIZE_X]) == pytest.approx(REGION.size_m[0])
-    assert float(lab.values[names.SCAN_TOP_LEFT_X]) == pytest.approx(REGION.top_left_m[0])
-    assert float(lab.values[names.SCAN_RESOLUTION_X]) == 8
+    assert (lab.parameters.region, lab.parameters.shape) == (REGION, (8, 8))
 
 
 def test_a_sample_that_is_not_found_again_is_a_person_s_business() -> None:
     lab = asked(SEARCH, ["lost"] * 10)
     assert len(lab.finished) == 3
     assert lab.problems == (MALFUNCTION,)
+    told = [(r.kind, r.subject) for r in lab.requests]
+    called, given_up = (ControlRequest.ADD_EXP_PRBLM, MALFUNCTION), (ControlRequest.RMV_EXP_PRBLM, DRIFT)
+    assert told.index(called) < told.index(given_up), "nobody is to go on in between"
 
 
 def refusing(lab: Drifting, most_m: float) -> None:

@@ -45,7 +45,6 @@ class Repairs(Lab):
         self.publish(self.parameters)
         self.actions: list[tuple[str, tuple[float, float]]] = []
         self.values |= dict.fromkeys(("x-pulse-voltage", "x-pulse-duration", "x-crash-depth", "x-crash-speed"), "0")
-        self.values |= dict.fromkeys(("scan-size-x", "scan-size-y", "scan-top-left-x", "scan-top-left-y"), "0")
 
     def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
         super().publish_scan(region, shape)

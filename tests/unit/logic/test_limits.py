@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from afspm import wire
 from afspm.logic.limits import Guard, Limit, Limits
 from afspm.model import (
     ControlRequest,
@@ -330,3 +331,11 @@ def test_steps_rates_and_places_are_known_after_a_restart() -> None:
     assert here(again, "x-pulse") == ""
     assert "corner" in here(again, "start-scan")
     assert again.snapshot() == g.snapshot()
+
+
+def test_a_setpoint_that_is_the_limit_is_not_above_it() -> None:
+    """The message has it in 32 bits, where 0.1 is a little more."""
+    limits = guard(zctrl_setpoint=Limit(0.0, 0.1))
+    for setpoint, fits in ((0.1, True), (0.100001, False)):
+        asked = wire.decode("ZCtrlParameters", wire.encode(Feedback(setpoint=setpoint))[1])
+        assert (why(limits, Request(int(ControlRequest.SET_ZCTRL_PARAMS), asked)) == "") is fits
