@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from afspm import wire
+from afspm.components.channels import Expected
 from afspm.components.feedback_metrics import error_shares
+from afspm.components.feedback_signal import Comparable
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import ControlState, Feedback, Problem, Scan
 from afspm.runtime.component import Component
@@ -20,7 +22,7 @@ class FeedbackAnalysis(Component):
     when they do not any more.
 
     Args:
-        channel: what the feedback holds at the setpoint.
+        channel: what the feedback holds at the setpoint, in a unit of the same kind.
         threshold: of the error, as a share of the setpoint.
         limit: of the pixels that may lie beyond it.
         flag_after: bad scans in a row until the problem is flagged.
@@ -45,6 +47,10 @@ class FeedbackAnalysis(Component):
         self.flag_after, self.clear_after = flag_after, clear_after
         self._setpoint: float | None = None
         self._is_flagged = False
+        self._comparable = Comparable()
+
+    def on_start(self) -> None:
+        self.expected = Expected([self.channel], self.log)
 
     def on_feedback(self, feedback: Feedback) -> None:
         self._setpoint = feedback.setpoint
@@ -53,11 +59,14 @@ class FeedbackAnalysis(Component):
         self._is_flagged = Problem.FEEDBACK_NON_OPTIMAL in control_state.problems
 
     def on_scan(self, scan: Scan) -> None:
+        self.expected.see(scan)
         if scan.channel != self.channel or not scan.values.size:
             return
         if scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1):
             return  # replayed after a restart
         try:
+            if self._setpoint is not None:
+                self._comparable.require(scan, self.scope)
             shares = error_shares(scan.values, self._setpoint, self.threshold)
         except InvalidValue as error:
             self.log.warning("%s: %s", scan.channel, error)

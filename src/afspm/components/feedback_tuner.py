@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from afspm.components.feedback_metrics import error_shares, gain_search
+from afspm.components.feedback_signal import Comparable
 from afspm.errors import ConfigError, ControlLost, InvalidValue, Refused
 from afspm.model import Problem, names
 from afspm.runtime.component import Component
@@ -19,7 +20,7 @@ class FeedbackTuner(Component):
         lowest_gain, highest_gain: of the integral gain; never left.
         factor: of one step.
         most_tries: test scans of one search.
-        channel: what the feedback holds at the setpoint.
+        channel: what the feedback holds at the setpoint, in a unit of the same kind.
         threshold: of the error, as a share of the setpoint.
         limit: of the pixels that may lie beyond it for the flag to be cleared.
     """
@@ -43,6 +44,7 @@ class FeedbackTuner(Component):
             raise ConfigError("needs 0 < lowest_gain < highest_gain, factor > 1, most_tries >= 2")
         self.lowest, self.highest, self.factor, self.most_tries = lowest_gain, highest_gain, factor, most_tries
         self.channel, self.threshold, self.limit = channel, threshold, limit
+        self._comparable = Comparable()
 
     def run(self) -> None:
         while True:
@@ -93,6 +95,8 @@ class FeedbackTuner(Component):
             )
         setpoint = self.scope.feedback.setpoint if self.scope.feedback else None
         try:
+            if setpoint is not None:
+                self._comparable.require(scans[self.channel], self.scope)
             share = error_shares(scans[self.channel].values, setpoint, self.threshold).total
         except InvalidValue as error:
             self.log.warning("integral gain %g can't be judged: %s", gain, error.what)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from afspm.components import verdicts
+from afspm.components.channels import Expected
 from afspm.components.tip_judge import Counter, Opinion, TipJudge, Tolerance, Verdict
 from afspm.components.tip_scans import HeightPair, Pairing
 from afspm.errors import UnitError
@@ -60,6 +61,7 @@ class TipClassifier(Component):
         self._problems: tuple[int, ...] | None = None  # not known yet
 
     def on_start(self) -> None:
+        self.expected = Expected(self.pairing.channels, self.log)
         if "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
             self.counter.restore(self.memory["counter"])
@@ -72,6 +74,7 @@ class TipClassifier(Component):
             self.counter.bad = 0  # somebody has seen to it: only scans from now on can tell that it is bad again
 
     def on_scan(self, scan: Scan) -> None:
+        self.expected.see(scan)
         pair = self.pairing.add(scan)
         # a replay after a restart brings what was judged already
         if pair is None or (scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1)):

@@ -37,6 +37,10 @@ class Pairing:
         self._channel, self._retrace_channel = channel, retrace_channel
         self._seen: dict[str, Scan] = {}
 
+    @property
+    def channels(self) -> tuple[str, str]:
+        return self._channel, self._retrace_channel
+
     def add(self, scan: Scan) -> HeightPair | None:
         """One more channel; a pair if it completes one."""
         if scan.channel not in (self._channel, self._retrace_channel) or not scan.values.size:

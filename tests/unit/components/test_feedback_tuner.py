@@ -11,7 +11,7 @@ import pytest
 from runtime_lab import Lab, run
 
 from afspm.components.feedback_tuner import FeedbackTuner
-from afspm.model import ControlRequest, Feedback, Packet, Problem, Region, Scan
+from afspm.model import ControlRequest, Feedback, Packet, Problem, Region, Scan, names
 from afspm.runtime.exit_codes import ExitCode
 
 SETPOINT = 0.5
@@ -23,6 +23,7 @@ class Rig(Lab):
     def __init__(self, amplitude: Callable[[float], np.ndarray], setpoint: float = SETPOINT) -> None:
         super().__init__("tuner")
         self.amplitude, self.setpoint = amplitude, setpoint
+        self.values[names.ZCTRL_SETPOINT] = str(setpoint)
         self.publish(Feedback(on=True, integral_gain=1.0))
         self.flag(Problem.FEEDBACK_NON_OPTIMAL)
 

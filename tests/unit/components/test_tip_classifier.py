@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from runtime_lab import Lab, run
 from tip_scans_lab import channels
 
@@ -141,3 +143,15 @@ def test_channels_of_two_scans_are_not_taken_for_one() -> None:
     component = classifier()
     run(component, lab)
     assert component.judge.reference is None
+
+
+def test_that_nothing_is_judged_for_want_of_a_channel_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("tip_classifier")
+    for number, (trace, retrace) in enumerate(channels(1, "double", 5)):
+        named = replace(trace, channel="Z Forward"), replace(retrace, channel="Z Backward")
+        publish_at(lab, 100.0 * (number + 1), named)
+    lab.at(2000.0, lab.kill)
+    run(classifier(), lab)
+    (told,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert "no channel Height and Height Retrace" in told
+    assert "There are Z Forward, Z Backward" in told
