@@ -14,13 +14,13 @@ import pytest
 
 from afspm import wire
 from afspm.errors import ControlLost
+from afspm.exit_codes import ExitCode
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.restart import RestartPolicy
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.supervision import Policy
 from afspm.model import Problem, Region
 from afspm.runtime.component import Component
-from afspm.runtime.exit_codes import ExitCode
 from afspm.scheduler.codec import WireCodec
 from afspm.testing.deterministic.bench import CHANNELS, BenchMicroscope
 from afspm.testing.deterministic.hosted import HostedComponent, HostedTranslator

@@ -20,6 +20,7 @@ from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.emulators.emulator import Emulator
 from afspm.emulators.faults import Fault
+from afspm.exit_codes import ExitCode
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -34,7 +35,6 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 

@@ -108,9 +108,9 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     from afspm.cli.joining import looking
     from afspm.dashboard import Dashboard
     from afspm.dashboard.joining import join, url_in
+    from afspm.exit_codes import ExitCode
     from afspm.experiment.known import DASHBOARD
     from afspm.record.facts import read_facts
-    from afspm.runtime.exit_codes import ExitCode
 
     url = url_in(read_facts(folder).get("processes"), folder, DASHBOARD)
     if url is not None:

@@ -8,10 +8,10 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from afspm.exit_codes import ExitCode
 from afspm.model import Frame
 from afspm.record.facts import EXPERIMENT_FILE, name_in
 from afspm.runtime.component import Component
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.priority import step_back
 from afspm.transport.port import CaughtUp, Killed, PacketReceived, ParentGone
 

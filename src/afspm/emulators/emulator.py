@@ -15,7 +15,7 @@ from afspm.clock import Clock, ExperimentClock
 from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError
-from afspm.runtime.exit_codes import ExitCode
+from afspm.exit_codes import ExitCode
 from afspm.transport.launching import open_port
 from afspm.transport.port import Killed
 from afspm.transport.wakeup import WakeUp

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Protocol
 
+from afspm.exit_codes import ExitCode
 from afspm.logic.liveness import Liveness, LivenessPolicy, Vital
 from afspm.logic.restart import RestartPolicy, Restarts
 
@@ -19,11 +20,9 @@ class Policy:
     restart: RestartPolicy = field(default_factory=RestartPolicy)
     beats: bool = True
     """Whether it sends heartbeats."""
-    final_codes: Collection[int] = frozenset({0, 78, 80})
-    """Exit codes after which it is not started again: done, bad settings, the experiment ended."""
-    asked_code: int = 81
-    """Of one that was asked to stop. If it was not us who asked, it is needed as before."""
-    quiet_codes: Collection[int] = frozenset({78, 80})
+    final_codes: Collection[int] = frozenset({ExitCode.DONE, ExitCode.CONFIG, ExitCode.ENDED})
+    """Exit codes after which it is not started again. Who was asked to stop, and not by us, is needed as before."""
+    quiet_codes: Collection[int] = frozenset({ExitCode.CONFIG, ExitCode.ENDED})
     """Those of them that others tell: who gives it up for its settings, the scheduler that the experiment has ended."""
 
 
@@ -111,7 +110,7 @@ class ChildWatch:
 
     def died(self, code: int) -> bool:
         """Whether a process that ended with this code had not finished."""
-        return code not in (*self._policy.final_codes, self._policy.asked_code)
+        return code not in (*self._policy.final_codes, ExitCode.ORPHAN)
 
     def begin(self, now_s: float) -> list[Effect]:
         """Start it, the first time or after it was over."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, FileError, WireError
+from afspm.exit_codes import ExitCode
 from afspm.logic.forwarding import NOT_SENT
 from afspm.logic.watchdog import feedback_of
 from afspm.microscopes import in_force
@@ -31,7 +32,6 @@ from afspm.microscopes.sequence import Sequence as StateSequence
 from afspm.microscopes.service import Service
 from afspm.microscopes.sole import ControllerTaken, commanding
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus, names
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.memory import Memory
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 

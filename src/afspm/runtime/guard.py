@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 
-from afspm.runtime.exit_codes import ExitCode
+from afspm.exit_codes import ExitCode
 from afspm.runtime.parent import STDIN, end_within
 
 ASK_S = 0.6  # to end by itself once its standard input is closed

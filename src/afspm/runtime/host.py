@@ -15,8 +15,8 @@ from pathlib import Path
 from afspm import wire
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ConfigError
+from afspm.exit_codes import ExitCode
 from afspm.runtime import failure, log
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch
 from afspm.runtime.loading import load
 from afspm.runtime.messages import register_all

@@ -9,12 +9,12 @@ from pathlib import Path
 from afspm import wire
 from afspm.clock import NS_PER_S, Clock
 from afspm.errors import ConfigError, ExperimentEnded
+from afspm.exit_codes import ExitCode
 from afspm.model import Frame, Packet
 from afspm.runtime import failure
 from afspm.runtime.backlog import Backlog
 from afspm.runtime.component import Component
 from afspm.runtime.dispatch import Dispatcher, overrides
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.link import Link
 from afspm.runtime.memory import Memory
 from afspm.runtime.process import Context

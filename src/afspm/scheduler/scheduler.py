@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from afspm.clock import Clock
 from afspm.errors import FileError
+from afspm.exit_codes import ExitCode
 from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
 from afspm.model import ProblemNames
 from afspm.scheduler.codec import WireCodec
@@ -22,9 +23,6 @@ from afspm.scheduler.state_file import StateFile
 from afspm.transport.complaints import Complaints
 from afspm.transport.launching import Launched
 from afspm.transport.scheduler_sockets import SchedulerSockets
-
-# The numbers of `runtime.exit_codes`, which is not below us: ended with the experiment, and left by the parent.
-_ENDED, _ORPHAN = 80, 81
 
 
 class SchedulerLaunch(Launched, Protocol):
@@ -116,7 +114,7 @@ class Scheduler:
             sockets.close()
             shell.close()
             state.close()
-        return _ENDED if shell.ended else _ORPHAN
+        return ExitCode.ENDED if shell.ended else ExitCode.ORPHAN
 
     def _settings(self, context: SchedulerContext) -> SchedulerSettings:
         settings = scheduler_settings(

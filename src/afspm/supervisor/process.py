@@ -15,7 +15,7 @@ from typing import IO, Literal
 
 from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
-from afspm.runtime.exit_codes import ExitCode
+from afspm.exit_codes import ExitCode
 from afspm.supervisor.thinning import PAUSE_S, Thinning
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory

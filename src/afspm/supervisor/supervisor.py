@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, replace
 
 from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
+from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
 from afspm.logic import supervision
 from afspm.logic.liveness import LivenessPolicy
-from afspm.runtime.exit_codes import ExitCode
 from afspm.supervisor import signals
 from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import SUPERVISOR, LineReader, RunLog

@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from afspm.clock import ExperimentClock
-from afspm.runtime.exit_codes import ExitCode
+from afspm.exit_codes import ExitCode
 from afspm.runtime.launch import Launch, Sockets
 
 DEADLINE_S = 30.0

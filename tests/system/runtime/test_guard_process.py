@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from afspm.runtime.exit_codes import ExitCode
+from afspm.exit_codes import ExitCode
 
 GUARD = [sys.executable, "-m", "afspm.runtime.guard"]
 

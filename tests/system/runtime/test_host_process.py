@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.runtime.exit_codes import ExitCode
+from afspm.exit_codes import ExitCode
 from afspm.runtime.host import MOST_FILES
 from afspm.runtime.launch import Launch, Sockets
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener

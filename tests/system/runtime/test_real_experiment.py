@@ -12,10 +12,10 @@ import pytest
 import afspm
 from afspm.clock import ExperimentClock
 from afspm.errors import ControlLost, ExperimentEnded, FileError, NoResponse, Refused
+from afspm.exit_codes import ExitCode
 from afspm.model import ControlMode, Region, ScopeState
 from afspm.runtime import connect
 from afspm.runtime.connect import guest_facts
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 

@@ -12,8 +12,8 @@ import pytest
 from supervisor_lab import DEADLINE_S, QUICK, RunTasks, peer
 
 from afspm.clock import ExperimentClock
+from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
-from afspm.runtime.exit_codes import ExitCode
 from afspm.supervisor.ending import Why
 from afspm.supervisor.task import Task
 

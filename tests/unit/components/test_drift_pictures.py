@@ -17,9 +17,9 @@ from afspm.components.drift_pictures import DriftPictures, Told, parts
 from afspm.components.simulated_truth import true_drift
 from afspm.drift.record import DriftRecord
 from afspm.errors import FileError
+from afspm.exit_codes import ExitCode
 from afspm.microscopes.simulator.files import Measured, encode_scan
 from afspm.model import Region
-from afspm.runtime.exit_codes import ExitCode
 from afspm.simulation import World
 
 pytest.importorskip("matplotlib")

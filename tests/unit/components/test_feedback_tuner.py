@@ -11,8 +11,8 @@ import pytest
 from runtime_lab import Lab, run
 
 from afspm.components.feedback_tuner import FeedbackTuner
+from afspm.exit_codes import ExitCode
 from afspm.model import ControlRequest, Feedback, Packet, Problem, Region, Scan, names
-from afspm.runtime.exit_codes import ExitCode
 
 SETPOINT = 0.5
 

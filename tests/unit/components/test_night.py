@@ -13,6 +13,7 @@ from runtime_lab import REGION, Lab, context_of, run
 from afspm import wire
 from afspm.components.night_picture import NightPicture
 from afspm.components.verdicts import BAD, MESSAGE, verdict_message
+from afspm.exit_codes import ExitCode
 from afspm.model import ControlMode, ControlState, Problem, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.night_record import (
     THUMBNAIL_PX,
@@ -22,7 +23,6 @@ from afspm.record.night_record import (
     scan_entry,
     thumbnail,
 )
-from afspm.runtime.exit_codes import ExitCode
 
 pytest.importorskip("matplotlib")
 from afspm.record.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by

@@ -19,12 +19,12 @@ from afspm.clock import ExperimentClock
 from afspm.components import recorder, recording
 from afspm.components.recording import Writer
 from afspm.errors import FileError
+from afspm.exit_codes import ExitCode
 from afspm.model import ControlMode, ControlState, Packet
 from afspm.record import ahead
 from afspm.record.ahead import Ahead, expect_record, recorded_until
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.store import About, Store
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch
 from afspm.runtime.process import Activity, Context
 from afspm.transport.port import Incoming, ParentGone

@@ -11,8 +11,8 @@ from runtime_lab import REGION, Lab, run
 from afspm import wire
 from afspm.components.rescanner import AGAIN, OPPOSITE, SEARCH, Rescanner
 from afspm.errors import ConfigError
+from afspm.exit_codes import ExitCode
 from afspm.model import ControlRequest, ControlResponse, Problem, Region, Request, Response, ScanParameters, names
-from afspm.runtime.exit_codes import ExitCode
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
 

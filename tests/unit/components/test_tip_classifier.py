@@ -12,9 +12,9 @@ from tip_scans_lab import channels
 from afspm import wire
 from afspm.components.tip_classifier import TipClassifier
 from afspm.components.verdicts import BAD, GOOD, MESSAGE, read_verdict
+from afspm.exit_codes import ExitCode
 from afspm.logic.arbitration import Event
 from afspm.model import ControlRequest, Problem, Region, Scan
-from afspm.runtime.exit_codes import ExitCode
 
 TIP = Problem.TIP_SHAPE_CHANGED
 

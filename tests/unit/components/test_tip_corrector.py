@@ -17,6 +17,7 @@ from afspm import wire
 from afspm.components.tip_corrector import TipCorrector
 from afspm.components.verdicts import BAD, GOOD, MESSAGE, UNCLEAR, verdict_message
 from afspm.errors import ConfigError
+from afspm.exit_codes import ExitCode
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -30,7 +31,6 @@ from afspm.model import (
     Scan,
     ScanParameters,
 )
-from afspm.runtime.exit_codes import ExitCode
 
 TIP, MALFUNCTION = Problem.TIP_SHAPE_CHANGED, Problem.DEVICE_MALFUNCTION
 

@@ -13,6 +13,7 @@ import pytest
 
 from afspm import wire
 from afspm.errors import FileError, Refused
+from afspm.exit_codes import ExitCode
 from afspm.microscopes import Microscope, Value, action
 from afspm.microscopes.translator import Translator
 from afspm.model import (
@@ -27,7 +28,6 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.memory import Memory
 from afspm.transport.port import RequestReceived, Served
 

@@ -14,6 +14,7 @@ from typing import BinaryIO
 import pytest
 
 from afspm.clock import ExperimentClock
+from afspm.exit_codes import ExitCode
 from afspm.microscopes import sole
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
@@ -21,7 +22,6 @@ from afspm.microscopes.nanonis import Nanonis
 from afspm.microscopes.simulator import Simulator
 from afspm.microscopes.sole import ControllerTaken, commanding
 from afspm.microscopes.translator import run_translator
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.process import Activity, Context
 

@@ -10,6 +10,7 @@ import pytest
 
 from afspm import wire
 from afspm.errors import ConfigError, WireError
+from afspm.exit_codes import ExitCode
 from afspm.model import (
     CLOCK_REQUEST,
     ControlRequest,
@@ -22,7 +23,6 @@ from afspm.model import (
     ScopeState,
     names,
 )
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.parent import TIP_WITHIN_S
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.wire.generated import feedback_pb2, scan_pb2

@@ -11,9 +11,9 @@ from runtime_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of,
 
 from afspm import model, wire
 from afspm.errors import ConfigError, ExperimentEnded, Refused
+from afspm.exit_codes import ExitCode
 from afspm.model import HAS_ENDED, ControlResponse, Problem, Response, Scan, ScopeState, ScopeStatus
 from afspm.runtime.component import Component
-from afspm.runtime.exit_codes import ExitCode
 from afspm.runtime.launch import Launch
 from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
 from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis

@@ -527,8 +527,10 @@ def test_a_rate_that_is_known_is_handed_over_and_the_worker_hears_since_when() -
     second = lab.sent()
     assert second.request.subject == Parameter("x-rate-y", "-2e-10", "m/s")
     lab.answer(second)
-    (velocity,) = lab.worker.velocities
-    assert velocity == (pytest.approx(lab.now_s), (1e-10, -2e-10))
+    assert lab.worker.velocities == [
+        (pytest.approx(lab.now_s), (1e-10, 0.0)),
+        (pytest.approx(lab.now_s), (1e-10, -2e-10)),
+    ]
     lab.scan()
     lab.says(registered(lab.worker.jobs[1], forecast(DRIFT, (1e-12, 0.0), at_s=lab.now_s, rate_sd_m_s=1e-11)))
     assert not lab.forwards()  # what is left is not known to be anything
@@ -545,7 +547,16 @@ def test_a_controller_that_does_not_take_the_rate_is_told_of() -> None:
     lab.answer(lab.sent(), ControlResponse.PARAM_NOT_SUPPORTED)
     assert "x-rate-x" in logged(lab, "ERROR")[0]
     lab.answer(lab.sent())
-    assert not lab.worker.velocities
+    assert [velocity for _, velocity in lab.worker.velocities] == [(0.0, -2e-10)], "the other is as it was"
+
+
+def test_under_a_person_s_hands_the_rate_is_left_as_it_is() -> None:
+    lab = Lab(DriftSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
+    lab.in_force()
+    lab.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL), name="dashboard:Ada")
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT, (1e-10, -2e-10), at_s=lab.now_s)))
+    assert not lab.forwards()
 
 
 def test_a_packet_that_is_no_scan_is_passed_on_as_it_is(lab: Lab) -> None:

@@ -10,6 +10,7 @@ import pytest
 from nanonis_bench import Bench
 from vendor_bench import FLAT, SHAPE, TURNED, left_in_danger, moved, ready, scanned, states
 
+from afspm.exit_codes import ExitCode
 from afspm.files import read
 from afspm.model import (
     ControlRequest,
@@ -24,7 +25,6 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.runtime.exit_codes import ExitCode
 
 Make = Callable[..., Bench]
 

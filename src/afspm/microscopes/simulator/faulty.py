@@ -6,10 +6,10 @@ import logging
 import os
 import threading
 
+from afspm.exit_codes import ExitCode
 from afspm.microscopes.simulator.faults import Fault, Faults
 from afspm.microscopes.translator import Translator
 from afspm.model import Response
-from afspm.runtime.exit_codes import ExitCode
 
 
 class FaultyTranslator(Translator):

@@ -52,7 +52,6 @@ class Consequences:
         self._started = settings.at_start == "nothing"
         self._unregistered = 0
         self._given_m_s = [0.0, 0.0]
-        self._accepted: dict[str, float] = {}
 
     def of(self, registered: Registered, job: ScanJob, step: Step, now_ns: int) -> list[Effect]:
         """What is done after a scan was published. What a person scans is followed, and not scanned again."""
@@ -137,7 +136,10 @@ class Consequences:
         return effects
 
     def hand_over(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Tell the controller the newest rate, if there is one beyond what it has been told."""
+        """Tell the controller the newest rate, if there is one beyond what it has been told; nothing is changed under
+        the hands of a person."""
+        if self._core.control.mode is ControlMode.MANUAL:
+            return []
         compensate, time_s = self._settings.compensate, now_ns * 1e-9
         predicted = self._knowledge.predicted(time_s)
         if compensate is None or predicted is None or not self._knowledge.corrects(time_s):
@@ -145,28 +147,27 @@ class Consequences:
         sd_m_s = np.sqrt(np.diagonal(predicted.rate_covariance))
         if np.hypot(*predicted.rate_m_s) <= np.hypot(*sd_m_s):
             return []
-        total = [float(given + more) for given, more in zip(self._given_m_s, predicted.rate_m_s, strict=True)]
-        self._accepted = {}
         effects: list[Effect] = []
-        for axis, value_m_s in zip((compensate.x, compensate.y), total, strict=True):
-            effects += self._core.ask_own(self._set(axis, value_m_s), now_s, self._answered(axis, total))
+        for axis, name in enumerate((compensate.x, compensate.y)):
+            value_m_s = float(self._given_m_s[axis] + predicted.rate_m_s[axis])
+            effects += self._core.ask_own(self._set(name, value_m_s), now_s, self._answered(axis, name, value_m_s))
         return effects
 
     def _set(self, name: str, value_m_s: float) -> Request:
         parameter = Parameter(name, f"{value_m_s:.9g}", "m/s")
         return Request(int(ControlRequest.PARAM), parameter, self._codec.encode(parameter))
 
-    def _told(self, axis: str) -> OwnEnd:
-        return lambda response, now_s, now_ns: _refusal(axis, response)
+    def _told(self, name: str) -> OwnEnd:
+        return lambda response, now_s, now_ns: _refusal(name, response)
 
-    def _answered(self, axis: str, total_m_s: list[float]) -> OwnEnd:
+    def _answered(self, axis: int, name: str, value_m_s: float) -> OwnEnd:
+        """Each axis by itself: the controller may take one and refuse the other."""
+
         def ended(response: Response, now_s: float, now_ns: int) -> list[Effect]:
             if not response.ok:
-                return _refusal(axis, response)
-            self._accepted[axis] = now_ns * 1e-9
-            if len(self._accepted) == 2:
-                self._given_m_s = total_m_s
-                self._worker.compensated(max(self._accepted.values()), (total_m_s[0], total_m_s[1]))
+                return _refusal(name, response)
+            self._given_m_s[axis] = value_m_s
+            self._worker.compensated(now_ns * 1e-9, (self._given_m_s[0], self._given_m_s[1]))
             return []
 
         return ended
