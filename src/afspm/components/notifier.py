@@ -18,6 +18,7 @@ from afspm.components.notices import (
     Targets,
 )
 from afspm.errors import ConfigError
+from afspm.logic.telling import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
 from afspm.model.words import lasting
 from afspm.record.facts import name_in
@@ -27,7 +28,6 @@ from afspm.units import Duration
 MOST_TOLD = 1000
 """So much is remembered as told; a component that says something else each time must not fill the memory."""
 LAST_TRIES = 2  # the end of the experiment does not wait for more
-SUPERVISOR = "afspm"  # as which it writes in the log: what it says there is told of as given up, and as the end
 
 
 class Notifier(Component):
@@ -92,7 +92,7 @@ class Notifier(Component):
     def on_log_lines(self, lines: LogLines) -> None:
         first: dict[str, str] = {}  # of each process: what follows it belongs to it
         for line in lines.lines:
-            if line.level == "CRITICAL" and line.name not in (SUPERVISOR, self.name):
+            if line.level == "CRITICAL" and line.name not in (LOGGED_AS, self.name):
                 first.setdefault(line.name, line.text)
         for name, text in first.items():
             self._tell(CRITICAL, f"{name} {text}", f"{name}: {text}")

@@ -6,19 +6,21 @@ from typing import Any, ClassVar
 
 from afspm import wire
 from afspm.errors import ConfigError, ControlLost, Refused
-from afspm.model import Problem, Region, ScanParameters, names
+from afspm.model import Problem, Region, RescanKind, ScanParameters, names
 from afspm.runtime.component import Component
 from afspm.runtime.events import Events
 
 WANTED, TOLD = "DriftRescan", "DriftMapping"
-AGAIN, OPPOSITE, SEARCH = 1, 2, 3
-"""The numbers of RescanKind."""
 FLAGGED_WITHIN_S = 5.0
 BACK_WITHIN_S = 60.0
 _BEFORE, _FRAME_BEFORE = "direction_before", "frame_before"
 Pixels = tuple[int, int] | None
 
-_IN_WORDS = {AGAIN: "the same region again", OPPOSITE: "the other direction", SEARCH: "a wider region"}
+_IN_WORDS = {
+    RescanKind.AGAIN: "the same region again",
+    RescanKind.OPPOSITE: "the other direction",
+    RescanKind.SEARCH: "a wider region",
+}
 
 
 class Rescanner(Component):
@@ -77,7 +79,8 @@ class Rescanner(Component):
             except Refused as refused:
                 self.log.error("it can't be scanned again: %s", refused.reason)
                 found = False
-            if not found and message.kind == SEARCH:  # before the other flag is gone: nobody is to go on in between
+            if not found and message.kind == RescanKind.SEARCH:
+                # before the other flag is gone: nobody is to go on in between
                 self.log.critical("the sample is not found again: a person has to look, nothing is scanned until then")
                 self.scope.flag(Problem.DEVICE_MALFUNCTION)
             elif not found:
@@ -93,11 +96,11 @@ class Rescanner(Component):
         assert shape is None or isinstance(shape, tuple)
         try:
             self._turn(message)
-            if message.kind == SEARCH:
+            if message.kind == RescanKind.SEARCH:
                 self._note_before(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
             for attempt in range(self.attempts):
                 self._forget(told)
-                if message.kind == SEARCH:
+                if message.kind == RescanKind.SEARCH:
                     self._search(region, shape, attempt + 1)
                 else:
                     self.scope.scan(region, shape=shape)
@@ -175,9 +178,9 @@ class Rescanner(Component):
         if mapping is None:
             self.log.warning("nothing was told of the drift in the scan")
             return False
-        if kind == SEARCH:
+        if kind == RescanKind.SEARCH:
             return not mapping.lost
-        return bool(mapping.matched and not mapping.lost and (kind == OPPOSITE or not mapping.rescan))
+        return bool(mapping.matched and not mapping.lost and (kind == RescanKind.OPPOSITE or not mapping.rescan))
 
     def _forget(self, told: Events) -> None:
         """What was told of earlier scans."""

@@ -21,6 +21,8 @@ TRUTH_FILE = "truth.jsonl"
 def true_drift(run_dir: Path) -> Callable[[Array], Array] | None:
     """The displacement (n, 2) of the sample at experiment times (n,), in tip coordinates; None where nobody knows it.
 
+    Tip coordinates go along with what the controller follows by itself, which is known at the ends of each scan.
+
     Raises:
         FileError: there is such a file, but it is not one of a simulated run.
     """
@@ -28,18 +30,31 @@ def true_drift(run_dir: Path) -> Callable[[Array], Array] | None:
     if not path.exists():
         return None
     try:
-        start = _start(path)
+        start, followed = _read(path)
         world = World.from_settings(start["settings"], int(start["seed"]), float(start["time_s"]))
     except (OSError, KeyError, ValueError, AfspmError) as error:
         raise FileError(f"does not say what was simulated: {error}", where=str(path)) from error
-    return lambda time_s: world.drift_m(time_s)[..., :2]
+
+    def left(time_s: Array) -> Array:
+        moved_m: Array = world.drift_m(time_s)[..., :2]
+        return moved_m - np.stack([np.interp(time_s, followed[:, 0], followed[:, axis]) for axis in (1, 2)], axis=-1)
+
+    return left
 
 
-def _start(path: Path) -> dict[str, Any]:
-    """The entry of the moment when the simulated microscope was switched on."""
+def _read(path: Path) -> tuple[dict[str, Any], Array]:
+    """The entry of the moment when the simulated microscope was switched on; and what the controller had followed of
+    the drift, (n, 3): time, x, y."""
+    start: dict[str, Any] | None = None
+    followed: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
     with path.open(encoding="utf-8") as file:
         for line in file:
             entry: dict[str, Any] = json.loads(line)
-            if entry["event"] == "start":
-                return entry
-    raise ValueError("it has no beginning")
+            if entry["event"] == "start" and start is None:
+                start = entry
+            scan = entry.get("scan")
+            if isinstance(scan, dict):
+                followed += [(scan[f"{at}_s"], *scan[f"compensated_{at}_m"][:2]) for at in ("start", "end")]
+    if start is None:
+        raise ValueError("it has no beginning")
+    return start, np.array(sorted(followed), dtype=np.float64)

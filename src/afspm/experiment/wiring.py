@@ -17,7 +17,7 @@ from afspm.experiment.findings import Findings, Place
 from afspm.experiment.known import WIRE_KEYS, Wire
 from afspm.experiment.parts import Part, Role, wire_of
 
-_ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+|inproc://\S+)")
+_ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+)")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from afspm.model.words import lasting
 
 SUPERVISOR = "supervisor"
 """Whose key it takes, where there are keys, to speak of processes; each supervisor adds ":" and what tells it apart."""
+LOGGED_AS = "afspm"
+"""The name that its own lines have in the log."""
 LONGEST = 256 * 1024
 """Bytes that may be told at a time."""
 SILENT_S = 10.0

@@ -11,6 +11,7 @@ from afspm.model.enums import (
     ControlRequest,
     ControlResponse,
     Problem,
+    RescanKind,
     ScopeState,
     request_name,
 )
@@ -63,6 +64,7 @@ __all__ = [
     "Region",
     "RegionChange",
     "Request",
+    "RescanKind",
     "Response",
     "Scan",
     "ScanLines",

@@ -86,3 +86,14 @@ class ControlResponse(IntEnum):
     WRONG_EXP_PROBLEM = 10
     ACTION_NOT_SUPPORTED = 11
     ACTION_ERROR = 12
+
+
+class RescanKind(IntEnum):
+    """What a Rescanner is asked to do; a message of ours."""
+
+    AGAIN = 1
+    """The same region."""
+    OPPOSITE = 2
+    """In the other direction of the slow axis."""
+    SEARCH = 3
+    """A wider region, until the sample is found."""

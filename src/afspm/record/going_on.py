@@ -40,7 +40,7 @@ def cut_off(folder: Path) -> str:
         return ""
     if REPLAY_OF in facts:
         return "this replay was cut off"
-    return f"it was cut off; {to_resume(folder)} goes on with it"
+    return f"it was cut off; {resume_command(folder)} goes on with it"
 
 
 def standing(folder: Path) -> str:
@@ -51,7 +51,7 @@ def standing(folder: Path) -> str:
     return cut_off(folder) or ("it goes on" if known else "it goes on, or was cut off")
 
 
-def to_resume(folder: Path) -> str:
+def resume_command(folder: Path) -> str:
     """The command that goes on with a run."""
     return f"`afspm run --resume {quoted(folder)}`"
 

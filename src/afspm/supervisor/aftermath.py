@@ -16,9 +16,9 @@ from afspm.components import notices
 from afspm.components.notices import END, GIVEN_UP, NotDelivered, Notice, Targets, Way
 from afspm.errors import ConfigError
 from afspm.experiment import Role, notifying
+from afspm.logic.telling import LOGGED_AS
 from afspm.record.journal import JOURNAL_FILE
 from afspm.supervisor.ending import Why
-from afspm.supervisor.log import SUPERVISOR
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -71,20 +71,18 @@ def report(folder: Path, log: RunLog) -> None:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        log.write(
-            SUPERVISOR, logging.WARNING, f"no report: it took longer than {REPORT_WITHIN_S:g} s; try afspm report"
-        )
+        log.write(LOGGED_AS, logging.WARNING, f"no report: it took longer than {REPORT_WITHIN_S:g} s; try afspm report")
         return
     except OSError as error:
-        log.write(SUPERVISOR, logging.WARNING, f"no report: {error}")
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {error}")
         return
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip().splitlines()
-        log.write(SUPERVISOR, logging.WARNING, f"no report: {said[-1] if said else f'exit code {done.returncode}'}")
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {said[-1] if said else f'exit code {done.returncode}'}")
     else:
         from afspm.record.report import REPORT_FILE
 
-        log.write(SUPERVISOR, logging.INFO, f"the report is {folder / REPORT_FILE}")
+        log.write(LOGGED_AS, logging.INFO, f"the report is {folder / REPORT_FILE}")
 
 
 def tell(ended: Ended, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
@@ -108,13 +106,13 @@ def _tell(notice: Notice, targets: Targets, way: Way, clock: Clock, until_s: flo
             targets.deliver(notice, way)
             return
         except ConfigError as error:
-            log.write(SUPERVISOR, logging.ERROR, f"nobody is told by the {way}: {error}")
+            log.write(LOGGED_AS, logging.ERROR, f"nobody is told by the {way}: {error}")
             return
         except NotDelivered as error:
             tries += 1
             delay_s = notices.delay_s(tries)
             if clock.monotonic_s() + delay_s >= until_s:
-                log.write(SUPERVISOR, logging.ERROR, f"nobody could be told by the {way}: {error}")
+                log.write(LOGGED_AS, logging.ERROR, f"nobody could be told by the {way}: {error}")
                 return
         threading.Event().wait(delay_s)
 

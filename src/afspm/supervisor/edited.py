@@ -9,7 +9,7 @@ from typing import Any
 
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, load
-from afspm.record.going_on import quoted, to_resume
+from afspm.record.going_on import quoted, resume_command
 
 
 def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> None:
@@ -28,7 +28,8 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
         raise ConfigError(
             f"was edited since this run was begun, which goes on as it was: {'; '.join(differs)}",
             where=", ".join(map(str, files)),
-            hint=f"{to_resume(folder)} goes on without what was edited, `afspm run {named}` begins a new run with it",
+            hint=f"{resume_command(folder)} goes on without what was edited, "
+            f"`afspm run {named}` begins a new run with it",
         )
 
 

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TextIO
 
 from afspm.clock import NS_PER_S, Clock, ExperimentClock
+from afspm.logic.telling import LOGGED_AS
 from afspm.model.words import day_and_time, time_of_day
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-SUPERVISOR = "afspm"
 MOST_UNSHOWN = 10_000
 SHOWN_WITHIN_S = 2.0
 COLOURS = ("cyan", "green", "magenta", "blue", "bright_cyan", "bright_green", "bright_magenta", "bright_blue")
@@ -78,7 +78,7 @@ class RunLog:
         self.listener: Callable[[str, int, str], None] = lambda name, level, text: None
         """Called with each line, as `write` is."""
         self._shown = _Shown(_coloured(terminal) if terminal.isatty() else _plain(terminal))
-        self._widest = max(map(len, (SUPERVISOR, *names)))
+        self._widest = max(map(len, (LOGGED_AS, *names)))
 
     def write(self, name: str, level: int, text: str) -> None:
         """One line of the process `name`; `level` is that of `logging`."""

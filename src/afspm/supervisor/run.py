@@ -13,6 +13,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
 from afspm.experiment.wiring import connectable
+from afspm.logic.telling import LOGGED_AS
 from afspm.record import ahead
 from afspm.record.facts import ENDED, STATE_DIR, known_facts
 from afspm.record.going_on import locked
@@ -20,7 +21,7 @@ from afspm.runtime.connect import GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor import aftermath, common_clock, reporting, run_folder, summary
 from afspm.supervisor.aftermath import Ended
-from afspm.supervisor.log import SUPERVISOR, RunLog
+from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.supervisor import Outcome, Supervisor
 from afspm.supervisor.task import from_start
@@ -93,20 +94,20 @@ def go(
     try:
         starts = _starts(experiment, options, clock, FreePorts(), folder)
         files = known_facts(folder).get(FILES) or list(map(str, experiment.files))  # one that is resumed has it
-        facts = {**run_facts(name, starts, clock), **to_resume(experiment, starts, options), FILES: files}
+        facts = {**run_facts(name, starts, clock), **facts_to_resume(experiment, starts, options), FILES: files}
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
             ahead.expect_record(folder / STATE_DIR)
-        log.write(SUPERVISOR, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
+        log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
         reporter = reporting.reporter(experiment, starts, clock)
         supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy(), reporter)
         outcome = supervisor.run()
         try:
             run_folder.write_run(folder, {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()})
         except OSError as error:  # a full disk must not keep people from being told of the end
-            log.write(SUPERVISOR, logging.ERROR, f"how it ended is not in run.json: {error}")
+            log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
         for line in summary.lines(outcome, folder):
-            log.write(SUPERVISOR, logging.INFO, line)
+            log.write(LOGGED_AS, logging.INFO, line)
         aftermath.follow(
             experiment,
             Ended(name, folder, outcome, experiment.resolved.simulated),
@@ -120,7 +121,7 @@ def go(
     return Run(folder, outcome)
 
 
-def to_resume(experiment: Experiment, starts: Sequence[Start], options: Options) -> dict[str, object]:
+def facts_to_resume(experiment: Experiment, starts: Sequence[Start], options: Options) -> dict[str, object]:
     """What else run.json says, so that the run can be resumed with that file alone.
 
     There the recorder and others that go where the scheduler is are named like all the rest, and so are chosen by name.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
 from afspm.model.words import lasting
-from afspm.record.going_on import to_resume
+from afspm.record.going_on import resume_command
 from afspm.record.run import open_run
 from afspm.supervisor.ending import Why
 
@@ -33,7 +33,7 @@ def lines(outcome: Outcome, folder: Path) -> list[str]:
     told += _recorded(folder) or _tabled(folder / TABLE)
     told.append(f"everything is in {folder}")
     if outcome.why is Why.STOPPED:
-        told.append(f"{to_resume(folder)} goes on with it")
+        told.append(f"{resume_command(folder)} goes on with it")
     return told
 
 

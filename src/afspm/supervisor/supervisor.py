@@ -17,9 +17,10 @@ from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
 from afspm.logic import supervision
 from afspm.logic.liveness import LivenessPolicy
+from afspm.logic.telling import LOGGED_AS
 from afspm.supervisor import signals
 from afspm.supervisor.ending import Do, Ending, Why
-from afspm.supervisor.log import SUPERVISOR, LineReader, RunLog
+from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed, describe_exit
 from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter
 from afspm.supervisor.standing import Standing
@@ -130,7 +131,7 @@ class Supervisor:
         self._standing = Standing(clock, policy.liveness)
         self._looked_s = -math.inf
         self._clock = clock
-        self._wall = Wall(clock, lambda text: log.write(SUPERVISOR, logging.WARNING, text))
+        self._wall = Wall(clock, lambda text: log.write(LOGGED_AS, logging.WARNING, text))
         self._policy = policy
         self._wakeup: WakeUp[ChildEvent | signals.Signalled | News] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
@@ -204,7 +205,7 @@ class Supervisor:
                 case Ordered():
                     self._on_ordered(event.name)
                 case Complaint():
-                    self._log.write(SUPERVISOR, logging.WARNING, event.text)
+                    self._log.write(LOGGED_AS, logging.WARNING, event.text)
 
     def _timeout_s(self) -> float | None:
         """How long there is nothing to do if nothing happens; None: for ever."""
@@ -319,7 +320,7 @@ class Supervisor:
             self._end(Why.LOST, f"{child.name} is given up, and the experiment can't go on without it: {why}")
         else:
             told = f"{child.name} is given up, the rest goes on (Ctrl-C ends it): {why}"
-            self._log.write(SUPERVISOR, logging.CRITICAL, told)
+            self._log.write(LOGGED_AS, logging.CRITICAL, told)
 
     def _end(self, why: Why, text: str) -> None:
         if self._ending is None:
@@ -333,7 +334,7 @@ class Supervisor:
                 # the signal that the experiment has ended is the scheduler's, whom a translator does not listen to
                 if child.task.role is Role.TRANSLATOR and child.process:
                     child.process.close_stdin()
-            self._log.write(SUPERVISOR, _LEVELS.get(why, logging.DEBUG), text)
+            self._log.write(LOGGED_AS, _LEVELS.get(why, logging.DEBUG), text)
 
     def _look_after_the_last(self, now_s: float) -> None:
         """At the end of the experiment: kill who is frozen, and let the scheduler go once nobody needs it any more."""
@@ -381,7 +382,7 @@ class Supervisor:
         if busy and self._ending.deadline_s() != ending.deadline_s() and do is None and not self._has_told_waiting:
             self._has_told_waiting = True
             told = f"waiting for {', '.join(busy)} to finish; Ctrl-C ends it now"
-            self._log.write(SUPERVISOR, logging.INFO, told)
+            self._log.write(LOGGED_AS, logging.INFO, told)
         for child in self._children.values():
             if child.process is None:
                 continue

@@ -202,6 +202,13 @@ def test_the_truth_is_that_of_the_simulated_world(tmp_path: Path) -> None:
     truth = true_drift(tmp_path)
     assert truth is not None
     np.testing.assert_allclose(truth(np.array([0.0, 100.0])), [(0.0, 0.0), (6e-9, -3e-9)], atol=1e-15)
+    scan = {"start_s": 0.0, "end_s": 50.0, "compensated_start_m": [0.0, 0.0], "compensated_end_m": [2e-9, 1e-9]}
+    with (tmp_path / "truth.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps({"n": 2, "time_s": 50.0, "event": "scan", "scan": scan}) + "\n")
+    truth = true_drift(tmp_path)
+    assert truth is not None
+    left = [(0.0, 0.0), (1.5e-9 - 1e-9, -0.75e-9 - 0.5e-9), (6e-9 - 2e-9, -3e-9 - 1e-9)]
+    np.testing.assert_allclose(truth(np.array([0.0, 25.0, 100.0])), left, atol=1e-15)
     (tmp_path / "truth.jsonl").write_text("{}\n", encoding="utf-8")
     with pytest.raises(FileError, match="what was simulated"):
         true_drift(tmp_path)

@@ -9,10 +9,20 @@ import pytest
 from runtime_lab import REGION, Lab, run
 
 from afspm import wire
-from afspm.components.rescanner import AGAIN, OPPOSITE, SEARCH, Rescanner
+from afspm.components.rescanner import Rescanner
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
-from afspm.model import ControlRequest, ControlResponse, Problem, Region, Request, Response, ScanParameters, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Problem,
+    Region,
+    Request,
+    RescanKind,
+    Response,
+    ScanParameters,
+    names,
+)
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
 
@@ -66,30 +76,30 @@ def asked(
 
 
 def test_the_region_is_taken_again_with_the_problem_flagged_meanwhile() -> None:
-    lab = asked(AGAIN, ["well"], ELSEWHERE)
+    lab = asked(RescanKind.AGAIN, ["well"], ELSEWHERE)
     assert [region.center_m for region in lab.finished] == [pytest.approx(ELSEWHERE.center_m)]
     assert lab.problems == ()
     assert lab.control.holder is None
 
 
 def test_it_is_tried_again_until_it_lies_well() -> None:
-    assert len(asked(AGAIN, ["off", "unmatched", "well"]).finished) == 3
+    assert len(asked(RescanKind.AGAIN, ["off", "unmatched", "well"]).finished) == 3
 
 
 def test_after_its_attempts_it_lets_the_experiment_go_on() -> None:
-    lab = asked(AGAIN, ["off"] * 10, attempts=2)
+    lab = asked(RescanKind.AGAIN, ["off"] * 10, attempts=2)
     assert len(lab.finished) == 2
     assert lab.problems == ()
 
 
 def test_the_other_direction_is_scanned_and_the_direction_set_back() -> None:
-    lab = asked(OPPOSITE, ["well"], upwards=False)
+    lab = asked(RescanKind.OPPOSITE, ["well"], upwards=False)
     assert lab.directions == [names.DOWN]
     assert lab.values[names.SCAN_DIRECTION] == names.UP
     assert lab.problems == ()
 
 
-@pytest.mark.parametrize("kind", [OPPOSITE, SEARCH])
+@pytest.mark.parametrize("kind", [RescanKind.OPPOSITE, RescanKind.SEARCH])
 def test_direction_and_region_are_set_back_when_somebody_else_says_that_there_is_no_drift(kind: int) -> None:
     lab = Drifting([])
     lab.at(10.0, lambda: lab.wants(kind, upwards=False))
@@ -97,12 +107,12 @@ def test_direction_and_region_are_set_back_when_somebody_else_says_that_there_is
     lab.at(5000.0, lab.kill)
     assert run(Rescanner(), lab) == ExitCode.ENDED
     assert lab.values[names.SCAN_DIRECTION] == names.UP
-    if kind == SEARCH:
+    if kind == RescanKind.SEARCH:
         assert (lab.parameters.region, lab.parameters.shape) == (REGION, (8, 8))
 
 
 def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_back() -> None:
-    lab = asked(SEARCH, ["lost", "lost", "unmatched"])
+    lab = asked(RescanKind.SEARCH, ["lost", "lost", "unmatched"])
     assert [region.size_m[0] for region in lab.finished] == pytest.approx([2e-6, 4e-6, 8e-6])
     assert {region.center_m for region in lab.finished} == {REGION.center_m}
     assert lab.problems == ()
@@ -110,7 +120,7 @@ def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_bac
 
 
 def test_a_sample_that_is_not_found_again_is_a_person_s_business() -> None:
-    lab = asked(SEARCH, ["lost"] * 10)
+    lab = asked(RescanKind.SEARCH, ["lost"] * 10)
     assert len(lab.finished) == 3
     assert lab.problems == (MALFUNCTION,)
     told = [(r.kind, r.subject) for r in lab.requests]
@@ -135,14 +145,14 @@ def refusing(lab: Drifting, most_m: float) -> None:
 def test_a_search_is_as_wide_as_is_allowed(most_m: float, widths: list[float]) -> None:
     lab = Drifting(["lost", "well"])
     refusing(lab, most_m)
-    lab.at(10.0, lambda: lab.wants(SEARCH))
+    lab.at(10.0, lambda: lab.wants(RescanKind.SEARCH))
     lab.at(5000.0, lab.kill)
     assert run(Rescanner(), lab) == ExitCode.ENDED
     assert [region.size_m[0] for region in lab.finished] == pytest.approx(widths)
     assert lab.problems == ()
 
 
-@pytest.mark.parametrize(("kind", "left"), [(SEARCH, (MALFUNCTION,)), (AGAIN, ())])
+@pytest.mark.parametrize(("kind", "left"), [(RescanKind.SEARCH, (MALFUNCTION,)), (RescanKind.AGAIN, ())])
 def test_what_may_not_be_scanned_at_all_has_not_helped(kind: int, left: tuple[int, ...]) -> None:
     lab = Drifting([])
     refusing(lab, 0.0)
@@ -157,7 +167,7 @@ def test_killed_in_the_middle_it_sets_back_the_direction_from_before(tmp_path: P
     (tmp_path / "rescanner.json").write_text(json.dumps({"direction_before": names.UP}))
     lab = Drifting(["well"])
     lab.values[names.SCAN_DIRECTION] = names.DOWN  # set in an earlier life
-    lab.at(10.0, lambda: lab.wants(OPPOSITE, upwards=False))
+    lab.at(10.0, lambda: lab.wants(RescanKind.OPPOSITE, upwards=False))
     lab.at(5000.0, lab.kill)
     assert run(Rescanner(), lab, state_dir=tmp_path) == ExitCode.ENDED
     assert lab.values[names.SCAN_DIRECTION] == names.UP
@@ -166,8 +176,8 @@ def test_killed_in_the_middle_it_sets_back_the_direction_from_before(tmp_path: P
 
 def test_what_it_was_asked_for_by_its_own_scans_is_not_done_again() -> None:
     lab = Drifting(["off", "off"])
-    lab.at(10.0, lambda: lab.wants(AGAIN))
-    lab.at(10.0 + 105.0, lambda: lab.wants(AGAIN))  # of its first scan
+    lab.at(10.0, lambda: lab.wants(RescanKind.AGAIN))
+    lab.at(10.0 + 105.0, lambda: lab.wants(RescanKind.AGAIN))  # of its first scan
     lab.at(5000.0, lab.kill)
     assert run(Rescanner(), lab) == ExitCode.ENDED
     assert len(lab.finished) == 3

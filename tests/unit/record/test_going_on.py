@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from afspm.record import going_on
-from afspm.record.going_on import cut_off, locked, standing, to_resume
+from afspm.record.going_on import cut_off, locked, resume_command, standing
 
 
 def folder_of(tmp_path: Path, **facts: Any) -> Path:
@@ -75,4 +75,4 @@ def test_the_command_that_resumes_can_be_typed_as_it_is_told(
     monkeypatch: pytest.MonkeyPatch, system: str, folder: str, said: str
 ) -> None:
     monkeypatch.setattr(going_on.sys, "platform", system)
-    assert to_resume(Path(folder)) == said
+    assert resume_command(Path(folder)) == said

@@ -416,6 +416,16 @@ def test_what_a_person_scans_is_followed_and_not_scanned_again(lab: Lab) -> None
     assert lab.published("DriftMapping")
 
 
+def test_a_sample_that_a_person_has_found_again_is_not_lost_any_more(lab: Lab) -> None:
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT), lost=True))
+    assert problems(lab) == (Problem.THERMAL_DRIFT,)
+    lab.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL), name="dashboard:Ada")
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT)))
+    assert not problems(lab)
+
+
 def test_a_microscope_that_is_lost_for_a_moment_does_not_begin_its_scan_anew(lab: Lab) -> None:
     lab.scope_is(ScopeState.SCANNING)
     began_s = lab.now_s

@@ -13,7 +13,7 @@ import pytest
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
 from afspm.supervisor.resuming import Resumable, _wait_until_gone
-from afspm.supervisor.run import ONLY, WITHOUT, Options, dry_run, to_resume
+from afspm.supervisor.run import ONLY, WITHOUT, Options, dry_run, facts_to_resume
 
 PARTS = """
 [clock]
@@ -60,14 +60,14 @@ def test_a_part_is_resumed_with_what_it_had(options: Options, tmp_path: Path) ->
     names = [start.launch.name for start in starts]
     has_scheduler = Role.SCHEDULER in {start.role for start in starts}
     assert {"recorder", "notifier"} & set(names) == ({"recorder", "notifier"} if has_scheduler else set())
-    facts = to_resume(experiment, starts, options)
+    facts = facts_to_resume(experiment, starts, options)
     (tmp_path / "experiment.toml").write_text(experiment.expanded(), encoding="utf-8")
     expanded = load_expanded(tmp_path / "experiment.toml", [tmp_path])
     for _ in range(2):  # and once more
         again = Options(only=facts[ONLY], without=facts[WITHOUT])  # type: ignore[arg-type]
         starts = dry_run(expanded, again)
         assert sorted(start.launch.name for start in starts) == sorted(names)
-        facts = to_resume(expanded, starts, again)
+        facts = facts_to_resume(expanded, starts, again)
 
 
 def test_what_was_added_when_it_was_resumed_is_there_in_that_life(tmp_path: Path) -> None:
@@ -78,13 +78,13 @@ def test_what_was_added_when_it_was_resumed_is_there_in_that_life(tmp_path: Path
     experiment = load(file)
     starts = dry_run(experiment, part)
     before = {start.launch.name for start in starts}
-    facts: dict[str, Any] = to_resume(experiment, starts, part)
+    facts: dict[str, Any] = facts_to_resume(experiment, starts, part)
     plain = Resumable(tmp_path, "night", load_expanded(file, [tmp_path]), facts, (tmp_path,))
     added = plain.with_overlay(overlay)
     starts = dry_run(added.experiment, added.options(Options()))
     assert {start.launch.name for start in starts} == {*before, "dashboard"}
     # and in the next life not, without being missed
-    facts = to_resume(added.experiment, starts, added.options(Options()))
+    facts = facts_to_resume(added.experiment, starts, added.options(Options()))
     again = replace(plain, facts=facts)
     assert {start.launch.name for start in dry_run(again.experiment, again.options(Options()))} == before
 

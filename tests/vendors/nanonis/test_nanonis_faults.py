@@ -297,6 +297,20 @@ def test_a_scan_that_goes_on_in_the_air_is_none(bench: Make) -> None:
     assert "safe tip" in peer.act_once_free(names.START_SCAN).reason
 
 
+def test_a_tip_that_is_being_shaped_is_not_free_when_the_connection_is_back(bench: Make) -> None:
+    """Nanonis does not tell that it holds the tip in the surface."""
+    made = bench(speed=2.0)
+    peer = small(made)
+    assert peer.set(names.CRASH_SPEED, 1, "nm/s").ok
+    assert peer.set(names.CRASH_DEPTH, 10, "nm").ok
+    peer.until(FREE)
+    assert peer.act(names.CRASH).ok
+    peer.until(ScopeState.MOVING)
+    made.strike("cut", count=2)
+    peer.until(UNDEFINED)
+    assert states(peer.until(FREE)) == ["MOVING", "FREE"]
+
+
 def test_a_scan_that_ended_while_the_connection_was_lost_is_not_lost(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = small(made)

@@ -106,7 +106,7 @@ class Nanonis(Microscope):
             own_folder = (self.run_dir / "scans").resolve()
             patience_s = self.patience_s(self.result_timeout_s / 2)
             self._harvest = Harvest(self.memory, self._session_dir, own_folder, patience_s, self.log)
-        self._activity = Activity(session, self._harvest, self._probe, self.clock, self.log)
+        self._activity = Activity(session, self._harvest, self._probe, self.memory, self.clock, self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
         if not folder.is_dir():
             self.log.warning("%s can't be seen from here: all data is fetched over TCP (set session_dir)", folder)
@@ -245,8 +245,8 @@ class Nanonis(Microscope):
         """A bias pulse of `x-pulse-voltage` for `x-pulse-duration`, the z controller on hold meanwhile."""
         duration_s = float(self._kept[names.PULSE_DURATION])
         hold, absolute = 1, 2
-        self._ask("Bias.Pulse", _AT_ONCE, duration_s, float(self._kept[names.PULSE_VOLTAGE]), hold, absolute)
-        self._activity.occupied(ScopeState.BUSY_PARAM, duration_s)
+        with self._activity.occupied(ScopeState.BUSY_PARAM, duration_s):
+            self._ask("Bias.Pulse", _AT_ONCE, duration_s, float(self._kept[names.PULSE_VOLTAGE]), hold, absolute)
 
     @action(names.CRASH, state=ScopeState.MOVING)
     def crash(self) -> None:
@@ -258,8 +258,8 @@ class Nanonis(Microscope):
         same_bias, settle_s, restore, no_timeout = 2, 0.1, 1, -1
         before = (settle_s, same_bias, bias_v)
         self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
-        self._ask("TipShaper.Start", _AT_ONCE, no_timeout)
-        self._activity.occupied(ScopeState.MOVING, 2 * ramp_s + 4 * settle_s)
+        with self._activity.occupied(ScopeState.MOVING, 2 * ramp_s + 4 * settle_s):
+            self._ask("TipShaper.Start", _AT_ONCE, no_timeout)
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 from afspm.clock import Clock
@@ -13,6 +15,7 @@ from afspm.microscopes.microscope import ControllerLost
 from afspm.microscopes.nanonis.groups import Probe, ScanFrame
 from afspm.microscopes.nanonis.harvest import Harvest
 from afspm.microscopes.nanonis.listener import CurveEnded, Failed, Heard, ScanEnded
+from afspm.microscopes.nanonis.protocol import NanonisError
 from afspm.microscopes.nanonis.session import APPROACH, MODULES, Session
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 
@@ -28,24 +31,29 @@ _SAFE_TIP, _WITHDRAWING = 5, 6
 class Activity:
     """See the module.
 
+    Args:
+        kept: JSON-able, and lasts: what it is occupied with.
+
     Attributes:
         curve: the data of the last spectrum, once it has ended.
         stopping: what is running was told to stop: nothing comes of it.
     """
 
-    def __init__(self, session: Session, harvest: Harvest, probe: Probe, clock: Clock, log: logging.Logger) -> None:
+    def __init__(
+        self, session: Session, harvest: Harvest, probe: Probe, kept: dict[str, Any], clock: Clock, log: logging.Logger
+    ) -> None:
         self._ask = session.ask
         self._listener = session.listener
         self._opened = session.opened
         self._harvest = harvest
         self._probe = probe
+        self._kept = kept
         self._clock = clock
         self._log = log
         self.curve: CurveEnded | None = None
         self.stopping = False
         self._kind_asked = ""
         self._told: str | None = None
-        self._occupied = (ScopeState.FREE, 0.0)
         self._was_safe = self._cut_off = False
         self._shows_until_s = 0.0
 
@@ -105,9 +113,22 @@ class Activity:
         self._kind_asked = ""
         self._harvest.forget()
 
-    def occupied(self, state: ScopeState, lasts_s: float) -> None:
-        """It is in a state for so long, experiment time, which Nanonis itself does not tell."""
-        self._occupied = (state, self._clock.now_s() + lasts_s)
+    @contextmanager
+    def occupied(self, state: ScopeState, lasts_s: float) -> Iterator[None]:
+        """What is begun in the block takes so long, experiment time, which Nanonis itself does not tell: also where its
+        answer is lost, or the connection, or we are."""
+        self._kept["occupied"] = [state.name, self._clock.now_s() + lasts_s]
+        try:
+            yield
+        except NanonisError:
+            self._kept["occupied"] = None
+            raise
+
+    @property
+    def _occupied(self) -> tuple[ScopeState, float]:
+        """The state that it is in, and until when."""
+        name, until_s = self._kept.get("occupied") or (ScopeState.FREE.name, 0.0)
+        return ScopeState[name], float(until_s)
 
     def sets_out(self, lasts_s: float) -> None:
         """The tip was sent away, and should arrive after so long, experiment time."""

@@ -10,11 +10,21 @@ import numpy as np
 from afspm.logic.desk import OwnEnd
 from afspm.logic.events import Announced, Effect, Input, Log, ProblemSeen
 from afspm.logic.scheduling import SchedulerCore
-from afspm.model import ControlMode, ControlRequest, ControlResponse, Parameter, Problem, Request, Response, names
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Problem,
+    Request,
+    RescanKind,
+    Response,
+    names,
+)
 from afspm.scheduler.drift.frame import DriftFrame
 from afspm.scheduler.drift.knowledge import Knowledge
 from afspm.scheduler.drift.settings import DriftSettings
-from afspm.scheduler.drift.told import DriftCodec, Registered, RescanKind, RescanWanted, ScanJob, Worker
+from afspm.scheduler.drift.told import DriftCodec, Registered, RescanWanted, ScanJob, Worker
 
 RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
@@ -56,11 +66,11 @@ class Consequences:
     def of(self, registered: Registered, job: ScanJob, step: Step, now_ns: int) -> list[Effect]:
         """What is done after a scan was published. What a person scans is followed, and not scanned again."""
         self._unregistered = 0
-        if self._core.control.mode is ControlMode.MANUAL:
-            return []
         if not self._knowledge.corrects(now_ns * 1e-9):
             self._started = True  # until it is corrected there is time enough to learn the velocity
             return []
+        if self._core.control.mode is ControlMode.MANUAL:
+            return [] if registered.lost else self._found(step)
         if registered.lost:
             return self._lost(f"the sample is lost: {registered.reason}", step, now_ns)
         if not self._started:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any, Protocol
 
 from afspm.drift.mapping import Mapping
-from afspm.model import Region, Scan
+from afspm.model import Region, RescanKind, Scan
 from afspm.scheduler.drift.places import PlaceCodec
 
 Matrix = list[list[float]]
@@ -102,14 +101,6 @@ class Worker(Protocol):
 
     def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
         """From that time on the controller moves the tip along with this velocity."""
-
-
-class RescanKind(IntEnum):
-    """The numbers of the wire."""
-
-    AGAIN = 1
-    OPPOSITE = 2
-    SEARCH = 3
 
 
 @dataclass(frozen=True)

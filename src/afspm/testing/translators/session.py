@@ -18,13 +18,14 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.experiment.parts import EMULATED
 from afspm.experiment.wiring import connectable
+from afspm.logic.telling import LOGGED_AS
 from afspm.model import Frame
 from afspm.record.facts import STATE_DIR
 from afspm.runtime.component import Component
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
 from afspm.supervisor import common_clock, run_folder
-from afspm.supervisor.log import SUPERVISOR, RunLog
+from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators.bench import Bench
 from afspm.testing.translators.processes import Processes
@@ -254,7 +255,7 @@ def _logger(log: RunLog) -> logging.Logger:
 
     class Writing(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            log.write(SUPERVISOR, record.levelno, record.getMessage())
+            log.write(LOGGED_AS, record.levelno, record.getMessage())
 
     logger.addHandler(Writing())
     return logger
