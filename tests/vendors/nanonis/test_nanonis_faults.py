@@ -302,8 +302,7 @@ def test_a_tip_that_is_being_shaped_is_not_free_when_the_connection_is_back(benc
     made = bench(speed=2.0)
     peer = small(made)
     assert peer.set(names.CRASH_SPEED, 1, "nm/s").ok
-    assert peer.set(names.CRASH_DEPTH, 10, "nm").ok
-    peer.until(FREE)
+    assert peer.set(names.CRASH_DEPTH, 4, "nm").ok
     assert peer.act(names.CRASH).ok
     peer.until(ScopeState.MOVING)
     made.strike("cut", count=2)
