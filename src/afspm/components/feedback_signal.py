@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
-from afspm.errors import InvalidValue, RequestError, UnitError
+from afspm.errors import InvalidValue, Refused, RequestError, UnitError
 from afspm.model import Scan, names
 from afspm.runtime.scope import Scope
+
+ASKED_WITHIN_S = 5.0
 
 
 class Comparable:
     """Asks, once for each unit, whether a channel can be compared with the setpoint, which is told without a unit."""
 
     def __init__(self) -> None:
-        self._units: set[str] = set()
+        self._reasons: dict[str, str] = {}
 
     def require(self, scan: Scan, scope: Scope) -> None:
-        """Raises InvalidValue: it is of another kind than the setpoint: an amplitude in m, say, where that is in V."""
-        if scan.unit in self._units:
-            return
+        """Raises InvalidValue: it is of another kind than the setpoint: an amplitude in m, say, where that is in V; or
+        nobody answers just now."""
+        if scan.unit not in self._reasons:
+            self._reasons[scan.unit] = self._reason(scan, scope)
+        if reason := self._reasons[scan.unit]:
+            raise InvalidValue(f"{scan.channel} can't be compared with the setpoint: {reason}")
+
+    def _reason(self, scan: Scan, scope: Scope) -> str:
         try:
-            scope.get(names.ZCTRL_SETPOINT, scan.unit)
+            scope.get(names.ZCTRL_SETPOINT, scan.unit, timeout_s=ASKED_WITHIN_S)
         except UnitError as error:
-            raise InvalidValue(f"{scan.channel} can't be compared with the setpoint: {error.what}") from error
-        except RequestError:
-            return  # it can't be asked for now
-        self._units.add(scan.unit)
+            return error.what
+        except Refused:  # it can't be asked for, and nobody knows better
+            return ""
+        except RequestError as error:
+            raise InvalidValue(f"its unit is not known yet: {error.what}") from error
+        return ""

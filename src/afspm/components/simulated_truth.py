@@ -49,11 +49,14 @@ def _read(path: Path) -> tuple[dict[str, Any], Array]:
     followed: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
     with path.open(encoding="utf-8") as file:
         for line in file:
-            entry: dict[str, Any] = json.loads(line)
+            try:
+                entry: dict[str, Any] = json.loads(line)
+            except ValueError:
+                continue  # cut off by a kill
             if entry["event"] == "start" and start is None:
                 start = entry
             scan = entry.get("scan")
-            if isinstance(scan, dict):
+            if isinstance(scan, dict) and "compensated_start_m" in scan:
                 followed += [(scan[f"{at}_s"], *scan[f"compensated_{at}_m"][:2]) for at in ("start", "end")]
     if start is None:
         raise ValueError("it has no beginning")

@@ -175,8 +175,6 @@ class Store:
 
     def _add(self, packet: Packet, message: str, source: str, thing: Any) -> None:
         """What is kept in the journal alone."""
-        if isinstance(thing, ProcessStates) and not self._add_processes(thing):
-            return  # told every other second, whether there is anything new or not
         payload = without_values(message, packet.payload) if message else bytes(packet.payload)
         insert_packet(self._journal, packet, message, payload, source=source)
         match thing:
@@ -184,6 +182,8 @@ class Store:
                 self._write(self._gathering.status(thing, packet.time_ns or 0))
             case JournalEntries():
                 self._add_entries(thing)
+            case ProcessStates():
+                self._add_processes(thing)
             case LogLines():
                 self._add_log(thing)
 
@@ -219,17 +219,13 @@ class Store:
             [(e.time_ns, e.kind, e.who, e.what, e.response, e.reason, e.took_s) for e in entries.entries],
         )
 
-    def _add_processes(self, states: ProcessStates) -> bool:
-        """Returns whether anything has changed."""
-        changed = False
+    def _add_processes(self, states: ProcessStates) -> None:
         for state in states.processes:
             row = (state.role, int(state.condition), state.since_ns, state.starts, state.pid, state.last_exit)
             if self._journal.execute(_PROCESS, (state.name,)).fetchone() != row:
-                changed = True
                 self._journal.execute(
                     "INSERT INTO processes VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (states.time_ns, state.name, *row)
                 )
-        return changed
 
     def _add_log(self, log: LogLines) -> None:
         self._journal.executemany(

@@ -37,7 +37,7 @@ def replace(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = T
     """
     aside = aside or path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(exist_ok=True)  # and no more: under a drive that is away there may be an empty folder
         with aside.open("wb") as file:
             file.writelines(parts)
             if synced:
@@ -158,14 +158,17 @@ class Generations:
             if written < len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError:
-            if written:
-                self._file.truncate(self._size)  # what was saved before is the last again
+            with contextlib.suppress(OSError):
+                if written:
+                    self._file.truncate(self._size)  # what was saved before is the last again
+            self._let_go()  # a drive that was away is not found again by a file that was open on it
             raise
         self._size += written
 
     def _let_go(self) -> None:
         if self._file is not None:
-            self._file.close()
+            with contextlib.suppress(OSError):
+                self._file.close()
             self._file = None
 
     def _run(self) -> None:

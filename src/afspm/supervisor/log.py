@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import queue
 import re
 import sys
 import threading
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TextIO
@@ -118,25 +118,34 @@ class _Shown:
 
     def __init__(self, show: Show) -> None:
         self._show = show
-        self._lines: queue.Queue[tuple[str, str, int, str] | None] = queue.Queue(MOST_UNSHOWN)
+        self._lines: deque[tuple[str, str, int, str]] = deque(maxlen=MOST_UNSHOWN)
+        self._changed = threading.Condition()
+        self._closing = False
         self._thread = threading.Thread(target=self._run, name="terminal", daemon=True)
         self._thread.start()
 
     def add(self, time: str, name: str, level: int, text: str) -> None:
-        """A line; left out where too many wait already."""
-        with contextlib.suppress(queue.Full):
-            self._lines.put_nowait((time, name, level, text))
+        """A line; where too many wait, the oldest is left out."""
+        with self._changed:
+            self._lines.append((time, name, level, text))
+            self._changed.notify()
 
     def close(self) -> None:
         """Show what waits, if the terminal takes it."""
-        with contextlib.suppress(queue.Full):
-            self._lines.put_nowait(None)
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
         self._thread.join(SHOWN_WITHIN_S)
 
     def _run(self) -> None:
-        while (line := self._lines.get()) is not None:
+        while (line := self._next()) is not None:
             with contextlib.suppress(OSError, ValueError):
                 self._show(*line)
+
+    def _next(self) -> tuple[str, str, int, str] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._lines or self._closing)
+            return self._lines.popleft() if self._lines else None
 
 
 def _plain(terminal: TextIO) -> Show:

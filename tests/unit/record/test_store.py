@@ -329,13 +329,6 @@ def test_requests_processes_and_log_lines_have_their_tables(night: Night, store:
     assert [line.text for line in run.log] == ["scan 1 of 3"]
 
 
-def test_processes_that_are_as_they_were_take_no_room(night: Night, store: Store) -> None:
-    """They are told every other second, for a week."""
-    state = ProcessState("series", "component", ProcessCondition.ALIVE, 5, 0.0, 1, 4711, "")
-    store.take([night.packet(ProcessStates(time, "lab", (state,))) for time in range(5, 50)])
-    assert store._journal.execute("SELECT count(*) FROM packets").fetchone() == (1,)
-
-
 def test_whether_a_process_has_changed_is_not_looked_for_in_the_whole_night(store: Store) -> None:
     ((*_, plan),) = store._journal.execute(f"EXPLAIN QUERY PLAN {_PROCESS}", ("series",)).fetchall()
     assert "processes_by_name" in plan

@@ -102,7 +102,7 @@ while failed < 3:
 print(saved)
 """
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "x")], capture_output=True, text=True)
-    assert (done.stdout.strip(), done.stderr) == ("90", "")
+    assert (done.stdout.strip(), done.stderr) == ("270", ""), "after each failure it is tried to begin the file anew"
 
 
 def test_while_it_is_saved_the_generation_before_is_made_sure_of_by_itself(tmp_path: Path) -> None:

@@ -484,19 +484,34 @@ def test_a_force_curve_comes_with_the_place_where_it_was_taken(bench: Make) -> N
     assert deflection[raw.argmax()] == pytest.approx(deflection.max(), rel=0.1)
 
 
-def test_of_a_force_curve_after_a_scan_the_place_is_told_that_its_file_has(
-    bench: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A scan leads the tip away from where it was sent."""
-    made = bench()
+def test_a_force_curve_after_a_scan_is_taken_where_the_tip_was_sent_before_it(bench: Make) -> None:
+    """A scan leads the tip away from there."""
+    made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
     moved_exactly(peer, 70e-9, 10e-9)
     scanned(peer)
-    monkeypatch.setattr(made.emulator.rig, "_probe_m", (120e-9, 5e-9))
+    made.at_panel(lambda emulator: setattr(emulator.rig, "_probe_m", (120e-9, 5e-9)))
     assert peer.act(names.START_SPEC).ok
-    (curve,) = [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
-    assert curve.position_m == pytest.approx((120e-9, 5e-9), rel=1e-4)
+    heard = peer.until(FREE)
+    assert states(heard) == ["SPEC", "FREE"]
+    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    assert curve.position_m == pytest.approx((70e-9, 10e-9))
+    assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
+
+
+def test_a_force_curve_can_be_stopped_while_the_tip_is_on_its_way_to_it(bench: Make) -> None:
+    made = bench(speed=2.0)
+    peer = made.start(move_s=10.0)
+    ready(peer)
+    moved_exactly(peer, 70e-9, 10e-9)
+    scanned(peer)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(ScopeState.SPEC)
+    assert peer.act(names.STOP_SPEC).ok
+    heard = peer.until(FREE)
+    assert "SPEC" not in states(heard)
+    assert not any(isinstance(one, Spectrum) for one in heard)
 
 
 def test_a_force_curve_that_is_stopped_gives_none(bench: Make) -> None:

@@ -456,7 +456,7 @@ def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Ma
     made = bench()
     peer = made.start()
     ready(peer)
-    for behind_s in (0.0, 3600.0, 7200.0):
+    for behind_s in (0.0, 3600.0, 3600.0, 7200.0, 60.0):
         made.at_panel(lambda emulator, behind_s=behind_s: setattr(emulator.program, "behind_s", behind_s))
         assert len(scanned(peer)) == 4
 

@@ -92,8 +92,9 @@ class BankTracker:
         self._learn(newest, used, tried, placed=placed)
         after = self._known(self._filters)
         # a scan that could be compared with none begins a row of its own, which is as far from the others as it is
-        missed = bool(tried) and not placed
-        self._lost = (missed and after.sd_m > self._limit_m(scan)) or self._unmatched >= self._settings.lost_after
+        if tried:
+            self._lost = not placed and after.sd_m > self._limit_m(scan)
+        self._lost |= self._unmatched >= self._settings.lost_after
         return Update(
             key=scan.key,
             before=before,

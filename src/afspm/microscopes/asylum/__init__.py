@@ -197,6 +197,9 @@ class Asylum(Microscope):
     def _send_probe(self, place: Mapping[str, Value]) -> None:
         x, y = (float(place.get(name, was)) for name, was in zip(POSITION, self._probe_m(), strict=True))
         self._put_spot((x, y))
+        self._go()
+
+    def _go(self) -> None:
         self._igor.put("ForceSpotNumber", _OUR_SPOT)  # whatever is chosen at the panel
         if not self._igor.do("DoForceFunc", "Go"):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum refuses to move the tip")
@@ -254,11 +257,18 @@ class Asylum(Microscope):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve where the tip is."""
+        """Take a force curve where the tip was sent, or else where it is."""
         if self._igor.doing().bits is None:
             reason = "without ARGetStatus it can't be seen when a force curve has ended"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
         self._activity.saves(FORCE)
+        if self._activity.was_led_away:
+            self._go()
+            self._activity.takes_on_arrival(self._take_curve)
+        else:
+            self._take_curve()
+
+    def _take_curve(self) -> None:
         self._activity.begin(FORCE, None if self._spots == "none" else self._probe_m())
         self._begin(FORCE, "DoForceFunc", "Single")
         self._activity.settle(FORCE)

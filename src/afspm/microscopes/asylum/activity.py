@@ -54,10 +54,13 @@ class Activity:
         self._clock = clock
         self._log = log
         self._stopping = False
+        self._on_arrival: Callable[[], None] | None = None
 
     def status(self) -> ScopeStatus:
         """What it is doing now; what has ended is awaited from here on."""
         state = self._session.doing().state
+        if self._on_arrival is not None:
+            return self._arriving(self._on_arrival, state)
         what = {ScopeState.SCANNING: SCAN, ScopeState.SPEC: FORCE}.get(state, "")
         if not what:
             self._stopping = False
@@ -72,6 +75,21 @@ class Activity:
         if state is ScopeState.FREE and self._harvest.broken_off:
             return ScopeStatus(ScopeState.INTERRUPTED)
         return ScopeStatus(state)
+
+    def _arriving(self, take: Callable[[], None], state: ScopeState) -> ScopeStatus:
+        """On the way to where a force curve is to be taken."""
+        if state is ScopeState.FREE and self._clock.now_s() < self._moving_until_s:
+            return ScopeStatus(ScopeState.SPEC)
+        self._on_arrival = None
+        if state is not ScopeState.FREE:
+            self._log.error("no force curve is taken: somebody began something while the tip was on its way to it")
+            return ScopeStatus(ScopeState.INTERRUPTED)
+        try:
+            take()
+        except Refused as refused:
+            self._log.error("no force curve is taken: %s", refused.reason)
+            return ScopeStatus(ScopeState.INTERRUPTED)
+        return ScopeStatus(ScopeState.SPEC)
 
     def next_change_s(self) -> float | None:
         """When a move is over."""
@@ -102,9 +120,10 @@ class Activity:
         Args:
             position_m: of a force curve, where the tip was sent; None: it is left to the file to know.
         """
-        taken: dict[str, Any] = {"position": None if self._led_away else position_m and list(position_m)}
+        taken: dict[str, Any] = {"position": position_m and list(position_m)}
         if what == SCAN:
-            self._kept["led_away"] = True
+            if "led_away" in self._kept:  # it was sent somewhere
+                self._kept["led_away"] = True
             taken = {"frame": as_list(self._frame_in_force())}
         self._harvest.begin(what, self._target(what), taken)
 
@@ -165,7 +184,7 @@ class Activity:
 
     def stopped(self) -> None:
         """What is running was told to stop: nothing comes of it."""
-        self._stopping = True
+        self._stopping, self._on_arrival = True, None
         self.forget()
 
     def forget(self) -> None:
@@ -178,9 +197,13 @@ class Activity:
         self._kept["led_away"] = False
 
     @property
-    def _led_away(self) -> bool:
+    def was_led_away(self) -> bool:
         """Whether a scan has taken the tip from where it was sent."""
         return bool(self._kept.get("led_away"))
+
+    def takes_on_arrival(self, take: Callable[[], None]) -> None:
+        """A force curve is taken when the tip is where it was sent."""
+        self._on_arrival = take
 
     def _target(self, what: str) -> Target:
         suffix = self._session.values(["BaseSuffix"])["BaseSuffix"]

@@ -48,7 +48,8 @@ class Harvest(Measurements):
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
         kept.setdefault("program", "")
-        kept.setdefault("starts", [])
+        kept.setdefault("starts", [])  # of the last scan's files
+        kept.setdefault("behind_ns", 0)  # how much their clock was
 
     @property
     def scanning(self) -> tuple[Region, tuple[int, int]] | None:
@@ -154,13 +155,24 @@ class Harvest(Measurements):
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
 
     def _is_of_before(self, content: FileContent, begun_ns: int) -> bool:
-        """Whether it is a scan of before, saved again: one that began when the last did, by the clock of GXSM's
-        computer, which may be another than ours, and be set meanwhile. Before there was one, an older one."""
+        """Whether it is a scan of before: the last one, saved again, or one that was stopped, saved late. When it began
+        is told by the clock of GXSM's computer, which may be another than ours, and be set meanwhile: what began before
+        the last scan did, by that clock, is new."""
         start_ns, known = content.start_ns, self._kept["starts"]
-        if start_ns is None or not (start_ns in known if known else start_ns < begun_ns - _CLOCK_NS):
+        if start_ns is None:
+            return False
+        is_older = start_ns < begun_ns - self._kept["behind_ns"] - _CLOCK_NS
+        if known and start_ns not in known:
+            is_older = is_older and start_ns > max(known)
+        if not (is_older or start_ns in known):
             return False
         self._before.add(start_ns)
         return True
+
+    def _saw(self, ended: Mapping[str, Any], starts: set[int]) -> None:
+        """Files that began then, after what was begun."""
+        self._kept["starts"] = sorted(starts)
+        self._kept["behind_ns"] = ended["begun_ns"] - max(starts) if starts and ended["begun_ns"] else 0
 
     def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
         """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
@@ -181,9 +193,10 @@ class Harvest(Measurements):
         return f"no new .vpdata in {folder}: is probe Auto Save on at GXSM's panel, and this its folder (probe_dir)?"
 
     def _give_up(self, why: str) -> None:
-        self._log.error("nothing comes of the %s: %s", self._kept["ended"]["what"], why)
-        self._kept["ended"] = None
-        self._kept["starts"] = sorted(self._before) or self._kept["starts"]
+        ended, self._kept["ended"] = self._kept["ended"], None
+        self._log.error("nothing comes of the %s: %s", ended["what"], why)
+        if self._before:
+            self._saw(ended, self._before)
         self.broken_off = True
 
     def _add(self, ended: Mapping[str, Any], files: Mapping[Path, FileContent]) -> None:
@@ -192,7 +205,7 @@ class Harvest(Measurements):
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
             self._kept["absent"] = absent
-            self._kept["starts"] = sorted({content.start_ns for content in files.values() if content.start_ns})
+            self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
             for ending, file in endings(files).items():
                 scan, header = files[file].scans[0], files[file].header
                 self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()

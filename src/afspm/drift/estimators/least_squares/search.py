@@ -69,7 +69,7 @@ class Correlation:
         var1 = self._correlate(self._transform(one * one), k2) - s1 * s1 / n
         var2 = self._correlate(k1, self._transform(two * two)) - s2 * s2 / n
         covariance = self._correlate(f1, f2) - s1 * s2 / n
-        least = 1e-6 * np.sqrt(max(var1.max(), 0.0) * max(var2.max(), 0.0)) + 1e-300
+        least = 1e-5 * np.sqrt(max(var1.max(), 0.0) * max(var2.max(), 0.0)) + 1e-300
         norm = np.sqrt(np.maximum(var1, 0.0) * np.maximum(var2, 0.0))
         coefficient: Array = np.where(norm > least, covariance / np.maximum(norm, least), 0.0)
         return np.clip(coefficient, -0.9999, 0.9999)
