@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-
 import pytest
 from benchmarks.drift.pairs import pair
 from benchmarks.drift.surfaces import SURFACES
@@ -18,31 +15,15 @@ MOST = 2.3
 MOST_OF_STAMPER = 3.0
 
 
-@pytest.fixture(scope="module")
-def cells() -> Callable[[str, str], Cell]:
-    @cache
-    def cell(surface: str, condition: str) -> Cell:
-        trials = [Trial("", surface, condition, seed, (DEFAULT,)) for seed in range(4)]
-        return Cell.of(outcome for trial in trials for outcome in trial.run())
-
-    return cell
-
-
 @pytest.mark.parametrize("condition", ["white30", "real"])
 @pytest.mark.parametrize("surface", SURFACES)
-def test_errors_are_near_the_bound_and_nothing_wrong_is_accepted(
-    cells: Callable[[str, str], Cell], surface: str, condition: str
-) -> None:
-    found = cells(surface, condition)
+def test_errors_are_near_the_bound_and_what_is_right_is_accepted(surface: str, condition: str) -> None:
+    trials = [Trial("", surface, condition, seed, (DEFAULT,)) for seed in range(4)]
+    found = Cell.of(outcome for trial in trials for outcome in trial.run())
+    assert found.accepted == 1.0
     assert found.failed == 0.0
     assert found.wrong == 0.0
     assert found.ratio < (MOST_OF_STAMPER if surface == "stamper" else MOST)
-
-
-def test_most_of_what_is_right_is_accepted(cells: Callable[[str, str], Cell]) -> None:
-    accepted = [cells(surface, "real").accepted for surface in SURFACES]
-    assert min(accepted) > 0.0
-    assert sum(accepted) / len(accepted) >= 0.95
 
 
 @pytest.mark.parametrize("surface", SURFACES)
