@@ -453,7 +453,7 @@ def test_a_scan_ends_though_repeat_is_on_at_the_panel(bench: Make) -> None:
 
 def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Make) -> None:
     """An hour back is more than a scan lasts: each of them seems to have begun before the one before it."""
-    made = bench()
+    made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
     for behind_s in (0.0, 3600.0, 3600.0, 7200.0, 60.0):

@@ -22,6 +22,8 @@ _STORED: Final = 1e-5
 _TURNED_RAD: Final = 1e-6
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Files tell the second in which a scan began."""
+_LATE_NS: Final = 20 * NS_PER_S
+"""One scan may begin so much later after it was asked for than another."""
 SOON_S: Final = 1.0
 """After so long a channel that did not come before will not come; 0.3 s were measured."""
 
@@ -161,7 +163,7 @@ class Harvest(Measurements):
         start_ns, known = content.start_ns, self._kept["starts"]
         if start_ns is None:
             return False
-        is_older = start_ns < begun_ns - self._kept["behind_ns"] - _CLOCK_NS
+        is_older = start_ns < begun_ns - self._kept["behind_ns"] - (_LATE_NS if known else _CLOCK_NS)
         if known and start_ns not in known:
             is_older = is_older and start_ns > max(known)
         if not (is_older or start_ns in known):
