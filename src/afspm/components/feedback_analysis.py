@@ -6,8 +6,7 @@ from typing import Any, ClassVar
 
 from afspm import wire
 from afspm.components.channels import Expected
-from afspm.components.feedback_metrics import error_shares
-from afspm.components.feedback_signal import Comparable
+from afspm.components.feedback_signal import FeedbackSignal
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import ControlState, Feedback, Problem, Scan
 from afspm.runtime.component import Component
@@ -47,7 +46,7 @@ class FeedbackAnalysis(Component):
         self.flag_after, self.clear_after = flag_after, clear_after
         self._setpoint: float | None = None
         self._is_flagged = False
-        self._comparable = Comparable()
+        self._signal = FeedbackSignal()
 
     def on_start(self) -> None:
         self.expected = Expected([self.channel], self.log)
@@ -65,9 +64,7 @@ class FeedbackAnalysis(Component):
         if scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1):
             return  # replayed after a restart
         try:
-            if self._setpoint is not None:
-                self._comparable.require(scan, self.scope)
-            shares = error_shares(scan.values, self._setpoint, self.threshold)
+            shares = self._signal.error_shares(scan, self._setpoint, self.threshold, self.scope)
         except InvalidValue as error:
             self.log.warning("%s: %s", scan.channel, error)
             return

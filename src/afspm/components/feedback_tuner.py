@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from afspm.components.feedback_metrics import error_shares, gain_search
-from afspm.components.feedback_signal import Comparable
+from afspm.components.feedback_metrics import gain_search
+from afspm.components.feedback_signal import FeedbackSignal
 from afspm.errors import ConfigError, ControlLost, InvalidValue, Refused
 from afspm.model import Problem, names
 from afspm.runtime.component import Component
@@ -44,7 +44,7 @@ class FeedbackTuner(Component):
             raise ConfigError("needs 0 < lowest_gain < highest_gain, factor > 1, most_tries >= 2")
         self.lowest, self.highest, self.factor, self.most_tries = lowest_gain, highest_gain, factor, most_tries
         self.channel, self.threshold, self.limit = channel, threshold, limit
-        self._comparable = Comparable()
+        self._signal = FeedbackSignal()
 
     def run(self) -> None:
         while True:
@@ -95,9 +95,7 @@ class FeedbackTuner(Component):
             )
         setpoint = self.scope.feedback.setpoint if self.scope.feedback else None
         try:
-            if setpoint is not None:
-                self._comparable.require(scans[self.channel], self.scope)
-            share = error_shares(scans[self.channel].values, setpoint, self.threshold).total
+            share = self._signal.error_shares(scans[self.channel], setpoint, self.threshold, self.scope).total
         except InvalidValue as error:
             self.log.warning("integral gain %g can't be judged: %s", gain, error.what)
             return 1.0

@@ -81,7 +81,7 @@ class Liveness:
             self._deadline_s += asleep_s
         if self._frozen and self._vital is Vital.ALIVE:
             return Vital.FROZEN
-        if not self._beats and self._vital is not Vital.NOT_CLOSING:
+        if self._has_no_deadline:
             return Vital.ALIVE
         if now_s < self._deadline_s:
             return Vital.STARTING if self._vital is Vital.STARTING else Vital.ALIVE
@@ -90,4 +90,8 @@ class Liveness:
     def next_check_s(self) -> float:
         """When to check at the latest."""
         next_s = self._checked_s + self._policy.beat_period_s
-        return next_s if not self._beats and self._vital is not Vital.NOT_CLOSING else min(self._deadline_s, next_s)
+        return next_s if self._has_no_deadline else min(self._deadline_s, next_s)
+
+    @property
+    def _has_no_deadline(self) -> bool:
+        return not self._beats and self._vital is not Vital.NOT_CLOSING

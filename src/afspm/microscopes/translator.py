@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from afspm import wire
 from afspm.clock import Clock
-from afspm.errors import AfspmError, ConfigError, FileError, WireError
+from afspm.errors import AfspmError, ConfigError, WireError
 from afspm.exit_codes import ExitCode
 from afspm.logic.forwarding import NOT_SENT
 from afspm.logic.watchdog import feedback_of
@@ -437,10 +437,7 @@ class Translator:
     def _save(self) -> None:
         self._kept["said"] = int(self._sequence.said.state)
         self._kept["seen_ns"] = self._clock.now_ns()  # a run that is resumed goes on after it
-        try:
-            self._memory.save()
-        except FileError as error:  # a full disk must not stop the tip from being looked after
-            self._log.critical("a restart would lose what was done and said until now: %s", error)
+        self._memory.save()  # a full disk does not stop the tip from being looked after: the memory says it
 
     # --- publishing ---
 

@@ -142,11 +142,10 @@ def _checked_copy(path: Path) -> sqlite3.Connection:
                 shutil.copy(f"{path}{suffix}", folder / f"{path.name}{suffix}")
         connection = _checked(read_only(folder / path.name), path, _OfCopy)
         assert isinstance(connection, _OfCopy)
-    except OSError as error:
+    except BaseException as error:
         shutil.rmtree(folder, ignore_errors=True)
-        raise FileError(f"can't be read, no copy can be made of it: {error}", where=str(path)) from error
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise FileError(f"can't be read, no copy can be made of it: {error}", where=str(path)) from error
         raise
     connection.remove = weakref.finalize(connection, shutil.rmtree, folder, ignore_errors=True)
     return connection

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +120,13 @@ def test_what_keeps_us_alive_is_not_for_the_component_to_read(host: Host) -> Non
     assert child.error_text == "WARNING two\n  lines\n"
 
 
+@pytest.fixture
+def listener() -> Iterator[HeartbeatListener]:
+    made = HeartbeatListener()
+    yield made
+    made.close()
+
+
 def beats_until(listener: HeartbeatListener, enough: Callable[[Heartbeat], bool]) -> list[Heartbeat]:
     """The beats up to one that is enough."""
     beats: list[Heartbeat] = []
@@ -132,64 +139,46 @@ def beats_until(listener: HeartbeatListener, enough: Callable[[Heartbeat], bool]
     raise AssertionError(f"not in {beats}")
 
 
-def test_beats_tell_busy_from_idle_and_the_end(host: Host) -> None:
-    listener = HeartbeatListener()
-    try:
-        address = listener.listen("diary")
-        child = host(part("Diary", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
-        child.expect("start")
-        beats_until(listener, lambda beat: beat.step_age_s == 0.0)
-        child.let_go()
-        beats_until(listener, lambda beat: beat.closing)
-    finally:
-        listener.close()
+def test_beats_tell_busy_from_idle_and_the_end(host: Host, listener: HeartbeatListener) -> None:
+    address = listener.listen("diary")
+    child = host(part("Diary", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
+    child.expect("start")
+    beats_until(listener, lambda beat: beat.step_age_s == 0.0)
+    child.let_go()
+    beats_until(listener, lambda beat: beat.closing)
 
 
-def test_a_busy_component_beats_with_the_age_of_its_step_and_how_long_it_may_take(host: Host) -> None:
-    listener = HeartbeatListener()
-    try:
-        address = listener.listen("stuck")
-        host(part("Stuck", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
-        beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.3 and beat.longest_step_s == 12.5)
-    finally:
-        listener.close()
+def test_a_busy_component_beats_with_the_age_of_its_step_and_how_long_it_may_take(
+    host: Host, listener: HeartbeatListener
+) -> None:
+    address = listener.listen("stuck")
+    host(part("Stuck", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
+    beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.3 and beat.longest_step_s == 12.5)
 
 
-def test_what_takes_long_to_be_made_is_not_frozen(host: Host) -> None:
+def test_what_takes_long_to_be_made_is_not_frozen(host: Host, listener: HeartbeatListener) -> None:
     """The class is not known yet: it can't say how long it takes to import it."""
-    listener = HeartbeatListener()
-    try:
-        address = listener.listen("slow")
-        host(part("SlowToMake", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
-        beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.1 and beat.longest_step_s == 300.0)
-    finally:
-        listener.close()
+    address = listener.listen("slow")
+    host(part("SlowToMake", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
+    beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.1 and beat.longest_step_s == 300.0)
 
 
-def test_a_step_that_takes_too_long_is_told_with_the_line_it_is_at(host: Host) -> None:
-    listener = HeartbeatListener()
-    try:
-        address = listener.listen("hanging")
-        child = host(part("Hanging", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
-        beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.2)
-        child.let_go()
-        child.exit_code()
-        assert child.error_text.startswith("ERROR a step takes longer than longest_step_s = 0.2 s")
-        assert "threading.Event().wait(0.001)" in child.error_text
-        assert "loop.py" not in child.error_text
-    finally:
-        listener.close()
+def test_a_step_that_takes_too_long_is_told_with_the_line_it_is_at(host: Host, listener: HeartbeatListener) -> None:
+    address = listener.listen("hanging")
+    child = host(part("Hanging", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
+    beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.2)
+    child.let_go()
+    child.exit_code()
+    assert child.error_text.startswith("ERROR a step takes longer than longest_step_s = 0.2 s")
+    assert "threading.Event().wait(0.001)" in child.error_text
+    assert "loop.py" not in child.error_text
 
 
-def test_a_crash_is_not_announced_as_an_end_on_purpose(host: Host) -> None:
-    listener = HeartbeatListener()
-    try:
-        address = listener.listen("broken")
-        child = host(part("Broken", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
-        assert child.exit_code() == ExitCode.CRASHED
-        assert not any(beat.closing for beat in listener.poll(0.3))
-    finally:
-        listener.close()
+def test_a_crash_is_not_announced_as_an_end_on_purpose(host: Host, listener: HeartbeatListener) -> None:
+    address = listener.listen("broken")
+    child = host(part("Broken", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
+    assert child.exit_code() == ExitCode.CRASHED
+    assert not any(beat.closing for beat in listener.poll(0.3))
 
 
 def test_messages_of_the_users_own_come_from_a_proto_file(host: Host, tmp_path: Path) -> None:

@@ -39,9 +39,10 @@ class BankTracker:
     A result far from all that was expected is believed only if that of the next scan is too. A scan that nothing could
     be registered with is adrift: kept where it was predicted, but it proves nothing, and neither do those that are
     known by it alone; how they lie to each other is still followed. Several scans in a row without a place of their own
-    mean that all of them may lie anywhere: it is lost, as it is whenever the standard deviation of a position is more
-    than half of what a scan may be misplaced and still be compared. It then looks everywhere, and is found again when
-    that has made positions certain enough; those adrift are then put right with it.
+    mean that all of them may lie anywhere: it is lost, as it is when one has no place while the standard deviation of
+    its position is more than half of what a scan may be misplaced and still be compared. It then looks everywhere, and
+    is found again when a scan has a place; those adrift are then put right with it. A scan that can be compared with
+    none, a zoom into an overview, begins a row of its own.
 
     Args:
         estimator: gets what is expected as prior.

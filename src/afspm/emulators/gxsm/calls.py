@@ -104,12 +104,11 @@ class Calls:
 
     def _action(self, name: str) -> Any:
         program = self._program
-        state = {"CHECK-MainAutoSave": True, "UNCHECK-MainAutoSave": False}.get(name)
-        repeats = {"CHECK-SCAN-REPEAT": True, "UNCHECK-SCAN-REPEAT": False}.get(name)
-        if state is not None:
-            program.auto_save = state
-        elif repeats is not None:
-            program.repeats = repeats
+        kind, _, switch = name.partition("-")
+        if kind in ("CHECK", "UNCHECK") and switch == "MainAutoSave":
+            program.auto_save = kind == "CHECK"
+        elif kind in ("CHECK", "UNCHECK") and switch == "SCAN-REPEAT":
+            program.repeats = kind == "CHECK"
         elif name == "GETCHECK-MainAutoSave" and program.version == 4:
             return "TRUE" if program.auto_save else "FALSE"
         elif name in self._list_actions():

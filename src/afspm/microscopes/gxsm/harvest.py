@@ -163,13 +163,15 @@ class Harvest(Measurements):
         start_ns, known = content.start_ns, self._kept["starts"]
         if start_ns is None:
             return False
-        is_older = start_ns < begun_ns - self._kept["behind_ns"] - (_LATE_NS if known else _CLOCK_NS)
-        if known and start_ns not in known:
-            is_older = is_older and start_ns > max(known)
-        if not (is_older or start_ns in known):
-            return False
-        self._before.add(start_ns)
-        return True
+        if start_ns in known:
+            is_of_before = True
+        elif known and start_ns < max(known):
+            is_of_before = False  # the clock was set back
+        else:
+            is_of_before = start_ns < begun_ns - self._kept["behind_ns"] - (_LATE_NS if known else _CLOCK_NS)
+        if is_of_before:
+            self._before.add(start_ns)
+        return is_of_before
 
     def _saw(self, ended: Mapping[str, Any], starts: set[int]) -> None:
         """Files that began then, after what was begun."""
