@@ -80,7 +80,15 @@ class Journal:
         return [found[time_ns] for time_ns in sorted(found)]
 
     def note(self, packet: Packet, source_ns: int | None, *, cached: bool) -> None:
-        """A packet is about to be published."""
+        """A packet is about to be published: with a time of the translator, or as the scheduler's own."""
+        self._write_ahead(packet, source_ns, cached=cached)
+        # only then: whoever finds it in the cache publishes it, and then it has to be in the record
+        if cached and source_ns is None:
+            self._keep(packet)
+        elif cached:
+            self._is_due_in(_PERIOD_S)
+
+    def _write_ahead(self, packet: Packet, source_ns: int | None, *, cached: bool) -> None:
         if self._ahead is None:
             return
         try:
@@ -92,17 +100,7 @@ class Journal:
             self._complain_at_s = self._clock.monotonic_s() + _COMPLAIN_EVERY_S
             self._log.critical("what is published now would be lost in a power cut: %s", complaint)
 
-    def changed(self) -> None:
-        """The cache is no longer what it was at the last `follow`. Costs next to nothing."""
-        self._is_due_in(_PERIOD_S)
-
-    def _is_due_in(self, period_s: float) -> None:
-        if self._folder is None or (self._due_s is not None and period_s >= _TIDY_S):
-            return
-        due_s = max(self._clock.monotonic_s() + period_s, self._not_before_s)
-        self._due_s = due_s if self._due_s is None else min(self._due_s, due_s)
-
-    def keep(self, packet: Packet) -> None:
+    def _keep(self, packet: Packet) -> None:
         """Write a packet of the scheduler's own at once; it is newer than all that is cached."""
         if self._folder is None or packet.time_ns is None:
             return
@@ -112,6 +110,12 @@ class Journal:
             self._written.add(packet.time_ns)
         except OSError as error:
             self._tell(error)
+
+    def _is_due_in(self, period_s: float) -> None:
+        if self._folder is None or (self._due_s is not None and period_s >= _TIDY_S):
+            return
+        due_s = max(self._clock.monotonic_s() + period_s, self._not_before_s)
+        self._due_s = due_s if self._due_s is None else min(self._due_s, due_s)
 
     @property
     def due_s(self) -> float | None:

@@ -242,13 +242,9 @@ class Shell:
                 case events.Forward():
                     sockets.link.send(effect.number, wire.encode_request(effect.request))
                 case events.Publish():
-                    if effect.cached and effect.source_ns is None:
-                        self._journal.keep(effect.packet)
                     if not self.ended:  # what is said afterwards is of no use to a run that is resumed
                         self._journal.note(effect.packet, effect.source_ns, cached=effect.cached)
                     sockets.publisher.publish(effect.packet)
-                    if effect.cached and effect.source_ns is not None:
-                        self._journal.changed()
                 case events.Replay():
                     self._replay = effect.packets
                 case events.SaveState():
