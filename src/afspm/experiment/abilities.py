@@ -4,18 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from afspm.errors import AfspmError
-from afspm.model import names
+from afspm.model import Parameter, names
+
+if TYPE_CHECKING:
+    from afspm.microscopes.parameters import ParameterTable
 
 
 @dataclass(frozen=True)
 class Abilities:
-    """The generic names of actions, and of parameters with their SI unit (None: it depends)."""
+    """The generic names of actions, and of parameters with their SI unit (None: it depends).
+
+    Attributes:
+        sets: by name of an action that the experiment file adds, the parameters that it sets.
+    """
 
     actions: frozenset[str]
     parameters: Mapping[str, str | None]
+    sets: Mapping[str, tuple[Parameter, ...]]
 
 
 def of_class(microscope: type, settings: Mapping[str, Any]) -> Abilities | None:
@@ -25,12 +33,21 @@ def of_class(microscope: type, settings: Mapping[str, Any]) -> Abilities | None:
     if not issubclass(microscope, Microscope):
         return None
     marks = (getattr(getattr(microscope, name), "_afspm_action", None) for name in dir(microscope))
-    actions = {mark.name for mark in marks if mark is not None} | set(settings.get("actions") or {})
+    added = settings.get("actions") or {}
+    actions = {mark.name for mark in marks if mark is not None} | set(added)
     try:
-        table = microscope.parameter_table(settings.get("parameters") or {})
+        table = microscope.parameter_table(microscope.rows(settings))
+        sets = {name: _set_by(what, table) for name, what in added.items()}
     except (AfspmError, AttributeError):
         return None  # the microscope itself will say what is wrong with its table
-    return Abilities(frozenset(actions), {name: table[name].si_unit for name in table})
+    return Abilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets)
+
+
+def _set_by(action: Any, table: ParameterTable) -> tuple[Parameter, ...]:
+    """What an action of the experiment file sets, in SI."""
+    given = action.get("set") if isinstance(action, Mapping) else None
+    values = table.written(given, where="actions") if isinstance(given, Mapping) else {}
+    return tuple(Parameter(name, str(value), table[name].si_unit or None) for name, value in values.items())
 
 
 def base() -> dict[str, str | None]:

@@ -32,7 +32,7 @@ from afspm.experiment.findings import Findings, nearest
 from afspm.experiment.lines import Path
 from afspm.experiment.sections import S, Section, parse, report
 from afspm.logic.limits import Limit, Limits
-from afspm.model import Region, names
+from afspm.model import Parameter, Region, names
 from afspm.units import Angle, Duration, Length, parse_quantity, si
 
 Quantity = str | float
@@ -83,6 +83,7 @@ class LimitsReader:
         parameters: the generic names that exist with their SI units (None: it depends on the operating mode).
         actions: those that exist; None: not known before it runs.
         certain: whether these are all parameters, or only those that any microscope may have.
+        sets: by name of an action, the parameters that it sets.
     """
 
     def __init__(
@@ -94,6 +95,7 @@ class LimitsReader:
         actions: frozenset[str] | None,
         *,
         certain: bool,
+        sets: Mapping[str, tuple[Parameter, ...]],
     ) -> None:
         self._document = document
         self._findings = findings
@@ -102,6 +104,7 @@ class LimitsReader:
         self._actions = actions
         self._known_actions = frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if actions is None else actions
         self._certain = certain
+        self._sets = sets
 
     def read(self, table: Mapping[str, Any]) -> Limits:
         """The limits; what is wrong is reported and left out."""
@@ -119,6 +122,7 @@ class LimitsReader:
             region=None if whole.region is None else self._region(whole.region),
             region_source=str(self._document.place("limits", "region")),
             most_pixels=whole.most_pixels,
+            sets={name: one for name, one in self._sets.items() if one},
         )
         self._check_sizes(limits)
         return limits
@@ -275,6 +279,7 @@ def to_settings(limits: Limits) -> dict[str, Any]:
         "parameters": {name: plain(limit) for name, limit in limits.parameters.items()},
         "actions": {name: plain(limit) for name, limit in limits.actions.items()},
         "most_pixels": limits.most_pixels,
+        "sets": {name: [[one.name, one.value, one.unit] for one in given] for name, given in limits.sets.items()},
     }
     if limits.region is not None:
         region = limits.region

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from afspm.logic.limits import Guard, Limits
+from afspm.logic.guard import Guard
+from afspm.logic.limits import Limits
 from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
 
 PURE = (
@@ -61,6 +62,18 @@ def refusals(name: str, planned: Planned, limits: Limits) -> list[str]:
         if refused is not None:
             reasons.append(refused.reason)
     return list(dict.fromkeys(reasons))
+
+
+def refused_actions(limits: Limits) -> list[tuple[str, str]]:
+    """The actions of which it is known beforehand that the limits refuse what they set, and why."""
+    parameters = {name: replace(limit, only=None) for name, limit in _without_changes(limits).parameters.items()}
+    guard = Guard(replace(limits, parameters=parameters, actions={}, region=None))  # where the tip is is not known yet
+    found = []
+    for action in limits.sets:
+        refused = guard.check("", Request(ControlRequest.ACTION, action, b""), 0)
+        if refused is not None:
+            found.append((action, refused.reason))
+    return found
 
 
 def _without_changes(limits: Limits) -> Limits:

@@ -190,8 +190,13 @@ def _resolve_sections(resolved: Resolved) -> None:
         parameters=abilities.base() if has is None else {**abilities.base(), **has.parameters},
         actions=None if has is None else has.actions,
         certain=has is not None,
+        sets={} if has is None else has.sets,
     )
     resolved.limits = reader.read(parts.sections.get("limits", {}))
+    for part in resolved.with_role(Role.TRANSLATOR):
+        for action, reason in planned.refused_actions(resolved.limits):
+            place = document.place(part.name, "actions", action)
+            findings.error(f"[{part.name}] actions: the limits would always refuse {reason}", place)
     for part in parts.components:
         if part.name in resolved.classes and part.name not in resolved.refused:
             _resolve_plan(part.name, resolved)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from afspm.logic.arbitration import Cause, Control
@@ -12,8 +14,8 @@ from afspm.logic.errands import Errands
 from afspm.logic.events import Codec, Effect, Log, Reply, RequestIn, SaveState
 from afspm.logic.forwarding import NOT_SENT, UNKNOWN, End, Forwarder, Job, Settled
 from afspm.logic.frame import CoordinateFrame, Mapped
+from afspm.logic.guard import Guard, is_get
 from afspm.logic.lease import Lease
-from afspm.logic.limits import Guard
 from afspm.logic.moves import Mover
 from afspm.logic.once import Fate, OnceTable, fingerprint
 from afspm.logic.sessions import Hearing, Sessions
@@ -30,6 +32,14 @@ OwnEnd = Callable[[Response, float, int], Iterable[Effect]]
 LATE = "late: it had been told that there was no answer"
 """Of an answer of the translator that came after all."""
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """A request that waits for the values its limits depend on: the names of those that are still to come."""
+
+    event: RequestIn
+    names: set[str]
 
 
 class Desk:
@@ -71,6 +81,7 @@ class Desk:
         self._chronicle = chronicle
         self._frame = frame
         self._asked_by_us: dict[int, OwnEnd] = {}
+        self._reading: list[_Reading] = []
         self._ids_known: bool | None = None
         # actions that only we know of: a translator of version 1 would do them again, one of ours not, but for one that
         # was done already it must not be moved
@@ -173,11 +184,14 @@ class Desk:
 
     def call_back(self, former: str | None, cause: Cause | None) -> None:
         """Commands of a former holder, or of anybody, that have not been sent are not sent any more."""
+        reason = f"control was taken before this was sent: {cause.value if cause else ''}"
         for job in self.forwarder.call_back(lambda job: job.command and former in (None, job.client)):
-            reason = f"control was taken before this was sent: {cause.value if cause else ''}"
             self._finish(job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))
+        waiting = [reading.event for reading in self._reading if former in (None, reading.event.name)]
+        self._reading = [reading for reading in self._reading if reading.event not in waiting]
         if (event := self.mover.call_back(former)) is not None:
-            reason = f"control was taken before this was sent: {cause.value if cause else ''}"
+            waiting.append(event)
+        for event in waiting:
             self.answer_late(event, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason))
 
     def action_in_flight(self) -> str | None:
@@ -191,8 +205,12 @@ class Desk:
         feedback = None if flight is None else feedback_of(flight.request)
         return feedback is not None and feedback.on is False
 
-    def forward(self, event: RequestIn, now_s: float, now_ns: int, *, command: bool) -> None:
-        """Pass a request on to the translator, unless a limit, or the watchdog, stands in the way."""
+    def forward(self, event: RequestIn, now_s: float, now_ns: int, *, command: bool, deadline_s: float = 0.0) -> None:
+        """Pass a request on to the translator, unless a limit, or the watchdog, stands in the way.
+
+        Args:
+            deadline_s: of one that has waited for what its limits depend on; 0: it has not.
+        """
         name, request = event.name, event.request
         mapped = None
         if self._frame is not None:
@@ -205,12 +223,44 @@ class Desk:
             if (why := self._stays_out(self._control())) is not None:
                 self.answer(event, ControlResponse.NOT_FREE, why)
                 return
-            if not self._is_within_limits(event, mapped, now_ns):
+            if not deadline_s and self._reads_first(event, mapped, now_s):
                 return
+            if self.forwarder.up and not self._is_within_limits(event, mapped, now_ns):
+                return  # if not, there is nobody to tell what is in force, as the asker will hear
             self._lease.used(now_ns)
             if request.kind == _ACTION and not self._may_act_here(event, now_s, now_ns):
                 return
-        self._send(event, mapped, now_s, now_ns, command=command)
+        self._send(event, mapped, now_s, now_ns, command=command, deadline_s=deadline_s)
+
+    def _reads_first(self, event: RequestIn, mapped: Mapped | None, now_s: float) -> bool:
+        """Whether the microscope has to be asked for the values that the request's limits depend on; then it is."""
+        sent, used = (event.request, None) if mapped is None else (mapped.request, mapped.names)
+        unread = self.guard.to_be_read(sent, used)
+        if not unread or not self.forwarder.up:
+            return False
+        deadline_s = now_s + self.forwarder.timeout_s
+        self._once.note(event.name, event.request, Fate.PENDING)
+        waiting = _Reading(event, set(unread))
+        self._reading.append(waiting)
+
+        def told(name: str, response: Response, now_s: float, now_ns: int) -> Iterable[Effect]:
+            waiting.names.discard(name)
+            if response.code != _SUCCESS:
+                self.guard.forget(name)
+            if waiting not in self._reading:
+                return ()  # control was taken meanwhile
+            if response.code == ControlResponse.NO_RESPONSE:
+                self._reading.remove(waiting)
+                self.answer_late(event, response)
+            elif not waiting.names:
+                self._reading.remove(waiting)
+                self.forward(event, now_s, now_ns, command=True, deadline_s=deadline_s)
+            return ()
+
+        for name in unread:
+            parameter = Parameter(name)
+            self.ask_own(Request(_PARAM, parameter, self._codec.encode(parameter)), now_s, partial(told, name))
+        return True
 
     def _stays_out(self, control: Control) -> str | None:
         """Why nobody commands, since the tip was left in danger; None: whoever is in control may."""
@@ -455,11 +505,6 @@ def _was_not_sent(response: Response) -> bool:
 def _unknown_fate(response: Response) -> Fate | None:
     """The controller did not answer its translator: whether it was done is for that one to say, when asked again."""
     return Fate.UNKNOWN if response.code == ControlResponse.NO_RESPONSE else None
-
-
-def is_get(request: Request) -> bool:
-    """Whether a parameter is asked for, not set."""
-    return isinstance(request.subject, Parameter) and request.subject.value is None
 
 
 def reads(request: Request) -> bool:

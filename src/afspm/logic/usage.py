@@ -47,6 +47,10 @@ class Usage:
         self._known[name] = Known(value, now_ns)
         return True
 
+    def forget(self, name: str) -> None:
+        """The value in force is not known any more."""
+        self._known.pop(name, None)
+
     def last_ns(self, name: str, who: str, request_id: str) -> int | None:
         """When it was used last, by another request than this one."""
         uses = (uses.get(name) for uses in (self._done, self._sent))

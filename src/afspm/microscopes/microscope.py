@@ -181,6 +181,11 @@ class Microscope(ABC):
         return max(of_s, self.program_s / self.clock.real_s(1.0))
 
     @classmethod
+    def rows(cls, settings: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+        """What these settings add to the table, or change of it: here what the experiment file says."""
+        return settings.get("parameters") or {}
+
+    @classmethod
     def parameter_table(cls, changed: Mapping[str, Mapping[str, Any]]) -> ParameterTable:
         """The parameters of this kind of microscope, with the rows that the experiment file adds or changes.
 

@@ -12,7 +12,7 @@ from afspm.logic.envelopes import CacheRule, EnvelopeMapping, Envelopes
 from afspm.logic.limits import Limit, Limits
 from afspm.logic.scheduling import SchedulerSettings
 from afspm.logic.watchdog import WatchdogSettings
-from afspm.model import ProblemNames, Region
+from afspm.model import Parameter, ProblemNames, Region
 
 Table = Mapping[str, Any]
 
@@ -72,6 +72,7 @@ def _limits(table: Table) -> Limits:
     if (region := plain.get("region")) is not None:
         center, size = tuple(region["center_m"]), tuple(region["size_m"])
         plain["region"] = Region(center, size, region.get("angle_rad", 0.0))
+    plain["sets"] = {name: tuple(Parameter(*one) for one in given) for name, given in plain.get("sets", {}).items()}
     return Limits(**plain)
 
 

@@ -6,6 +6,11 @@ import math
 
 import pytest
 
+from afspm.experiment.limits import to_settings
+from afspm.logic.guard import Guard
+from afspm.model import ControlRequest, ProblemNames, Request
+from afspm.scheduler.settings import scheduler_settings
+
 from .conftest import Write, errors, line_of, only_error
 
 CORRECTOR = '[repair]\ncomponent = true\nclass = "parts.Corrector"\n'
@@ -97,6 +102,49 @@ def test_a_limit_of_unknown_dimension_is_in_the_unit_given(write: Write) -> None
     assert not errors(experiment)
     limit = experiment.resolved.limits.parameters["zctrl-setpoint"]
     assert (limit.low, limit.high, limit.unit) == (0.1, 0.5, "V")
+
+
+SIMULATED = '[scheduler]\ncomponent = true\nclass = "Scheduler"\n[microscope]\ncomponent = true\nclass = "Simulator"\n'
+
+
+@pytest.mark.parametrize(
+    ("settings", "limit", "said"),
+    [
+        ("", "0.9 V", ""),
+        ("", "1 nA", "nA can't be converted to V"),
+        ('feedback = { mode = "current", setpoint = 1e-10 }\n', "1 nA", ""),
+        ('surface = "lattice"\n', "1 nA", ""),  # where it tunnels, unless said otherwise
+    ],
+)
+def test_a_setpoint_is_limited_in_the_unit_of_the_operating_mode(
+    write: Write, settings: str, limit: str, said: str
+) -> None:
+    experiment = write(f'[limits.zctrl-setpoint]\nmax = "{limit}"\n', frame=SIMULATED + settings)
+    assert (said in only_error(experiment).what) if said else not errors(experiment)
+
+
+ADDED = 'actions = { x-high = { set = { tip-bias-voltage = "8 V", scan-angle = 90 } } }\n'
+
+
+def test_what_an_added_action_sets_is_limited_too(write: Write) -> None:
+    experiment = write(BIAS + 'max = "3 V"\n', frame=SIMULATED + ADDED)
+    error = only_error(experiment)
+    assert "always refuse x-high: tip-bias-voltage = 8 V is above the highest allowed, 3 V" in error.what
+    assert error.place is not None
+    assert error.place.line == line_of(experiment, "actions")
+
+
+def test_what_added_actions_set_reaches_the_scheduler(write: Write) -> None:
+    experiment = write(CORRECTOR + BIAS + 'only = ["repair"]\n', frame=SIMULATED + ADDED)
+    assert not errors(experiment)
+    limits = scheduler_settings({}, to_settings(experiment.resolved.limits), {}, ProblemNames(), 5.0).limits
+    assert limits.sets == experiment.resolved.limits.sets
+    guard = Guard(limits)
+    high = Request(int(ControlRequest.ACTION), "x-high")
+    assert guard.check("repair", high, 0) is None
+    refusal = guard.check("series", high, 0)
+    assert refusal is not None
+    assert "only repair" in refusal.reason
 
 
 def test_a_rate_of_a_wrong_unit_is_told_what_a_rate_is(write: Write) -> None:

@@ -8,7 +8,8 @@ import math
 import pytest
 
 from afspm import wire
-from afspm.logic.limits import Guard, Limit, Limits
+from afspm.logic.guard import Guard
+from afspm.logic.limits import Limit, Limits
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -88,7 +89,7 @@ def test_getting_is_never_limited() -> None:
 
 def test_a_step_is_measured_from_what_is_in_force() -> None:
     g = guard(tip_bias_voltage=Limit(step=0.5))
-    assert "not known" in why(g, set_("0.1", "V"))
+    assert "does not tell" in why(g, set_("0.1", "V"))
     g.carried_out(Request(int(ControlRequest.PARAM), Parameter(BIAS)), 0, Parameter(BIAS, "1000", "mV"))
     assert not why(g, set_("1.5", "V"))
     assert "step" in why(g, set_("1.6", "V"))
@@ -339,3 +340,65 @@ def test_a_setpoint_that_is_the_limit_is_not_above_it() -> None:
     for setpoint, fits in ((0.1, True), (0.100001, False)):
         asked = wire.decode("ZCtrlParameters", wire.encode(Feedback(setpoint=setpoint))[1])
         assert (why(limits, Request(int(ControlRequest.SET_ZCTRL_PARAMS), asked)) == "") is fits
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "unit"),
+    [(BIAS, "nan", "V"), (BIAS, "0,5", "V"), (BIAS, "1", "Hz"), ("zctrl-setpoint", "1", "pineapples")],
+)
+def test_what_a_microscope_tells_without_sense_is_no_value_and_no_harm(name: str, value: str, unit: str) -> None:
+    g = guard(tip_bias_voltage=Limit(step=0.5), zctrl_setpoint=Limit(step=0.5, unit="V"))
+    get = Request(int(ControlRequest.PARAM), Parameter(name))
+    g.carried_out(get, 0, Parameter(name, "1", "V"))
+    assert not why(g, set_("1.2", "V", name))
+    assert not g.carried_out(get, 0, Parameter(name, value, unit))
+    assert "does not tell" in why(g, set_("1.2", "V", name))
+    assert not g.published(Feedback(setpoint=math.nan), 0)
+
+
+def test_who_may_set_counts_for_switches_and_texts_too() -> None:
+    g = guard(x_feedback_on=Limit(only={"corrector"}), x_spec_kind=Limit(only={"corrector"}, interval_s=10.0))
+    off = Request(int(ControlRequest.SET_ZCTRL_PARAMS), Feedback(on=False))
+    requests = (off, set_("false", None, "x-feedback-on"), set_("IV", None, "x-spec-kind"))
+    for request in requests:
+        assert "only corrector" in why(g, request, "experiment")
+        assert not why(g, request, "corrector")
+    g.carried_out(requests[2], 0)
+    assert "every 10 s" in why(g, Request(int(ControlRequest.PARAM), requests[2].subject), "corrector", NS)
+
+
+HIGH = {"x-high": (Parameter(BIAS, "8", "V"),)}
+
+
+def test_an_action_is_limited_by_what_it_sets() -> None:
+    act = Request(int(ControlRequest.ACTION), "x-high", id="i")
+    for limit, word in (
+        (Limit(high=3.0), "above the highest"),
+        (Limit(only={"corrector"}), "only corrector"),
+        (Limit(step=0.5), "step of 7 V"),
+    ):
+        g = Guard(Limits({BIAS: limit}, sets=HIGH))
+        g.carried_out(set_("1", "V"), 0)
+        assert word in why(g, act)
+        assert "x-high" in why(g, act)
+    away = Guard(Limits(region=STAGE, sets={"x-away": (Parameter("probe-pos-x", "20", "um"),)}))
+    away.published(ProbePosition((0.0, 0.0)), 0)
+    assert "outside the region" in why(away, Request(int(ControlRequest.ACTION), "x-away", id="i"))
+
+
+def test_what_an_action_has_set_is_in_force() -> None:
+    g = Guard(Limits({BIAS: Limit(step=0.5)}, sets=HIGH))
+    g.carried_out(Request(int(ControlRequest.ACTION), "x-high"), 0)
+    assert not why(g, set_("8.4", "V"))
+    assert why(g, set_("1.0", "V"))
+
+
+def test_only_what_nobody_publishes_is_to_be_read_and_only_where_it_matters() -> None:
+    g = Guard(
+        Limits({BIAS: Limit(step=0.5), "scan-size-x": Limit(step=1e-6), "scan-speed": Limit(high=1.0)}, sets=HIGH)
+    )
+    assert g.to_be_read(set_("1", "V")) == [BIAS]
+    assert g.to_be_read(Request(int(ControlRequest.ACTION), "x-high")) == [BIAS]
+    assert g.to_be_read(Request(int(ControlRequest.PARAM), Parameter(BIAS))) == []
+    assert g.to_be_read(set_("1e-6", "m/s", "scan-speed")) == []
+    assert g.to_be_read(scan(Region((0.0, 0.0), (1e-6, 1e-6)))) == []

@@ -376,15 +376,6 @@ def test_a_limit_refuses_and_is_logged() -> None:
     assert lab.forwarded == []
 
 
-def test_a_step_limit_follows_what_the_translator_answers() -> None:
-    lab = Lab(SchedulerSettings(limits=Limits({"tip-bias-voltage": Limit(step=0.5)})))
-    lab.translator()
-    lab.take_control("experiment")
-    lab.ask("experiment", PARAM, Parameter("tip-bias-voltage"))
-    lab.answer(lab.forwarded[-1], payload=lab.codec.encode(Parameter("tip-bias-voltage", "1.0", "V")))
-    assert kinds(lab.ask("experiment", PARAM, Parameter("tip-bias-voltage", "1.4", "V"))) == ["Forward"]
-
-
 def test_packets_pass_renamed_and_late_joiners_get_them_in_order(lab: Lab) -> None:
     header = PacketHeader("Scan2d", "Height", (2e-6, 2e-6))
     scan = lab.step(PacketIn(Packet("Scan2d", b"values", lab.now_ns + NS), header))

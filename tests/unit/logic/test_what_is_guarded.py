@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from logic_lab import NS, Lab, in_control, killed, kinds, replies
 
-from afspm.logic.events import Forward
+from afspm.logic.events import Effect, Forward, Tick, TranslatorDown
 from afspm.logic.limits import Limit, Limits
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
@@ -13,6 +13,7 @@ from afspm.model import (
     ControlResponse,
     Parameter,
     ProbePosition,
+    Problem,
     Region,
     ScanParameters,
 )
@@ -63,17 +64,75 @@ def test_what_may_have_been_done_counts() -> None:
     assert lab.says("experiment", ACTION, "x-pulse", "experiment/a/2") is ControlResponse.ACTION_ERROR
 
 
-def test_the_value_that_a_step_is_measured_from_outlives_the_scheduler() -> None:
-    settings = SchedulerSettings(limits=Limits({"tip-bias-voltage": Limit(step=0.1)}))
-    lab = in_control(settings)
-    lab.ask("experiment", PARAM, Parameter("tip-bias-voltage"))
-    lab.answer(lab.forwarded[-1], payload=lab.codec.encode(Parameter("tip-bias-voltage", "0.1", "V")))
-    again = killed(lab, settings)
-    too_far = replies(again.ask("experiment", PARAM, Parameter("tip-bias-voltage", "0.3", "V"), "experiment/a/2"))
-    assert "a step of 0.2 V" in too_far[0].response.reason
-    assert "Forward" in kinds(
-        again.ask("experiment", PARAM, Parameter("tip-bias-voltage", "0.2", "V"), "experiment/a/3")
-    )
+BIAS = "tip-bias-voltage"
+STEPS = SchedulerSettings(limits=Limits({BIAS: Limit(step=0.1)}))
+
+
+def told(lab: Lab, value: str) -> list[Effect]:
+    """The microscope answers what the bias is."""
+    forward = lab.forwarded[-1]
+    assert forward.request.subject == Parameter(BIAS)
+    return lab.answer(forward, payload=lab.codec.encode(Parameter(BIAS, value, "V")))
+
+
+def sent(effects: list[Effect]) -> list[object]:
+    return [effect.request.subject for effect in effects if isinstance(effect, Forward)]
+
+
+def test_a_step_is_measured_from_what_the_microscope_says_then() -> None:
+    lab = in_control(STEPS)
+    assert sent(lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")) == [Parameter(BIAS)]
+    assert sent(told(lab, "0.1")) == [Parameter(BIAS, "0.2", "V")]
+    lab.answer(lab.forwarded[-1])
+    lab.ask("experiment", PARAM, Parameter(BIAS, "0.3", "V"), "experiment/a/2")
+    (reply,) = replies(told(lab, "-3"))  # somebody was at the panel
+    assert "a step of 3.3 V" in reply.response.reason
+    assert reply.response.id == "experiment/a/2"
+
+
+def test_what_can_not_be_read_is_not_set() -> None:
+    lab = in_control(STEPS)
+    lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")
+    (reply,) = replies(lab.answer(lab.forwarded[-1], ControlResponse.PARAM_NOT_SUPPORTED))
+    assert reply.response.code == ControlResponse.PARAM_ERROR
+    assert "does not tell" in reply.response.reason
+
+
+def test_one_whose_value_the_microscope_does_not_tell_in_time_may_ask_again() -> None:
+    lab = in_control(STEPS)
+    lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")
+    lab.later(STEPS.request_timeout_s)
+    (reply,) = replies(lab.step(Tick()))
+    assert reply.response.code == ControlResponse.NO_RESPONSE
+    assert reply.response.reason.startswith("not sent: ")
+
+
+def test_who_loses_control_while_the_value_is_read_does_not_set_it() -> None:
+    lab = in_control(STEPS)
+    lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")
+    effects = lab.ask("classifier", ControlRequest.ADD_EXP_PRBLM, Problem.TIP_SHAPE_CHANGED)
+    (code,) = [reply.response.code for reply in replies(effects) if reply.name == "experiment"]
+    assert code == ControlResponse.NOT_IN_CONTROL
+    assert not sent(told(lab, "0.1"))
+
+
+def test_without_a_translator_nothing_is_read() -> None:
+    lab = in_control(SchedulerSettings(limits=Limits({BIAS: Limit(high=3.0)})))
+    lab.step(TranslatorDown())
+    (reply,) = replies(lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1"))
+    assert reply.response.code == ControlResponse.NO_RESPONSE
+    lab = in_control(STEPS)
+    lab.step(TranslatorDown())
+    (reply,) = replies(lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1"))
+    assert reply.response.code == ControlResponse.NO_RESPONSE
+
+
+@pytest.mark.parametrize("said", ["nan", "0,5", ""])
+def test_no_answer_of_a_microscope_ends_the_scheduler(said: str) -> None:
+    lab = in_control(SchedulerSettings())
+    lab.ask("experiment", PARAM, Parameter(BIAS), "experiment/a/1")
+    (reply,) = replies(told(lab, said))
+    assert reply.response.code == ControlResponse.SUCCESS
 
 
 def test_what_an_older_scheduler_saved_is_taken_up() -> None:

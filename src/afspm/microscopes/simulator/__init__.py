@@ -20,6 +20,7 @@ from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.simulation import World
+from afspm.simulation.world_settings import WorldSettings, read_settings
 from afspm.units import Duration
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ class Simulator(Microscope):
         self._seed = seed
         loop = World.from_settings(self._world_settings, seed, 0.0).settings.feedback
         super().__init__(
-            parameters=_merged(_rows_for(loop.mode), parameters or {}),
+            parameters=self.rows({**self._world_settings, "parameters": parameters}),
             actions=actions,
             poll_period_s=poll_period_s,
             result_timeout_s=result_timeout_s,
@@ -146,6 +147,12 @@ class Simulator(Microscope):
             if event.action and event.action not in self.own_actions():
                 raise ConfigError(f"there is no action {event.action!r}", where="panel")
         self._approach_s = approach_s
+
+    @classmethod
+    def rows(cls, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        of_world = ("surface", *WorldSettings.__dataclass_fields__)
+        _, world = read_settings({name: settings[name] for name in of_world if settings.get(name) is not None})
+        return _merged(_rows_for(world.feedback.mode), settings.get("parameters") or {})
 
     def connect(self) -> None:
         """Switch the instrument on, or find it as it was."""
