@@ -26,6 +26,9 @@ from afspm.transport.port import (
     ReplyReceived,
 )
 
+LONGER_THAN_THE_SCHEDULER = 1.2
+"""By so much we wait longer than the scheduler does for the microscope: what it says then is an answer, and who asks
+again instead makes the connection anew, as if the scheduler were gone."""
 CAUGHT_UP_WITHIN_S = 2.0  # a scheduler of version 1 replays without saying when it is done
 Listener = Callable[[Packet, bool], None]
 
@@ -186,13 +189,14 @@ class Link:
         request = Request(kind, subject, id=request_id or self.next_id())
         frames = wire.encode_request(request)
         self._asked, self._answer = request.id, None
+        answered_within_s = self.request_timeout_s * LONGER_THAN_THE_SCHEDULER
         sent = 0
         try:
             while sent < self._tries(kind):
                 self._wait_connected(until_s)
                 connection = self.connections
                 self.port.send(frames)
-                answer = self._await_answer(connection, self._earlier(self.request_timeout_s, until_s))
+                answer = self._await_answer(connection, self._earlier(answered_within_s, until_s))
                 if answer is not None:
                     self.ended = self.ended or answer.reason == HAS_ENDED  # that may come before the signal itself
                     self.check()

@@ -159,6 +159,10 @@ class Lab:
         self._inbox.append(PacketReceived(packet, SOURCE))
         return packet
 
+    def answer_now(self, response: Response) -> None:
+        """What `intercept` left without an answer."""
+        self._inbox.append(ReplyReceived(response))
+
     def connect(self) -> None:
         self._inbox.append(ControlConnected())
 

@@ -284,6 +284,30 @@ def test_a_translator_that_stays_silent_is_told(lab: Lab, scope: Scope) -> None:
         scope.set("tip-bias-voltage", 1.0)
 
 
+def test_what_the_scheduler_says_of_a_slow_translator_is_heard_before_it_is_asked_again(lab: Lab, scope: Scope) -> None:
+    done_s = lab.clock.passed_s + 25.0
+    unanswered: set[float] = set()
+
+    def slow(request: model.Request) -> str | None:
+        if request.subject != "x-pulse":
+            return "go on"
+        assert not unanswered, "asked again too soon"
+        asked_s, left_s = lab.clock.passed_s, done_s - lab.clock.passed_s
+        unanswered.add(asked_s)
+        code = ControlResponse.SUCCESS if left_s < 5.0 else ControlResponse.NO_RESPONSE
+
+        def answer() -> None:
+            unanswered.remove(asked_s)
+            lab.answer_now(Response(code, id=request.id))
+
+        lab.at(min(left_s, 5.0) + 0.01, answer)
+        return None
+
+    lab.intercept = slow
+    scope.action("x-pulse")
+    assert lab.clock.passed_s == pytest.approx(done_s, abs=0.1)
+
+
 def test_a_scheduler_that_never_answers_is_told(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: None
     with pytest.raises(NoResponse, match="asked 4 times"):
