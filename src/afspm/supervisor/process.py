@@ -20,7 +20,7 @@ from afspm.supervisor.thinning import PAUSE_S, Thinning
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
 FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
-LAST_WORDS_S = 0.3  # how long output may still come after an exit (a grandchild can hold the pipe open)
+LAST_WORDS_S = 3.0  # how long its output may still be read after an exit; a grandchild that left can hold the pipe open
 
 Stream = Literal["stdout", "stderr"]
 
