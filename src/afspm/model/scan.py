@@ -98,6 +98,7 @@ class Scan:
         values: [y, x], both ascending, float64; empty where only the parameters came.
         time_ns: when it was finished, ns since the Unix epoch; None if it is not known.
         filename: where the controller saved it; empty if it did not.
+        pixels: (rows, columns) that it has where no values came to say so; None if that was not said either.
     """
 
     region: Region
@@ -106,19 +107,27 @@ class Scan:
     values: NDArray[np.float64]
     time_ns: int | None = None
     filename: str = ""
+    pixels: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2:
             raise InvalidValue(f"a scan needs values as [y, x], not of shape {self.values.shape}")
+        if self.pixels is None:
+            return
+        ScanParameters(shape=self.pixels)
+        if self.values.size and self.values.shape != self.pixels:
+            raise InvalidValue(f"a scan of {self.pixels} pixels with values of shape {self.values.shape}")
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns)."""
-        return self.values.shape[0], self.values.shape[1]
+        """(rows, columns), with or without values; one of them 0 where neither came."""
+        rows, columns = self.values.shape
+        return (rows, columns) if self.values.size or self.pixels is None else self.pixels
 
     @property
     def parameters(self) -> ScanParameters:
-        return ScanParameters(self.region, self.shape, self.unit)
+        """What it was taken with; without a shape where that is not known."""
+        return ScanParameters(self.region, self.shape if all(self.shape) else None, self.unit)
 
     @property
     def time(self) -> datetime | None:
@@ -127,7 +136,9 @@ class Scan:
 
     @property
     def lines_missing(self) -> int:
-        """How many lines have no value at all: it was broken off."""
+        """How many lines have no value at all: it was broken off. All of them where no values came."""
+        if not self.values.size:
+            return self.shape[0]
         import numpy as np
 
         return int(np.isnan(self.values).all(axis=1).sum())
@@ -155,7 +166,8 @@ class Scan:
     def to_xarray(self) -> xarray.DataArray:
         """As an xarray DataArray with coordinates in m (needs the extra `xarray`).
 
-        The coordinates x and y are those of the unrotated rectangle; `angle_rad` is in the attributes.
+        The coordinates x and y are those of the unrotated rectangle; `angle_rad` is in the attributes. NaN where no
+        values came.
         """
         import numpy as np
         import xarray
@@ -163,7 +175,7 @@ class Scan:
         (left, low), (width, height) = self.region.top_left_m, self.region.size_m
         ny, nx = self.shape
         return xarray.DataArray(
-            self.values,
+            self.values if self.values.size else np.full(self.shape, np.nan),
             {
                 "y": ("y", np.linspace(low, low + height, ny), {"units": "m"}),
                 "x": ("x", np.linspace(left, left + width, nx), {"units": "m"}),

@@ -12,7 +12,7 @@ from afspm import wire
 from afspm.errors import FileError, WireError
 from afspm.model import Frame, Packet, Scan, Spectrum
 from afspm.record.journal import SCHEDULER
-from afspm.wire.values import shape_of_scan, with_values
+from afspm.wire.values import with_values
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,7 +60,7 @@ def without_reading_files(
         try:
             thing = wire.decode(message, payload)
             if isinstance(thing, Scan) and scan is not None:
-                thing = _shaped(thing, payload)
+                thing = _without_numbers(thing)
         except WireError:
             continue
         yield Packet(envelope, payload, time_ns), message, _placed(thing, frame)
@@ -77,10 +77,10 @@ def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterat
         after = rows[-1][:2]
 
 
-def _shaped(scan: Scan, payload: bytes) -> Scan:
+def _without_numbers(scan: Scan) -> Scan:
     import numpy as np
 
-    return replace(scan, values=np.broadcast_to(np.nan, shape_of_scan(payload)))
+    return replace(scan, values=np.broadcast_to(np.nan, scan.shape))
 
 
 def _placed(thing: Any, frame: Frame) -> Any:

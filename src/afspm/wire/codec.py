@@ -69,12 +69,9 @@ def header(name: str, payload: Buffer) -> model.PacketHeader:
 
 def _encode_scan(scan: model.Scan) -> tuple[str, bytes]:
     message = scan_pb2.Scan2d(
-        params=convert.scan_parameters_to_wire(
-            model.ScanParameters(scan.region, scan.shape if scan.values.size else None)
-        ),
+        params=convert.scan_parameters_to_wire(scan.parameters),
         channel=scan.channel,
     )
-    message.params.data.units = scan.unit
     if scan.time_ns is not None:
         message.timestamp.CopyFrom(convert.timestamp(scan.time_ns))
     if scan.filename:
@@ -101,6 +98,7 @@ def _decode_scan(payload: Buffer) -> model.Scan:
         values.reshape(shape.y, shape.x) if values.size else values.reshape(0, 0),
         convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
         message.filename,
+        None if values.size or not (shape.x and shape.y) else (shape.y, shape.x),
     )
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from afspm.wire.codec import Buffer
-from afspm.wire.generated.scan_pb2 import Scan2d
-from afspm.wire.messages import parse
 from afspm.wire.split import nested, packed, split
 
 if TYPE_CHECKING:
@@ -42,13 +40,3 @@ def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes
     rest, inner = split(head, _DATA_OF_SPECTRUM)
     data = b"".join((*inner, *packed(values, _VALUES_OF_DATA)))
     return rest + nested(data, _DATA_OF_SPECTRUM)
-
-
-def shape_of_scan(head: bytes) -> tuple[int, int]:
-    """(rows, columns) that a Scan2d without its values says it has.
-
-    Raises:
-        WireError: the bytes are no message.
-    """
-    shape = parse(Scan2d, head).params.data.shape
-    return shape.y, shape.x

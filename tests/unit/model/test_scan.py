@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from afspm.errors import InvalidValue
-from afspm.model import ProblemNames, Region, Scan, ScanSet, Spectrum
+from afspm.model import ProblemNames, Region, Scan, ScanParameters, ScanSet, Spectrum
 from afspm.model.picture import png
 
 REGION = Region.from_top_left((0.0, 1e-6), (3e-6, 2e-6))
@@ -21,6 +21,32 @@ def test_xarray_has_coordinates_in_metres() -> None:
     np.testing.assert_allclose(array.y, [1e-6, 2e-6, 3e-6])
     assert (array.name, array.attrs["units"]) == ("Height", "m")
     assert float(array.sel(x=1e-6, y=3e-6, method="nearest")) == SCAN.values[2, 1]
+
+
+def test_a_scan_without_values_has_the_shape_that_it_was_taken_with() -> None:
+    scan = Scan(REGION, "Height", "m", np.empty((0, 0)), pixels=(3, 4))
+    assert scan.shape == (3, 4)
+    assert scan.parameters == SCAN.parameters
+    assert scan.lines_missing == 3
+    assert "4 x 3 px" in scan._repr_html_()
+    assert "4 x 3 px" in repr(ScanSet([scan]))
+    array = scan.to_xarray()
+    np.testing.assert_allclose(array.y, SCAN.to_xarray().y)
+    assert np.isnan(array).all()
+    assert scan.undistorted((0.0, 0.0), 1.0).shape == (3, 4)
+
+
+def test_a_scan_of_which_not_even_the_shape_is_known_has_parameters() -> None:
+    scan = Scan(REGION, "Height", "m", np.empty((0, 0)))
+    assert scan.shape == (0, 0)
+    assert scan.parameters == ScanParameters(REGION, unit="m")
+    assert scan.lines_missing == 0
+
+
+@pytest.mark.parametrize("pixels", [(4, 3), (0, 0), (3,)])
+def test_pixels_that_the_values_contradict_or_that_are_none_are_refused(pixels: tuple[int, int]) -> None:
+    with pytest.raises(InvalidValue):
+        Scan(REGION, "Height", "m", SCAN.values, pixels=pixels)
 
 
 def test_a_set_of_scans_is_a_mapping_by_channel() -> None:

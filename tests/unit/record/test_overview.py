@@ -104,6 +104,12 @@ def test_an_interrupted_scan_is_kept_and_marked_where_lines_came() -> None:
     assert (part.began_ns, part.time_ns, part.shape, part.holder) == (20 * S, 24 * S, (4, 4), "series")
 
 
+def test_a_scan_without_values_is_told_with_the_shape_that_it_was_taken_with() -> None:
+    night = Overview()
+    night.take("Scan2d", model.Scan(REGION, "Topo", "m", np.empty((0, 0)), 5 * S, pixels=(6, 8)), 6 * S, "Scan2d")
+    assert [one.shape for one in night.scans] == [(6, 8)]
+
+
 def test_channels_of_a_scan_are_entries_of_their_own() -> None:
     night = Overview()
     night.take("Scan2d", scan("Height", 5), 6 * S, "Scan2d_1000.0_Height")

@@ -27,6 +27,7 @@ from afspm.model import (
     ProcessCondition,
     ProcessState,
     ProcessStates,
+    Scan,
     ScopeState,
 )
 from afspm.record.store import _PROCESS, About, Store
@@ -98,6 +99,18 @@ def test_everything_comes_out_as_it_was_published(night: Night, store: Store, tm
     assert same(list(run.packets()), given)
     assert same(list(run.packets(messages=["ControlState"])), given[:1])
     assert same(list(run.packets(since_ns=given[6][0].time_ns or 0)), given[7:])
+
+
+def test_a_scan_without_values_comes_out_as_it_was_published(night: Night, store: Store, tmp_path: Path) -> None:
+    """There is nothing to make a file of; the journal has what it was taken with."""
+    bare = Scan(REGION, "Topo", "m", np.empty((0, 0)), pixels=(6, 8))
+    given = [night.state(ScopeState.SCANNING), night.packet(bare, "Scan2d_1000.0_Topo"), *night.scans(1)]
+    given.append(night.state(ScopeState.FREE))
+    store.take(given)
+    run = afspm.open_run(tmp_path)
+    assert same(list(run.packets()), given)
+    assert [row.channels for row in run.scans] == [(("Height", "m"), ("Height Retrace", "m"))]
+    assert next(wire.decode("Scan2d", p.payload) for p in run.packets(messages=["Scan2d"])).shape == (6, 8)
 
 
 def test_lines_of_a_channel_that_the_end_came_before_are_there(night: Night, store: Store, tmp_path: Path) -> None:

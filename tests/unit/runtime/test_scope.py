@@ -10,7 +10,17 @@ from runtime_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
 
 from afspm import model
 from afspm.errors import ControlLost, ExperimentEnded, InvalidValue, NoResponse, Refused, UnitError
-from afspm.model import ControlMode, ControlRequest, ControlResponse, Problem, Response, Scan, ScopeState, ScopeStatus
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Problem,
+    Region,
+    Response,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+)
 from afspm.runtime.link import Link
 from afspm.runtime.scope import Scope
 from afspm.runtime.stopping import StopRequested
@@ -134,6 +144,18 @@ def test_a_scan_that_was_accepted_and_never_begins_is_asked_for_anew(lab: Lab, s
     scope.scan(REGION)
     ids = [request.id for request in lab.requests if request.subject == "start-scan"]
     assert len(set(ids)) == 2
+
+
+def test_a_scan_of_the_shape_that_was_asked_for_is_the_one_even_without_values(lab: Lab, scope: Scope) -> None:
+    """Of a translator that tells what was taken and leaves the values in its files."""
+
+    def publish(region: Region, shape: tuple[int, int] = (8, 8)) -> None:
+        lab.publish(Scan(region, "Height", "m", np.empty((0, 0)), lab.clock.now_ns(), "a.dat", shape))
+
+    lab.publish_scan = publish  # type: ignore[method-assign]
+    scans = scope.scan(REGION, shape=(8, 8))
+    assert (scans.first.shape, scans.first.values.size, scans.first.filename) == ((8, 8), 0, "a.dat")
+    assert lab.begun_scans == 1
 
 
 def test_channels_that_got_lost_with_the_translator_are_noticed(lab: Lab, scope: Scope) -> None:

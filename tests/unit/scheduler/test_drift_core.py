@@ -73,6 +73,15 @@ def test_channels_that_come_in_files_of_their_own_are_of_one_scan(lab: Lab, chan
     assert not problems(lab)
 
 
+def test_heights_without_values_are_not_registered(lab: Lab) -> None:
+    lab.scope_is(ScopeState.SCANNING)
+    lab.publish(Scan(HERE, "Amplitude", "V", np.ones(SHAPE), lab.now_ns, "a.nc"))
+    lab.publish(Scan(HERE, "Height", "m", np.empty((0, 0)), lab.now_ns, "a.nc", SHAPE))
+    assert not lab.worker.jobs
+    lab.scope_is(ScopeState.FREE)
+    assert [scan.shape for scan in lab.published("Scan2d")] == [SHAPE] * 2
+
+
 def test_the_middle_of_a_scan_is_between_its_beginning_and_its_own_end(lab: Lab) -> None:
     """However late its file comes."""
     lab.scope_is(ScopeState.SCANNING)

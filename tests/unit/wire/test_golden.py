@@ -66,11 +66,10 @@ def test_model_objects_survive_a_round_trip(entry: Any) -> None:
 
 
 def _presence(message: Any) -> Any:
-    """Which fields are there, all the way down. Values are left out; empty scans keep no pixel count."""
+    """Which fields are there, all the way down."""
     return {
         field.name: _presence(value) if field.message_type and not field.is_repeated else None
         for field, value in message.ListFields()
-        if field.name != "shape"
     }
 
 
@@ -96,6 +95,13 @@ def test_the_reference_scan_in_si_units() -> None:
     assert (scan.channel, scan.unit, scan.filename) == ("Height Retrace", "nm", "C:\\data\\scan0001.ibw")
     assert scan.time_ns == 1_767_225_600_123_456_000
     np.testing.assert_array_equal(scan.values, [[0.0, 1.5, -2.25], [1e-09, 3e300, -0.0]])
+
+
+def test_the_reference_scan_without_values_has_its_shape() -> None:
+    entry = next(e for e in GOLDEN["messages"] if e["name"] == "scan without values")
+    scan = wire.decode("Scan2d", bytes.fromhex(entry["hex"]))
+    assert (scan.shape, scan.values.size) == ((2, 3), 0)
+    assert (scan.parameters.region, scan.parameters.shape, scan.parameters.unit) == (scan.region, (2, 3), "nm")
 
 
 @each("requests")

@@ -228,7 +228,9 @@ class DriftCore:
                 return self._without_channel(held.key, now_s, now_ns)
         elif message == "Scan2d":
             scan = self._codec.decode_packet(message, event.packet.payload)
-            if isinstance(scan, Scan) and scan_key(scan, event.packet) == held.key and self._is_channel(scan):
+            if not isinstance(scan, Scan) or not scan.values.size:
+                return []
+            if scan_key(scan, event.packet) == held.key and self._is_channel(scan):
                 self._register(held, scan, event, now_ns)
         return []
 
