@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from afspm.addresses import ListeningAddress
 from afspm.clock import iso_utc
 from afspm.components.records import LineFile
 from afspm.runtime.component import Component
@@ -38,7 +39,7 @@ class LogCollector(Component):
 
     def __init__(
         self,
-        address: str,
+        address: ListeningAddress,
         file: str = "log-all.txt",
         level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO",
     ) -> None:

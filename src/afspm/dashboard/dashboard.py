@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from afspm.addresses import Listens
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, is_loopback, secret_in
 from afspm.dashboard.allowed import allowed_region
@@ -45,7 +46,7 @@ class Dashboard(Component):
     def __init__(
         self,
         host: str = "127.0.0.1",
-        port: int | None = None,
+        port: Annotated[int | None, Listens(host="host", keyed=False)] = None,
         password_hash: str = "",
         certificate: Path | None = None,
         certificate_key: Path | None = None,

@@ -9,8 +9,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+from afspm.addresses import Listens
 from afspm.clock import Clock, ExperimentClock
 from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
@@ -82,7 +83,7 @@ class Emulator(ABC):
     def __init__(
         self,
         *,
-        port: int | None = None,
+        port: Annotated[int | None, Listens()] = None,
         seed: int = 1,
         faults: Sequence[str | Mapping[str, Any] | Fault] = (),
         **world: Any,

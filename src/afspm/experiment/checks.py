@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Collection, Iterator
 from typing import Any, Final
 
+from afspm.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.errors import InvalidValue
 from afspm.experiment import notifying, wiring
 from afspm.experiment.findings import closest, nearest
@@ -111,9 +112,9 @@ def check_intermediaries(resolved: Resolved) -> None:
                 resolved.findings.error(f"[{name}] a {kind.value} has no setting {key!r}", place, hint)
             elif key.endswith("url"):
                 for url in value if isinstance(value, list) else [value]:
-                    if not isinstance(url, str) or not wiring.is_address(url):
+                    if not isinstance(url, str) or not is_address(url):
                         near = closest(str(url), names, 0.7)
-                        hint = f"did you mean {near!r}?" if near else 'as in "tcp://127.0.0.1:9000"'
+                        hint = f"did you mean {near!r}?" if near else hint_on(str(url)) or EXAMPLE
                         resolved.findings.error(f"[{name}] {key} = {url!r} is not an address", place, hint)
 
 
@@ -121,28 +122,28 @@ def check_addresses(resolved: Resolved) -> None:
     """No address is bound twice; none is open to the network without keys; every connection has somebody at its end."""
     bound: dict[str, wiring.Slot] = {}
     secure = resolved.security.keys is not None or resolved.security.insecure
-    for slot in resolved.net.slots.values():
+    for slot in (*resolved.net.slots.values(), *resolved.listening):
         if slot.address is None:
             continue
         for address, other in bound.items():
-            if wiring.reaches(slot.address, address) or wiring.reaches(address, slot.address):
+            if reaches(slot.address, address) or reaches(address, slot.address):
                 resolved.findings.error(
                     f"[{slot.owner}] and [{other.owner}] both bind {slot.address} ({slot.use}, {other.use})", slot.place
                 )
         bound[slot.address] = slot
-        if wiring.is_address(slot.address) and not is_local(slot.address) and not secure:
+        if slot.keyed and is_address(slot.address) and not is_local(slot.address) and not secure:
             resolved.findings.error(
                 f"[{slot.owner}] binds {slot.address}, which other computers can reach, without keys",
                 slot.place,
                 'make keys with `afspm keys` and set [security] keys = "keys"; or say [security] insecure = true',
             )
-    if not all(wiring.is_address(address) for address in bound):
+    if not all(is_address(address) for address in bound):
         return  # what is no address has been reported as such; whoever looks for it may be right
     for name, links in resolved.net.links.items():
         for target in (links.control, *links.subscribe):
-            if target is None or target in resolved.net.slots or not wiring.is_address(target):
+            if target is None or target in resolved.net.slots or not is_address(target):
                 continue
-            if not any(wiring.reaches(target, b) for b in bound):
+            if not any(reaches(target, b) for b in bound):
                 resolved.findings.error(
                     f"[{name}] connects to {target}, which nobody binds",
                     resolved.document.place(name),
@@ -157,7 +158,7 @@ def check_self_subscription(resolved: Resolved) -> None:
         if own is None or resolved.roles[name] is not Role.COMPONENT:
             continue
         key = f"{own.owner}/{own.use}"
-        if key in links.subscribe or (own.address and any(wiring.reaches(s, own.address) for s in links.subscribe)):
+        if key in links.subscribe or (own.address and any(reaches(s, own.address) for s in links.subscribe)):
             resolved.findings.error(f"[{name}] subscribes to itself", resolved.document.place(name, "subscriber"))
 
 

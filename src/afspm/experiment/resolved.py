@@ -26,7 +26,7 @@ from afspm.experiment.classes import Declared
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
 from afspm.experiment.parts import EMULATED, SIMULATED, Part, Parts, Role
-from afspm.experiment.wiring import Net, Wires
+from afspm.experiment.wiring import Net, Slot, Wires
 from afspm.logic.limits import Limits
 from afspm.model import ProblemNames
 
@@ -58,6 +58,8 @@ class Resolved:
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     wires: dict[str, Wires] = field(default_factory=dict)
     net: Net = field(default_factory=Net)
+    listening: list[Slot] = field(default_factory=list)
+    """Where components listen by settings of their own, beside the wiring."""
     limits: Limits = field(default_factory=Limits)
     caching: Caching = field(default_factory=Caching)
 
@@ -162,6 +164,8 @@ def _resolve_part(part: Part, resolved: Resolved) -> None:
     resolved.settings[name] = settings.check(component, part.settings, (name,), document, findings, given)
     if findings.errors > errors:
         resolved.refused.add(name)
+    for setting, address, keyed in settings.listening(component, resolved.settings[name]):
+        resolved.listening.append(Slot(name, setting, address, setting, document.place(name, setting), keyed))
 
 
 def _declared(component: type, part: Part) -> Declared:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import typing
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, is_dataclass
 from datetime import date, datetime
 from enum import Enum
@@ -15,6 +15,7 @@ from typing import Any
 import pydantic
 
 from afspm import units
+from afspm.addresses import Listens
 from afspm.errors import UnitError
 from afspm.experiment import classes
 from afspm.experiment.document import Document
@@ -78,6 +79,15 @@ def default_of(component: type, name: str) -> Any:
     """The default of a setting; None where it has none."""
     parameter = _parameters(component).get(name)
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
+
+
+def listening(component: type, settings: Mapping[str, Any]) -> Iterator[tuple[str, str, bool]]:
+    """(setting, address, whether keys guard it) of each place at which the component will listen by its settings."""
+    everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
+    for name, annotation in _annotations(component).items():
+        for mark in getattr(annotation, "__metadata__", ()):
+            if isinstance(mark, Listens) and (address := mark.address(everything.get(name), everything)):
+                yield name, address, mark.keyed
 
 
 def jsonable(value: Any, folder: Path) -> Any:

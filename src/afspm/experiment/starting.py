@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from afspm.addresses import connectable, reaches
 from afspm.errors import ConfigError
 from afspm.experiment import limits, wiring
 from afspm.experiment.experiment import Start
@@ -109,7 +110,7 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
         return None if key is None else addresses.get(key, key)
 
     def met(key: str) -> str:
-        return wiring.connectable(addresses.get(key, key))
+        return connectable(addresses.get(key, key))
 
     launch = Launch(
         name=part.name,
@@ -157,7 +158,7 @@ def asking(experiment: Experiment, names: Collection[str]) -> Launch | None:
     address = next((found for key in known if key and (found := addresses.get(key, key)) is not None), None)
     if address is None:
         return None
-    target = wiring.connectable(address)
+    target = connectable(address)
     keys = _keys(resolved, wiring.Links(), {key: found for key, found in addresses.items() if found is not None})
     if keys is not None and "folder" in keys:
         keys = {**keys, target: part.name}
@@ -169,7 +170,7 @@ def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str])
     if resolved.keys_folder is None:
         return {"insecure": "true"} if resolved.security.insecure else None
     slots = resolved.net.slots.items()
-    owners = {wiring.connectable(addresses[key]): slot.owner for key, slot in slots if key in addresses}
+    owners = {connectable(addresses[key]): slot.owner for key, slot in slots if key in addresses}
     keys = {"folder": str(resolved.keys_folder)}
     scheduler = next((name for name, role in resolved.roles.items() if role is Role.SCHEDULER), None)
     if scheduler is not None:
@@ -177,8 +178,8 @@ def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str])
     for key in (links.control, *links.subscribe):
         if key is None:
             continue
-        target = wiring.connectable(addresses.get(key, key))
-        owner = owners.get(target) or next((o for bind, o in owners.items() if wiring.reaches(target, bind)), None)
+        target = connectable(addresses.get(key, key))
+        owner = owners.get(target) or next((o for bind, o in owners.items() if reaches(target, bind)), None)
         if owner is not None:
             keys[target] = owner
     log, collector = _log(resolved)
@@ -191,7 +192,7 @@ def _log(resolved: Resolved) -> tuple[str | None, str]:
     """Where a component collects the log lines of all others, and its name."""
     for name, component in resolved.classes.items():
         if getattr(component, "collects_logs", False) is True:
-            return wiring.connectable(str(resolved.settings[name]["address"])), name
+            return connectable(str(resolved.settings[name]["address"])), name
     return None, ""
 
 

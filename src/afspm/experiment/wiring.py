@@ -7,17 +7,15 @@ listen to what it publishes.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from afspm.addresses import hint_on, is_address
 from afspm.experiment.classes import Declared
 from afspm.experiment.findings import Findings, Place
 from afspm.experiment.known import WIRE_KEYS, Wire
 from afspm.experiment.parts import Part, Role, wire_of
-
-_ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+)")
 
 
 @dataclass(frozen=True)
@@ -29,6 +27,8 @@ class Slot:
     address: str | None
     key: str
     place: Place
+    keyed: bool = True
+    """Whether it is open to nobody without a key, where the experiment has keys."""
 
 
 @dataclass
@@ -76,12 +76,13 @@ def read_wires(part: Part, placed: Callable[..., Place], findings: Findings) -> 
         if key not in part.own:
             continue
         value, place = part.own[key], placed(part.name, key)
-        if isinstance(value, str) and _ADDRESS.fullmatch(value):
+        if isinstance(value, str) and is_address(value):
             _apply_address(wires, key, value)
         elif wire_of(value) in kinds:
             _apply_table(wires, value)
         elif isinstance(value, str):
-            findings.error(f"[{part.name}] {key} = {value!r} is neither an address nor one of the tables above", place)
+            what = f"[{part.name}] {key} = {value!r} is neither an address nor one of the tables above"
+            findings.error(what, place, hint_on(value))
         elif wire_of(value) is not None:
             findings.error(f"[{part.name}] {key} is a {_kind(value)}, not a {kinds[0].value}", place)
         else:
@@ -146,27 +147,6 @@ def _apply_timeouts(wires: Wires, table: Mapping[str, Any]) -> None:
         wires.request_timeout_s = timeout_ms / 1000
     if isinstance(retries, int):
         wires.request_retries = retries
-
-
-def is_address(text: str) -> bool:
-    """Whether this is an address as ZeroMQ writes it."""
-    return _ADDRESS.fullmatch(text) is not None
-
-
-def reaches(connect: str, bind: str) -> bool:
-    """Whether a connection to one address ends at what is bound at the other (a wildcard means any host)."""
-    if connect == bind:
-        return True
-    a, b = _ADDRESS.fullmatch(connect), _ADDRESS.fullmatch(bind)
-    if not a or not b or a[3] is None or a[3] != b[3]:
-        return False
-    here = {"127.0.0.1", "localhost", "[::1]"}
-    return b[2] in {"*", "0.0.0.0", "[::]"} or {a[2], b[2]} <= here
-
-
-def connectable(bind: str) -> str:
-    """How a peer on the same computer connects to what is bound: a wildcard is no address to connect to."""
-    return re.sub(r"^tcp://(\*|0\.0\.0\.0)(?=:)", "tcp://127.0.0.1", bind)
 
 
 def connect(

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from afspm import wire
+from afspm.addresses import is_address
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
-from afspm.experiment.wiring import is_address
 from afspm.model import Frame, Packet
 from afspm.record.facts import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
 from afspm.record.going_on import locked

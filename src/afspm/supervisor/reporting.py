@@ -8,9 +8,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
+from afspm.addresses import connectable
 from afspm.clock import Clock
 from afspm.experiment import Experiment, Role, Start
-from afspm.experiment.wiring import connectable
 from afspm.logic.telling import SUPERVISOR
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.reporter import Reporter

@@ -9,10 +9,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import TextIO
 
+from afspm.addresses import connectable
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
-from afspm.experiment.wiring import connectable
 from afspm.logic.telling import LOGGED_AS
 from afspm.record import ahead
 from afspm.record.facts import ENDED, STATE_DIR, known_facts

@@ -17,6 +17,7 @@ from __future__ import annotations
 from enum import Enum
 from pathlib import Path
 
+from afspm.addresses import ListeningAddress
 from afspm.microscopes.microscope import Microscope
 from afspm.runtime.component import Component
 from afspm.units import Angle, Duration, Length, Voltage
@@ -43,6 +44,10 @@ class Corrector(Component):
     solves = ("tip-shape-changed",)
 
     def __init__(self, voltage: Voltage = 3.0): ...
+
+
+class Listener(Component):
+    def __init__(self, at: ListeningAddress = "tcp://127.0.0.1:9010"): ...
 
 
 class Peaks(Component):

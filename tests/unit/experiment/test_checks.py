@@ -13,6 +13,8 @@ from .conftest import FRAME, Write, errors, line_of, only_error
 CLASSIFIER = '[watch]\ncomponent = true\nclass = "parts.Classifier"\n'
 CORRECTOR = '[repair]\ncomponent = true\nclass = "parts.Corrector"\n'
 PEAKS = '[peaks]\ncomponent = true\nclass = "parts.Peaks"\n'
+LOG = '[log]\ncomponent = true\nclass = "LogCollector"\n'
+PAGE = '[page]\ncomponent = true\nclass = "Dashboard"\n'
 CHOOSER = '[choose]\ncomponent = true\nclass = "parts.Chooser"\n'
 ANYTHING = '[any]\ncomponent = true\nclass = "parts.Anything"\n'
 REAL = FRAME.replace("simulated = true", "")
@@ -104,6 +106,40 @@ BROKEN = {
     "a host that only begins like this computer": (
         PEAKS + 'publisher = "tcp://localhost.example.org:9000"\n', FRAME, "without keys"
     ),
+    "a publisher where the log is collected": (
+        LOG + 'address = "tcp://127.0.0.1:9000"\n' + PEAKS + 'publisher = "tcp://localhost:9000"\n',
+        FRAME,
+        "[log] and [peaks] both bind tcp://127.0.0.1:9000 (address, publish)",
+    ),
+    "a page where the log is collected": (
+        PAGE + "port = 9000\n" + LOG + 'address = "tcp://127.0.0.1:9000"\n', FRAME, "(address, port)"
+    ),
+    "a page at all addresses where somebody publishes": (
+        PAGE + 'host = "0.0.0.0"\nport = 9000\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9000"\n', FRAME, "both bind"
+    ),
+    "an emulated controller where somebody publishes": (
+        '[controller]\ncomponent = true\nclass = "AsylumEmulator"\nport = 9000\n'
+        + PEAKS + 'publisher = "tcp://127.0.0.1:9000"\n',
+        FRAME,
+        "both bind",
+    ),
+    "a component of one's own where somebody publishes": (
+        '[mine]\ncomponent = true\nclass = "parts.Listener"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9010"\n',
+        FRAME,
+        "[mine] and [peaks] both bind tcp://127.0.0.1:9010 (at, publish)",
+    ),
+    "a log that others on the network can send to": (
+        LOG + 'address = "tcp://192.168.1.5:9010"\n', FRAME, "[log] binds tcp://192.168.1.5:9010, which other"
+    ),
+    "a log at no address": (LOG + 'address = "localhost"\n', FRAME, "this is not an address"),
+    "a log at no port": (LOG + 'address = "tcp://127.0.0.1:99999"\n', FRAME, "this is not an address"),
+    "a page at no port": (PAGE + "port = 99999\n", FRAME, "this is not a port"),
+    "no port": (PEAKS + 'publisher = "tcp://127.0.0.1:99999"\n', FRAME, "neither an address"),
+    "no port in an intermediary": (
+        ANYTHING + 'subscriber = "s"\n[s]\nclass = "Subscriber"\nsub_url = "tcp://localhost:65536"\n',
+        FRAME,
+        "is not an address",
+    ),
     "nobody binds": (ANYTHING + 'subscriber = "tcp://127.0.0.1:9009"\n', FRAME, "which nobody binds"),
     "not an address": (
         ANYTHING + 'subscriber = "s"\n[s]\nclass = "Subscriber"\nsub_url = "localhost:3"\n', FRAME, "is not an address"
@@ -144,6 +180,24 @@ def test_time_may_be_made_faster_where_the_controller_is_an_emulated_one(write: 
     emulated = '[controller]\ncomponent = true\nclass = "parts.Emulated"\nport = 6501\n'
     assert errors(write("[clock]\nspeed = 60\n" + emulated, frame=REAL)) == []
     assert write("[clock]\nspeed = 60\n" + emulated, frame=REAL).resolved.simulated
+
+
+def test_what_listens_at_addresses_of_its_own_is_no_error(write: Write) -> None:
+    """A page keeps strangers out by itself, and any port that is free is nobody else's."""
+    listening = PAGE + 'host = "0.0.0.0"\nport = 9000\n' + PAGE.replace("page", "second") + "port = 0\n"
+    listening += LOG + 'address = "tcp://127.0.0.1:9001"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9002"\n'
+    assert errors(write(listening)) == []
+
+
+@pytest.mark.parametrize("secure", ['[security]\nkeys = "."\n', "[security]\ninsecure = true\n"])
+def test_a_log_may_be_collected_from_other_computers_with_keys_or_by_word(write: Write, secure: str) -> None:
+    assert errors(write(LOG + 'address = "tcp://192.168.1.5:9010"\n' + secure)) == []
+
+
+def test_of_a_port_that_is_too_high_it_is_said(write: Write) -> None:
+    assert "65535" in only_error(write(PEAKS + 'publisher = "tcp://127.0.0.1:99999"\n')).hint
+    assert "65535" in only_error(write(LOG + 'address = "tcp://127.0.0.1:99999"\n')).hint
+    assert errors(write(PEAKS + 'publisher = "tcp://127.0.0.1:65535"\n')) == []
 
 
 def test_lines_of_running_scans_are_there_for_those_who_asked_the_microscope_for_them(write: Write) -> None:

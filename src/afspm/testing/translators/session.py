@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
+from afspm.addresses import connectable
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.experiment.parts import EMULATED
-from afspm.experiment.wiring import connectable
 from afspm.logic.telling import LOGGED_AS
 from afspm.model import Frame
 from afspm.record.facts import STATE_DIR
