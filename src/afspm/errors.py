@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 
 class AfspmError(Exception):
@@ -31,6 +32,56 @@ class ConfigError(AfspmError):
     """The experiment file, or a setting of a component, is wrong."""
 
     code = "config"
+
+
+class ConfigErrors(ConfigError):
+    """Several settings are wrong.
+
+    Attributes:
+        errors: one for each, in the order in which they were found.
+    """
+
+    def __init__(self, errors: Sequence[ConfigError]) -> None:
+        super().__init__("; ".join(map(str, errors)))
+        self.errors = tuple(errors)
+
+
+class Gathered:
+    """Errors that are raised together at the end, so that whoever mends one hears of all::
+
+        errors = Gathered()
+        for name in names:
+            with errors:
+                check(name)
+        errors.raise_all()
+
+    A ConfigError ends its block and not what comes after it.
+    """
+
+    def __init__(self) -> None:
+        self.errors: list[ConfigError] = []
+
+    def add(self, error: ConfigError) -> None:
+        self.errors += each(error)
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        if isinstance(error, ConfigError):
+            self.add(error)
+            return True
+        return False
+
+    def raise_all(self) -> None:
+        """Raises ConfigError, the only one as it is, if there are any."""
+        if self.errors:
+            raise self.errors[0] if len(self.errors) == 1 else ConfigErrors(self.errors)
+
+
+def each(error: AfspmError) -> tuple[Any, ...]:
+    """The errors that one stands for: those that it gathers, or itself."""
+    return error.errors if isinstance(error, ConfigErrors) else (error,)
 
 
 class InvalidValue(AfspmError, ValueError):

@@ -15,7 +15,7 @@ from afspm.addresses import Listens
 from afspm.clock import Clock, ExperimentClock
 from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
-from afspm.errors import AfspmError
+from afspm.errors import AfspmError, Gathered
 from afspm.exit_codes import ExitCode
 from afspm.transport.launching import open_port
 from afspm.transport.port import Killed
@@ -103,8 +103,12 @@ class Emulator(ABC):
         """
         from afspm.simulation import World
 
-        World.from_settings(self._world_settings, self.seed, 0.0)
-        Faults(self._faults, self.fault_kinds, 0.0)
+        errors = Gathered()
+        with errors:
+            World.from_settings(self._world_settings, self.seed, 0.0)
+        with errors:
+            Faults(self._faults, self.fault_kinds, 0.0)
+        errors.raise_all()
 
     # -- what one writes
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from afspm.errors import AfspmError, InvalidValue
+from afspm.errors import AfspmError, InvalidValue, each
 from afspm.experiment import (
     abilities,
     caching,
@@ -30,6 +31,7 @@ from afspm.experiment.wiring import Net, Slot, Wires
 from afspm.logic.limits import Limits
 from afspm.model import ProblemNames
 
+_STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")
 """Arguments of a scheduler's constructor that come from sections of these names."""
 
@@ -49,8 +51,8 @@ class Resolved:
     notify: sections.Notify
     problems: ProblemNames
     named_problems: dict[str, int]
-    refused: set[str] = field(default_factory=set)
-    """Those whose settings are wrong."""
+    refused: dict[str, frozenset[str]] = field(default_factory=dict)
+    """Of those whose settings are wrong: which of them."""
     classes: dict[str, type] = field(default_factory=dict)
     class_paths: dict[str, str] = field(default_factory=dict)
     roles: dict[str, Role] = field(default_factory=dict)
@@ -161,9 +163,10 @@ def _resolve_part(part: Part, resolved: Resolved) -> None:
     resolved.declared[name] = _declared(component, part)
     errors = findings.errors
     given = FROM_SECTIONS if role is Role.SCHEDULER else ()
-    resolved.settings[name] = settings.check(component, part.settings, (name,), document, findings, given)
+    wrong: set[str] = set()
+    resolved.settings[name] = settings.check(component, part.settings, (name,), document, findings, given, wrong)
     if findings.errors > errors:
-        resolved.refused.add(name)
+        resolved.refused[name] = frozenset(wrong)
     for setting, address, keyed in settings.listening(component, resolved.settings[name]):
         resolved.listening.append(Slot(name, setting, address, setting, document.place(name, setting), keyed))
 
@@ -202,8 +205,40 @@ def _resolve_sections(resolved: Resolved) -> None:
             place = document.place(part.name, "actions", action)
             findings.error(f"[{part.name}] actions: the limits would always refuse {reason}", place)
     for part in parts.components:
-        if part.name in resolved.classes and part.name not in resolved.refused:
+        if part.name in resolved.refused:
+            _look_inside(part.name, resolved)
+        elif part.name in resolved.classes:
             _resolve_plan(part.name, resolved)
+
+
+def _look_inside(name: str, resolved: Resolved) -> None:
+    """What is wrong within the tables of a component some of whose other settings are wrong already.
+
+    Only that counts which lies within a setting of the file that is right as far as was seen: what does not fit
+    together may do so when the others are mended.
+    """
+    sound = resolved.settings[name].keys() - resolved.refused[name]
+    try:
+        planned.plan_of(resolved.classes[name], resolved.settings[name])
+    except AfspmError as error:
+        for one in each(error):
+            inside = _inside(one)
+            if len(inside) > 1 and inside[0] in sound:
+                _report(name, one, resolved)
+    except Exception:  # made of what is wrong, it may fail in any way
+        return
+
+
+def _report(name: str, error: AfspmError, resolved: Resolved) -> None:
+    inside = _inside(error)
+    said = f"{sections.name_of((name, *inside))}{':' if inside else ''} {error.what}"
+    resolved.findings.error(said, resolved.document.place(name, *inside), error.hint)
+
+
+def _inside(error: AfspmError) -> tuple[str | int, ...]:
+    """Where in a component's table an error says that it is: "panel[1].set" as ("panel", 1, "set")."""
+    where = error.where.removeprefix("simulation.").removeprefix("the experiment file, ")
+    return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 
 
 def _resolve_plan(name: str, resolved: Resolved) -> None:
@@ -212,9 +247,8 @@ def _resolve_plan(name: str, resolved: Resolved) -> None:
     try:
         plan = planned.plan_of(resolved.classes[name], resolved.settings[name])
     except AfspmError as error:
-        inside = error.where.removeprefix("simulation.").split(".") if error.where else []
-        said = f"{error.where}: {error.what}" if inside else error.what
-        resolved.findings.error(f"[{name}] {said}", resolved.document.place(name, *inside), error.hint)
+        for one in each(error):
+            _report(name, one, resolved)
         return
     except Exception as error:
         resolved.findings.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", place)

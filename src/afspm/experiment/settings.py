@@ -34,11 +34,13 @@ def check(
     document: Document,
     findings: Findings,
     given: Collection[str] = (),
+    wrong: set[str] | None = None,
 ) -> dict[str, Any]:
     """The settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
 
     Args:
         given: parameters that are not for the table to set.
+        wrong: those whose values are wrong are added to it.
     """
     everything = _parameters(component)
     parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME and name not in given}
@@ -55,7 +57,10 @@ def check(
                     document.place(*path, name),
                     f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.units",
                 )
+            errors = findings.errors
             checked[name] = _value(annotation, value, (*path, name), document, findings)
+            if wrong is not None and findings.errors > errors:
+                wrong.add(name)
         elif takes_any:
             checked[name] = jsonable(value, document.folder_of(*path, name))
         else:

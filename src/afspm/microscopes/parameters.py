@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from afspm import units
-from afspm.errors import AfspmError, ConfigError, Refused, UnitError
+from afspm.errors import AfspmError, ConfigError, Gathered, Refused, UnitError
 from afspm.model import ControlResponse, names
 
 Value = bool | int | float | str
@@ -229,12 +229,15 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             translated: the names of rows that code translates: how the controller has them is not a row's to say.
 
         Raises:
-            ConfigError: an attribute is unknown or has a value that it can't have.
+            ConfigError: an attribute is unknown or has a value that it can't have; those of all rows at once.
         """
         table = dict(self._rows)
+        errors = Gathered()
         for name, given in rows.items():
             known = table.get(name, ParameterSpec(name, vendor=name, unit=names.BASE_PARAMETERS.get(name) or ""))
-            table[name] = _row(known, given, where, translated=name in translated)
+            with errors:
+                table[name] = _row(known, given, where, translated=name in translated)
+        errors.raise_all()
         return ParameterTable(table)
 
     def without(self, names_: Collection[str]) -> ParameterTable:
@@ -258,21 +261,26 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         """Values as the experiment file has them, in SI: "2 um/s", or plain numbers in the row's unit.
 
         Raises:
-            ConfigError: a name or a value can't be.
+            ConfigError: a name or a value can't be; all of them at once.
         """
         values: dict[str, Value] = {}
-        try:
-            for name, value in given.items():
-                spec = self.find(name)
-                if isinstance(value, str) and spec.type in ("float", "int"):
-                    number, unit = units.parse_quantity(value)
-                    value = spec.from_unit(number, unit or spec.unit)
-                elif not isinstance(value, bool | str):
-                    value = spec.from_unit(value, spec.unit)
-                values[name] = spec.checked(value)
-        except (AfspmError, TypeError) as error:
-            raise ConfigError(str(error), where=where) from error
+        errors = Gathered()
+        for name, value in given.items():
+            try:
+                values[name] = self._written(name, value)
+            except (AfspmError, TypeError) as error:
+                errors.add(ConfigError(str(error), where=f"{where}.{name}"))
+        errors.raise_all()
         return values
+
+    def _written(self, name: str, value: Any) -> Value:
+        spec = self.find(name)
+        if isinstance(value, str) and spec.type in ("float", "int"):
+            number, unit = units.parse_quantity(value)
+            value = spec.from_unit(number, unit or spec.unit)
+        elif not isinstance(value, bool | str):
+            value = spec.from_unit(value, spec.unit)
+        return spec.checked(value)
 
     def __getitem__(self, name: str) -> ParameterSpec:
         return self._rows[name]
@@ -292,15 +300,17 @@ def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translat
     at = f"{where}, parameters.{known.name}"
     if not isinstance(given, Mapping):
         raise ConfigError(f"a table is wanted, not {given!r}", where=at)
+    errors = Gathered()
     for key in given:
         if key not in _ATTRIBUTES:
             near = difflib.get_close_matches(key, _ATTRIBUTES, n=1)
             hint = f"did you mean {near[0]!r}?" if near else ""
-            raise ConfigError(f"unknown attribute {key!r}", where=at, hint=hint)
+            errors.add(ConfigError(f"unknown attribute {key!r}", where=at, hint=hint))
         if translated and key in _OF_THE_CONTROLLER:
             hint = "a Microscope class of your own, made from this one, can translate it otherwise"
             told = f"{key}: code translates this parameter for this microscope, and would not look at that"
-            raise ConfigError(told, where=at, hint=hint)
+            errors.add(ConfigError(told, where=at, hint=hint))
+    errors.raise_all()
     values = dict(given)
     for key in ("vendor", "unit", "type"):
         if not isinstance(values.get(key, ""), str):

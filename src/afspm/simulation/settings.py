@@ -13,7 +13,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-from afspm.errors import ConfigError
+from afspm.errors import ConfigError, Gathered, each
 
 T = TypeVar("T")
 
@@ -23,25 +23,34 @@ def build(cls: type[T], settings: object, where: str) -> T:
 
     Raises:
         ConfigError: an unknown key (the nearest name is offered), a value of the wrong type, or one that
-            the dataclass itself refuses.
+            the dataclass itself refuses; all of them at once (`ConfigErrors`) where there are several.
     """
     if not isinstance(settings, Mapping):
         raise ConfigError(f"expected a table, got {settings!r}", where=where)
     hints = typing.get_type_hints(cls)
     names = _names(cls)
-    unknown = [key for key in settings if key not in names]
-    if unknown:
-        raise ConfigError(f"no setting named {unknown[0]!r}", where=where, hint=nearest(str(unknown[0]), names))
-    values = {key: _convert(hints[key], value, f"{where}.{key}") for key, value in settings.items()}
+    values: dict[str, object] = {}
+    errors = Gathered()
+    for key, value in settings.items():
+        at = f"{where}.{key}"
+        if key not in names:
+            errors.add(ConfigError(f"no setting named {key!r}", where=at, hint=nearest(str(key), names)))
+            continue
+        with errors:
+            values[key] = _convert(hints[key], value, at)
+    known = not errors.errors
     try:
-        return cls(**values)
+        made = cls(**values)
     except ConfigError as error:
-        raise ConfigError(
-            error.what, where=f"{where}.{error.where}" if error.where else where, hint=error.hint
-        ) from None
+        for one in each(error):
+            if known or one.where in values:  # else it may be about what was left out above
+                errors.add(ConfigError(one.what, where=f"{where}.{one.where}" if one.where else where, hint=one.hint))
     except TypeError:
-        missing = [name for name in names if name not in values and _is_required(cls, name)]
-        raise ConfigError(f"missing: {', '.join(missing)}", where=where) from None
+        if known:
+            missing = [name for name in names if name not in values and _is_required(cls, name)]
+            errors.add(ConfigError(f"missing: {', '.join(missing)}", where=where))
+    errors.raise_all()
+    return made
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
@@ -62,8 +71,9 @@ def one_of(value: str, choices: Iterable[str], where: str) -> str:
 def check(settings: object, *, above_zero: str = "", from_zero: str = "", fraction: str = "") -> None:
     """Checks the named attributes (separated by spaces) of a dataclass in its `__post_init__`.
 
-    A fraction lies in [0, 1]. Raises ConfigError with the attribute as `where`.
+    A fraction lies in [0, 1]. Raises ConfigError with the attribute as `where`, for all of them at once.
     """
+    errors = Gathered()
     rules: tuple[tuple[str, str, Callable[[float], bool]], ...] = (
         (above_zero, "above zero", lambda value: value > 0),
         (from_zero, "zero or more", lambda value: value >= 0),
@@ -73,7 +83,8 @@ def check(settings: object, *, above_zero: str = "", from_zero: str = "", fracti
         for name in names.split():
             value = getattr(settings, name)
             if not holds(value):
-                raise ConfigError(f"{value!r} is not {wanted}", where=name)
+                errors.add(ConfigError(f"{value!r} is not {wanted}", where=name))
+    errors.raise_all()
 
 
 def _names(cls: Any) -> list[str]:
@@ -91,6 +102,8 @@ def _convert(hint: Any, value: object, where: str) -> object:
         if value is None and type(None) in arguments:
             return None
         return _convert(next(a for a in arguments if a is not type(None)), value, where)
+    if origin is dict:
+        hint = dict  # of anything
     if origin is tuple:
         return _sequence(arguments, value, where)
     if dataclasses.is_dataclass(hint):
@@ -112,6 +125,13 @@ def _sequence(arguments: tuple[Any, ...], value: object, where: str) -> tuple[ob
         arguments = (arguments[0],) * len(value)
     if len(value) != len(arguments):
         raise ConfigError(f"expected {len(arguments)} values, got {len(value)}", where=where)
-    return tuple(
-        _convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, value, strict=True))
-    )
+    return tuple(_gathered(zip(arguments, value, strict=True), where))
+
+
+def _gathered(pairs: Iterable[tuple[Any, object]], where: str) -> list[object]:
+    errors, found = Gathered(), []
+    for i, (hint, item) in enumerate(pairs):
+        with errors:
+            found.append(_convert(hint, item, f"{where}[{i}]"))
+    errors.raise_all()
+    return found

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from afspm.errors import ConfigError
+from afspm.errors import ConfigError, Gathered
 from afspm.simulation import spectra
 from afspm.simulation.drift import DriftSettings
 from afspm.simulation.feedback import FeedbackSettings
@@ -14,6 +14,7 @@ from afspm.simulation.noise import NoiseSettings
 from afspm.simulation.scanning import ScannerSettings
 from afspm.simulation.settings import build, nearest
 from afspm.simulation.signals import SignalSettings
+from afspm.simulation.surfaces import surface_from
 from afspm.simulation.tip import TipChangeSettings, TipSettings
 
 # What suits a sample better than the general defaults; the user's settings go on top.
@@ -53,16 +54,23 @@ def read_settings(settings: Mapping[str, Any]) -> tuple[object, WorldSettings]:
     """The surface's table and the rest, from one table of all.
 
     Raises:
-        ConfigError: unknown names or values without sense.
+        ConfigError: unknown names or values without sense, of all tables at once; FileError: the surface's file.
     """
     tables = dict(settings)
     names = ["surface", *WorldSettings.__dataclass_fields__]
-    for name in tables:
-        if name not in names:
-            raise ConfigError(f"no setting named {name!r}", where="simulation", hint=nearest(name, names))
+    errors = Gathered()
+    for name in [name for name in tables if name not in names]:
+        errors.add(ConfigError(f"no setting named {name!r}", where=f"simulation.{name}", hint=nearest(name, names)))
+        del tables[name]
     surface = tables.pop("surface", "steps")
     kind = surface.get("kind", "steps") if isinstance(surface, Mapping) else surface
     for name, fitting in _FITTING.get(str(kind), {}).items():
         own = tables.get(name, {})
         tables[name] = {**fitting, **own} if isinstance(own, Mapping) else own
-    return surface, build(WorldSettings, tables, "simulation")
+    with errors:
+        built = build(WorldSettings, tables, "simulation")
+    if errors.errors:
+        with errors:  # else it is made later
+            surface_from(surface)
+    errors.raise_all()
+    return surface, built

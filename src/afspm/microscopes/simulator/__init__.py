@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from afspm.errors import ConfigError, Refused
+from afspm.errors import ConfigError, Gathered, Refused
 from afspm.microscopes.microscope import Action, Microscope, action
 from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.microscopes.simulator import files
@@ -20,11 +20,15 @@ from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.simulation import World
+from afspm.simulation.feedback import FeedbackSettings
+from afspm.simulation.settings import build
 from afspm.simulation.world_settings import WorldSettings, read_settings
 from afspm.units import Duration
 
 if TYPE_CHECKING:
     from afspm.runtime.process import Context
+
+T = TypeVar("T")
 
 _FAULT = "x-fault"
 _FAULT_PARAMETERS = ("x-fault-kind", "x-fault-count", "x-fault-duration")
@@ -121,17 +125,29 @@ class Simulator(Microscope):
         }
         self._world_settings = {name: settings for name, settings in world.items() if settings is not None}
         self._seed = seed
-        loop = World.from_settings(self._world_settings, seed, 0.0).settings.feedback
-        super().__init__(
-            parameters=self.rows({**self._world_settings, "parameters": parameters}),
-            actions=actions,
-            poll_period_s=poll_period_s,
-            result_timeout_s=result_timeout_s,
-            live_lines_s=live_lines_s,
-        )
-        if not fault_action:
-            self.table = self.table.without(_FAULT_PARAMETERS)
-        self._fault_action = fault_action
+        errors = Gathered()
+        with errors:
+            World.from_settings(self._world_settings, seed, 0.0)
+        self._faults_settings = _made(Fault, faults or [], "faults", errors)
+        self._panel = _made(PanelEvent, panel or [], "panel", errors)
+        self._fault_action, self._approach_s = fault_action, approach_s
+        loop = _loop_of(self._world_settings)
+        with errors:
+            super().__init__(
+                parameters=self.rows({**self._world_settings, "parameters": parameters}),
+                actions=actions,
+                poll_period_s=poll_period_s,
+                result_timeout_s=result_timeout_s,
+                live_lines_s=live_lines_s,
+            )
+            if not fault_action:
+                self.table = self.table.without(_FAULT_PARAMETERS)
+            if loop is not None:  # else it can't be said what a setpoint is
+                self._check_values(loop, initial or {}, errors)
+        errors.raise_all()
+
+    def _check_values(self, loop: FeedbackSettings, initial: Mapping[str, Any], errors: Gathered) -> None:
+        """Values of parameters that are set by themselves: at the start, and by a person at the panel."""
         in_force = {
             FEEDBACK_ON: loop.on,
             names.ZCTRL_PGAIN: loop.proportional_gain,
@@ -139,20 +155,19 @@ class Simulator(Microscope):
             names.ZCTRL_SETPOINT: loop.setpoint,
         }
         at_first = {name: value for name, value in {**_AT_FIRST, **in_force}.items() if name in self.table}
-        self._initial = self.table.written({**at_first, **(initial or {})}, where="initial")
-        self._faults_settings = [_made(Fault, fault, "faults") for fault in faults or []]
-        self._panel = [_made(PanelEvent, event, "panel") for event in panel or []]
-        for event in self._panel:
-            self.table.written(event.set or {}, where="panel")
+        with errors:
+            self._initial = self.table.written({**at_first, **initial}, where="initial")
+        for i, event in enumerate(self._panel):
+            with errors:
+                self.table.written(event.set or {}, where=f"panel[{i}].set")
             if event.action and event.action not in self.own_actions():
-                raise ConfigError(f"there is no action {event.action!r}", where="panel")
-        self._approach_s = approach_s
+                errors.add(ConfigError(f"there is no action {event.action!r}", where=f"panel[{i}].action"))
 
     @classmethod
     def rows(cls, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         of_world = ("surface", *WorldSettings.__dataclass_fields__)
-        _, world = read_settings({name: settings[name] for name in of_world if settings.get(name) is not None})
-        return _merged(_rows_for(world.feedback.mode), settings.get("parameters") or {})
+        loop = _loop_of({name: settings[name] for name in of_world if settings.get(name) is not None})
+        return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
     def connect(self) -> None:
         """Switch the instrument on, or find it as it was."""
@@ -300,8 +315,18 @@ def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any
     return merged
 
 
-def _made(kind: Any, table: Mapping[str, Any], where: str) -> Any:
+def _loop_of(world_settings: Mapping[str, Any]) -> FeedbackSettings | None:
+    """The feedback at the start, whatever is wrong with the rest of the world; None: it is itself."""
+    of_it = {name: world_settings[name] for name in ("surface", "feedback") if name in world_settings}
     try:
-        return kind(**table)
-    except TypeError as error:
-        raise ConfigError(f"{dict(table)} can't be: {error}", where=where) from error
+        return read_settings(of_it)[1].feedback
+    except ConfigError:
+        return None
+
+
+def _made(kind: type[T], tables: Sequence[Mapping[str, Any]], where: str, errors: Gathered) -> list[T]:
+    made = []
+    for i, table in enumerate(tables):
+        with errors:
+            made.append(build(kind, table, f"{where}[{i}]"))
+    return made

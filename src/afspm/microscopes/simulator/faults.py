@@ -31,9 +31,9 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise ConfigError(f"there is no fault {self.kind!r}", where="faults", hint=", ".join(KINDS))
+            raise ConfigError(f"there is no fault {self.kind!r}", where="kind", hint=", ".join(KINDS))
         if self.count < 1 or self.duration_s < 0:
-            raise ConfigError(f"{self} affects nothing", where="faults")
+            raise ConfigError(f"{self} affects nothing")
 
 
 class Faults:

@@ -1,0 +1,72 @@
+"""Wrong settings within the tables of the simulated microscope: each is found at once, with its line."""
+
+from __future__ import annotations
+
+from .conftest import FRAME, Write, errors, line_of
+
+WITHOUT_MICROSCOPE = FRAME[: FRAME.index("[microscope]")]
+MICROSCOPE = '[microscope]\ncomponent = true\nclass = "Simulator"\n'
+WRONG = """
+tip = { radus_m = 1e-9, half_angle_deg = -3.0 }
+noise = { whit_m = 1.0 }
+surface = { kind = "steps", stepp_m = 1.0 }
+initial = { scan-sped = "1 um/s" }
+
+[[microscope.faults]]
+kind = "slow"
+
+[[microscope.faults]]
+kind = "slwo"
+
+[[microscope.panel]]
+at_s = 4
+set = { scan-angle = "3 V" }
+"""
+EACH = [
+    ("tip.radus_m", "tip ="),
+    ("tip.half_angle_deg", "tip ="),
+    ("noise.whit_m", "noise ="),
+    ("surface.stepp_m", "surface ="),
+    ("initial.scan-sped", "initial ="),
+    ("faults[1].kind", 'kind = "slwo"'),
+    ("panel[0].set.scan-angle", "set ="),
+]
+
+
+def test_all_that_is_wrong_in_all_tables_is_found_at_once(write: Write) -> None:
+    experiment = write(MICROSCOPE + WRONG, frame=WITHOUT_MICROSCOPE)
+    found = {error.what.split(":")[0]: error.place.line for error in errors(experiment)}
+    assert found == {f"[microscope] {where}": line_of(experiment, line) for where, line in EACH}
+
+
+def test_an_error_beside_the_tables_hides_none_within_them(write: Write) -> None:
+    experiment = write(MICROSCOPE + 'seeed = 3\npoll_period_s = "3 V"\n' + WRONG, frame=WITHOUT_MICROSCOPE)
+    said = "\n".join(error.what for error in errors(experiment))
+    assert len(errors(experiment)) == len(EACH) + 2
+    for where in ("seeed", "poll_period_s", *(where for where, _ in EACH)):
+        assert where in said
+
+
+def test_what_only_follows_from_another_error_is_not_told(write: Write) -> None:
+    """A setpoint is a current or a voltage by the feedback's mode; no more is said of it than of what is wrong."""
+    wrong = 'feedback = 3\ninitial = { zctrl-setpoint = "100 pA" }\n'
+    (error,) = errors(write(MICROSCOPE + wrong, frame=WITHOUT_MICROSCOPE))
+    assert "feedback" in error.what
+    wrong = wrong.replace("3", '{ mode = "curent" }', 1)
+    (error,) = errors(write(MICROSCOPE + wrong, frame=WITHOUT_MICROSCOPE))
+    assert "feedback.mode" in error.what
+
+
+def test_a_row_of_parameters_is_looked_at_as_a_whole(write: Write) -> None:
+    wrong = "parameters = { scan-angle = { rnge = [1, 2], sgn = 3 }, scan-speed = { unit = 3 } }\n"
+    experiment = write(MICROSCOPE + wrong, frame=WITHOUT_MICROSCOPE)
+    said = [error.what for error in errors(experiment)]
+    assert len(said) == 3
+    assert all("parameters.scan-" in what for what in said)
+    assert {error.place.line for error in errors(experiment)} == {line_of(experiment, "parameters")}
+
+
+def test_what_an_emulated_controller_is_told_is_found_at_once(write: Write) -> None:
+    emulated = '[controller]\ncomponent = true\nclass = "AsylumEmulator"\ntip = { radus_m = 1.0 }\n'
+    emulated += 'noise = { whit_m = 1.0 }\nfaults = ["no-such"]\n'
+    assert len(errors(write(emulated))) == 3
