@@ -202,7 +202,7 @@ class Rig:
     def crash(self, depth_m: float, speed_m_s: float) -> str:
         """Drive the tip into the sample where the probe is, and out again: as `pulse`."""
         now_s = self._free_now_s()
-        outcome = self.world.crash(self._probe_m, speed_m_s, now_s) if self.engaged else "unchanged"
+        outcome = self.world.crash(self._probe_m, depth_m, speed_m_s, now_s) if self.engaged else "unchanged"
         self.occupy("crash", 2.0 * depth_m / speed_m_s)
         return outcome
 

@@ -83,6 +83,10 @@ class TipSettings:
 class TipChangeSettings:
     """When the tip changes, and what a repair does to it.
 
+    The chances of a repair are made up, so that one is seen to take some trying. How they grow is a simple picture and
+    no theory: a crash takes material from the apex, or leaves some there, all along its way in; a pulse moves by its
+    field what it can, most of it soon.
+
     Attributes:
         per_hour: mean number of changes an hour of scanning at a gentle setpoint.
         per_metre: the same a metre of scanned line.
@@ -91,7 +95,10 @@ class TipChangeSettings:
         schedule: pairs of seconds after the start and a condition: changes that come for certain.
         wear_m_per_m: the radius grows so much a metre scanned at a gentle setpoint.
         pulse_threshold_v: below, a pulse does nothing.
-        pulse_cures, pulse_worsens, crash_cures, crash_worsens: probabilities.
+        pulse_cures, pulse_worsens: probabilities, of a pulse far above the threshold that lasts `pulse_duration_s`.
+        pulse_duration_s: a longer one does more, but not more than two of these; a shorter one less.
+        crash_cures, crash_worsens: probabilities, of a crash `crash_depth_m` deep.
+        crash_depth_m: a crash so many times as deep does what so many of these do, until one of them does anything.
         crash_speed_m_per_s: slower crashes are that much less likely to do anything.
     """
 
@@ -106,13 +113,16 @@ class TipChangeSettings:
     pulse_threshold_v: float = 2.0
     pulse_cures: float = 0.5
     pulse_worsens: float = 0.08
+    pulse_duration_s: float = 50e-3
     crash_cures: float = 0.85
     crash_worsens: float = 0.1
+    crash_depth_m: float = 5e-9
     crash_speed_m_per_s: float = 50e-9
 
     def __post_init__(self) -> None:
         check(self, from_zero="per_hour per_metre hardness_exponent blunt_weight double_weight contaminated_weight")
-        check(self, from_zero="wear_m_per_m pulse_threshold_v", above_zero="crash_speed_m_per_s")
+        check(self, from_zero="wear_m_per_m pulse_threshold_v")
+        check(self, above_zero="pulse_duration_s crash_depth_m crash_speed_m_per_s")
         check(self, fraction="pulse_cures pulse_worsens crash_cures crash_worsens")
         for _, condition in self.schedule:
             one_of(condition, CONDITIONS, "schedule")
@@ -183,6 +193,58 @@ class TipMaker:
     def _about(self, share: float, random: np.random.Generator) -> float:
         """A factor near one, scattered by that share of the spread."""
         return math.exp(share * self._s.spread * float(random.normal()))
+
+
+@dataclass(frozen=True)
+class Chances:
+    """Probabilities that a treatment cures a tip, and that it worsens it."""
+
+    cures: float
+    worsens: float
+
+    def of_times(self, times: float) -> Chances:
+        """Of so many treatments, not necessarily a whole number, of which the first that does anything is the last.
+
+        Both grow with the number; their ratio stays, and their sum is 1 at most.
+        """
+        once = min(1.0, self.cures + self.worsens)
+        if once <= 0.0:
+            return self
+        ever = 1.0 - (1.0 - once) ** times
+        cures = min(self.cures, once)
+        return Chances(ever * cures / once, ever * (once - cures) / once)
+
+    def weakened(self, share: float) -> Chances:
+        """With both smaller by a factor."""
+        return Chances(share * self.cures, share * self.worsens)
+
+
+def pulse_times(settings: TipChangeSettings, duration_s: float) -> float:
+    """As many pulses of the usual duration as one of `duration_s` is worth: from 0 to 2, 1 for the usual.
+
+    Simulated, without a source: it is the field that moves atoms of the apex, so the voltage matters most; those that
+    it can move go soon, and the longer it lasts, the fewer are left. Half of them are gone after the usual duration.
+    """
+    return 2.0 * duration_s / (duration_s + settings.pulse_duration_s)
+
+
+def crash_times(settings: TipChangeSettings, depth_m: float) -> float:
+    """As many crashes of the usual depth as one `depth_m` deep is worth.
+
+    Simulated, without a source: material is taken from the apex, or left there, all along the way in, so each further
+    stretch of the way has the chance that the one before it had.
+    """
+    return depth_m / settings.crash_depth_m
+
+
+def indented_m(tip: TipState, depth_m: float) -> float:
+    """How deep a tip gets into the sample when it is driven `depth_m` beyond the surface.
+
+    Simulated, without a source: at first the sample gives way, by as much as was asked for. The deeper, the more it is
+    the apex that gives way, and blunts; beyond some three of its radii nothing more is gained. A blunt apex is stiffer.
+    """
+    most_m = 3.0 * tip.imaging_radius_m
+    return -most_m * math.expm1(-depth_m / most_m)
 
 
 def drawn_flaw(settings: TipChangeSettings, random: np.random.Generator) -> str | None:

@@ -27,12 +27,16 @@ from afspm.simulation.scanning import Course, SimulatedScan
 from afspm.simulation.settings import build, nearest
 from afspm.simulation.surfaces import Relief, surface_from
 from afspm.simulation.tip import (
+    Chances,
     TipChange,
     TipHistory,
     TipMaker,
     TipState,
     chance_changes,
+    crash_times,
     drawn_flaw,
+    indented_m,
+    pulse_times,
 )
 from afspm.simulation.world_settings import WorldSettings, read_settings
 
@@ -174,6 +178,8 @@ class World:
     ) -> str:
         """A bias pulse: may cure or worsen the tip, and leaves a little mound.
 
+        Whether it does depends on the voltage above all, and a little on the duration (`tip.pulse_times`).
+
         Args:
             position_m: where the tip was moved to; None: where it measured last.
 
@@ -189,28 +195,39 @@ class World:
             return "unchanged"
         effect = 1.0 - math.exp(-3.0 * strength)
         random = chance.generator(self.seed, 4, call)
-        outcome = self._treat("pulse", t_s, effect * s.pulse_cures, effect * s.pulse_worsens, random)
+        chances = Chances(s.pulse_cures, s.pulse_worsens).weakened(effect).of_times(pulse_times(s, duration_s))
+        outcome = self._treat("pulse", t_s, chances, random)
         if outcome != "unchanged":
             radius = self._tips.at(t_s).imaging_radius_m * random.uniform(0.5, 1.0)
             self._mark("pulse", self._at_m, t_s, -0.3 * radius, radius)
         return outcome
 
-    def crash(self, position_m: tuple[float, float], speed_m_s: float, t_s: float) -> str:
+    def crash(self, position_m: tuple[float, float], depth_m: float, speed_m_s: float, t_s: float) -> str:
         """Drives the tip into the sample: may cure or worsen it, and leaves a crater that later scans see.
+
+        The deeper, the more likely it does anything (`tip.crash_times`), and the deeper is the crater
+        (`tip.indented_m`); of that a part springs back. Simulated: material is pushed aside over three times the radius
+        of contact, about as far as plastic flow reaches around an indenter.
+
+        Args:
+            depth_m: beyond the surface.
 
         Returns:
             "cured", "worsened" or "unchanged".
         """
-        if not (all(map(math.isfinite, position_m)) and math.isfinite(speed_m_s) and speed_m_s > 0):
-            raise InvalidValue(f"a crash at {position_m} with {speed_m_s} m/s", hint="finite, and faster than nothing")
+        if not (all(map(math.isfinite, (*position_m, depth_m, speed_m_s))) and min(depth_m, speed_m_s) > 0):
+            what = f"a crash at {position_m}, {depth_m} m deep with {speed_m_s} m/s"
+            raise InvalidValue(what, hint="finite, deeper and faster than nothing")
         call = self._begin(t_s, position_m)
         s = self.settings.tip_changes
         effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
         random = chance.generator(self.seed, 5, call)
-        radius = 3.0 * self._tips.at(t_s).imaging_radius_m * random.uniform(0.8, 1.4)
-        outcome = self._treat("crash", t_s, effect * s.crash_cures, effect * s.crash_worsens, random)
-        depth = radius * random.uniform(0.3, 0.6) * max(effect, 0.1)
-        self._mark("crash", position_m, t_s, depth, radius)
+        tip = self._tips.at(t_s)
+        into_m = indented_m(tip, depth_m)
+        radius = 3.0 * math.sqrt(2.0 * tip.imaging_radius_m * into_m) * random.uniform(0.8, 1.4)
+        chances = Chances(s.crash_cures, s.crash_worsens).of_times(crash_times(s, depth_m)).weakened(effect)
+        outcome = self._treat("crash", t_s, chances, random)
+        self._mark("crash", position_m, t_s, into_m * random.uniform(0.6, 0.9), radius)
         self._held_z_m = None
         return outcome
 
@@ -345,14 +362,14 @@ class World:
             tip = replace(self.tip, radius_m=self.tip.radius_m + worn)
             self._tips.add(TipChange(course.end_s, "wear", tip))
 
-    def _treat(self, cause: str, t_s: float, cures: float, worsens: float, random: np.random.Generator) -> str:
+    def _treat(self, cause: str, t_s: float, chances: Chances, random: np.random.Generator) -> str:
         draw = random.random()
         tip = self._tips.at(t_s)
-        if draw < cures:
+        if draw < chances.cures:
             self._tips.add(TipChange(t_s, cause, self._maker.changed(tip, "sharp", random)))
             return "cured"
         flaw = drawn_flaw(self.settings.tip_changes, random)
-        if draw < cures + worsens and flaw is not None:
+        if draw < chances.cures + chances.worsens and flaw is not None:
             self._tips.add(TipChange(t_s, cause, self._maker.changed(tip, flaw, random)))
             return "worsened"
         return "unchanged"

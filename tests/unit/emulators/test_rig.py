@@ -161,7 +161,11 @@ def test_pulses_and_crashes_happen_to_the_world(rig: Rig, clock: Any) -> None:
     rig.crash(depth_m=1e-7, speed_m_s=1e-6)
     assert rig.next_change_s(1001.0) == pytest.approx(1001.2)
     clock.t_s = 1002.0
-    assert [mark["kind"] for mark in rig.world.truth(1002.0)["marks"]][-1] == "crash"
+    deep = rig.world.truth(1002.0)["marks"][-1]
+    rig.crash(depth_m=1e-9, speed_m_s=1e-6)
+    shallow = rig.world.truth(1003.0)["marks"][-1]
+    assert [mark["kind"] for mark in (deep, shallow)] == ["crash", "crash"]
+    assert shallow["depth_m"] < 1e-9 < deep["depth_m"]
 
 
 def test_a_picture_drawn_in_the_background_is_the_same_and_wakes_the_emulator(clock: Any) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
+from afspm.simulation.tip import Chances, TipChangeSettings, crash_times, pulse_times
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 SHAPE = (48, 48)
@@ -40,7 +43,7 @@ def test_a_restored_world_goes_on_as_if_nothing_had_happened() -> None:
     settings = {"tip_changes": {"per_hour": 60.0, "schedule": [[70.0, "double"], [150.0, "contaminated"]]}}
     w = world(**settings)
     scan_height(w, 0.0)
-    w.crash((2e-7, 1e-7), 1e-7, 60.0)
+    w.crash((2e-7, 1e-7), 10e-9, 1e-7, 60.0)
     saved = json.loads(json.dumps(w.state()))
     expected = [scan_height(w, 65.0), scan_height(w, 130.0)]
     again = world(**settings)
@@ -134,7 +137,7 @@ def test_each_flaw_of_the_tip_shows() -> None:
 def test_a_crash_leaves_a_crater_that_later_scans_see_and_earlier_ones_did_not() -> None:
     w = world(surface="flat", drift={"velocity_m_per_s": [1e-9, 0.0, 0.0]}, tip_changes={"crash_cures": 1.0})
     assert np.ptp(scan_height(w, 0.0)) < 3e-9
-    w.crash((1.5e-7, -2e-7), 1e-7, 100.0)
+    w.crash((1.5e-7, -2e-7), 20e-9, 1e-7, 100.0)
     later = scan_height(w, 200.0)
     row, column = np.unravel_index(later.argmin(), later.shape)
     x, y = REGION.pixels_m(SHAPE)
@@ -159,10 +162,64 @@ def test_pulses_and_crashes_cure_and_worsen_as_often_as_told() -> None:
     assert outcomes["worsened"] == pytest.approx(60, abs=25)
     w = world(surface="flat", tip={"condition": "blunt"}, tip_changes=settings)
     assert w.pulse(0.5, 0.05, 1.0) == "unchanged"  # below the threshold
-    assert w.crash((0.0, 0.0), 1e-7, 2.0) == "cured"
+    assert w.crash((0.0, 0.0), 5e-9, 1e-7, 2.0) == "cured"
     assert w.tip.is_sharp
-    slow = [world(seed, surface="flat", tip_changes=settings).crash((0.0, 0.0), 5e-9, 1.0) for seed in range(100)]
+    slow = [world(seed, surface="flat", tip_changes=settings).crash((0.0, 0.0), 5e-9, 5e-9, 1.0) for seed in range(100)]
     assert slow.count("cured") == pytest.approx(10, abs=9)
+
+
+def test_a_deeper_crash_leaves_a_deeper_crater_as_far_as_the_tip_holds_out() -> None:
+    def crater_m(depth_m: float, condition: str = "sharp") -> float:
+        w = world(surface="flat", tip={"condition": condition})
+        w.crash((0.0, 0.0), depth_m, 50e-9, 1.0)
+        (mark,) = w.truth(2.0)["marks"]
+        assert float(w.surface_m(0.0, 0.0)[()]) < -0.5 * mark["depth_m"]
+        return float(mark["depth_m"])
+
+    asked_m = [1e-9, 2e-9, 5e-9, 10e-9, 20e-9, 50e-9, 1e-6]
+    craters_m = [crater_m(depth_m) for depth_m in asked_m]
+    assert craters_m == sorted(craters_m)
+    assert all(0.0 < made_m < wanted_m for made_m, wanted_m in zip(craters_m, asked_m, strict=True))
+    assert craters_m[2] > 4 * craters_m[0]  # as long as it is shallow, what was asked for decides
+    assert craters_m[-1] < 3 * 8e-9  # and in the end the apex gives way
+    assert crater_m(1e-6, "blunt") > craters_m[-1]
+
+
+def test_chances_grow_with_depth_with_duration_and_with_voltage() -> None:
+    s = TipChangeSettings()
+    crashes = [Chances(0.6, 0.2).of_times(crash_times(s, depth_m)) for depth_m in (1e-10, 1e-9, 5e-9, 20e-9, 1e-6)]
+    pulses = [Chances(0.6, 0.2).of_times(pulse_times(s, duration_s)) for duration_s in (1e-4, 0.01, 0.05, 1.0, 60.0)]
+    for grown in (crashes, pulses):
+        assert [one.cures for one in grown] == sorted(one.cures for one in grown)
+        assert [one.worsens for one in grown] == sorted(one.worsens for one in grown)
+        assert (grown[2].cures, grown[2].worsens) == pytest.approx((0.6, 0.2))  # the usual ones, as told
+        assert all(one.cures + one.worsens <= 1.0 + 1e-12 for one in grown)
+    assert crashes[-1].cures + crashes[-1].worsens == pytest.approx(1.0)
+    assert pulses[-1].cures + pulses[-1].worsens < 1.0 - 0.2**2 + 1e-12  # no more than two pulses do
+    assert Chances(0.0, 0.0).of_times(3.0) == Chances(0.0, 0.0)
+    assert Chances(1.0, 0.5).of_times(3.0) == Chances(1.0, 0.0)
+
+
+def test_deeper_crashes_and_longer_pulses_cure_more_tips() -> None:
+    settings = {"crash_cures": 0.4, "crash_worsens": 0.1, "pulse_cures": 0.3, "pulse_worsens": 0.1}
+
+    def cured(treat: Callable[[World], str]) -> int:
+        made = [world(seed, surface="flat", tip={"condition": "blunt"}, tip_changes=settings) for seed in range(200)]
+        return [treat(w) for w in made].count("cured")
+
+    by_depth = [cured(lambda w, d=d: w.crash((0.0, 0.0), d, 50e-9, 1.0)) for d in (1e-9, 5e-9, 20e-9)]
+    assert by_depth[1] == pytest.approx(80, abs=25)
+    assert by_depth[0] < 0.5 * by_depth[1] < 0.7 * by_depth[2]
+    by_duration = [cured(lambda w, t=t: w.pulse(8.0, t, 1.0)) for t in (5e-3, 50e-3, 5.0)]
+    assert by_duration[0] < by_duration[1] < by_duration[2] < 2.5 * by_duration[1]
+    by_voltage = [cured(lambda w, v=v: w.pulse(v, 50e-3, 1.0)) for v in (1.0, 2.2, 8.0)]
+    assert by_voltage[0] == 0 < by_voltage[1] < by_voltage[2]
+
+
+@pytest.mark.parametrize(("depth_m", "speed_m_s"), [(0.0, 1e-7), (-1e-9, 1e-7), (math.nan, 1e-7), (1e-9, 0.0)])
+def test_a_crash_of_no_depth_or_no_speed_is_refused(depth_m: float, speed_m_s: float) -> None:
+    with pytest.raises(InvalidValue):
+        world().crash((0.0, 0.0), depth_m, speed_m_s, 1.0)
 
 
 def test_creep_brings_the_tip_to_its_place_slowly() -> None:

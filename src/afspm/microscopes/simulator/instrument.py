@@ -241,7 +241,7 @@ class Instrument:
         values = self._si(self._kept["values"])
         position_m = (float(values[names.PROBE_POS_X]), float(values[names.PROBE_POS_Y]))
         speed_m_s, depth_m = float(values[names.CRASH_SPEED]), float(values[names.CRASH_DEPTH])
-        outcome = self._world.crash(position_m, speed_m_s, now_s)
+        outcome = self._world.crash(position_m, depth_m, speed_m_s, now_s)
         facts = {"position_m": position_m, "speed_m_per_s": speed_m_s, "depth_m": depth_m, "outcome": outcome}
         self._treated("crash", now_s, 2.0 * depth_m / speed_m_s, facts)
 
