@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 
 class AfspmError(Exception):
@@ -41,7 +41,7 @@ class ConfigErrors(ConfigError):
         errors: one for each, in the order in which they were found.
     """
 
-    def __init__(self, errors: Sequence[ConfigError]) -> None:
+    def __init__(self, errors: Sequence[AfspmError]) -> None:
         super().__init__("; ".join(map(str, errors)))
         self.errors = tuple(errors)
 
@@ -55,31 +55,31 @@ class Gathered:
                 check(name)
         errors.raise_all()
 
-    A ConfigError ends its block and not what comes after it.
+    An error of ours ends its block and not what comes after it.
     """
 
     def __init__(self) -> None:
-        self.errors: list[ConfigError] = []
+        self.errors: list[AfspmError] = []
 
-    def add(self, error: ConfigError) -> None:
+    def add(self, error: AfspmError) -> None:
         self.errors += each(error)
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
-        if isinstance(error, ConfigError):
+        if isinstance(error, AfspmError):
             self.add(error)
             return True
         return False
 
     def raise_all(self) -> None:
-        """Raises ConfigError, the only one as it is, if there are any."""
+        """Raises ConfigErrors; the only one as it is; nothing if there are none."""
         if self.errors:
             raise self.errors[0] if len(self.errors) == 1 else ConfigErrors(self.errors)
 
 
-def each(error: AfspmError) -> tuple[Any, ...]:
+def each(error: AfspmError) -> tuple[AfspmError, ...]:
     """The errors that one stands for: those that it gathers, or itself."""
     return error.errors if isinstance(error, ConfigErrors) else (error,)
 

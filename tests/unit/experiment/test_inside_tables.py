@@ -66,6 +66,13 @@ def test_a_row_of_parameters_is_looked_at_as_a_whole(write: Write) -> None:
     assert {error.place.line for error in errors(experiment)} == {line_of(experiment, "parameters")}
 
 
+def test_a_picture_that_is_not_there_hides_nothing_else(write: Write) -> None:
+    wrong = 'surface = { kind = "file", path = "./none.png" }\ntip = { radus_m = 1.0 }\nfeedback = { mode = "no" }\n'
+    said = "\n".join(error.what for error in errors(write(MICROSCOPE + wrong, frame=WITHOUT_MICROSCOPE)))
+    for what in ("none.png", "tip.radus_m", "feedback.mode"):
+        assert what in said
+
+
 def test_what_an_emulated_controller_is_told_is_found_at_once(write: Write) -> None:
     emulated = '[controller]\ncomponent = true\nclass = "AsylumEmulator"\ntip = { radus_m = 1.0 }\n'
     emulated += 'noise = { whit_m = 1.0 }\nfaults = ["no-such"]\n'

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.errors import ConfigError, InvalidValue
+from afspm.errors import ConfigError, ConfigErrors, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
 from afspm.simulation.tip import Chances, TipChangeSettings, crash_times, pulse_times
@@ -254,6 +254,21 @@ def test_settings_are_refused_with_place_and_nearest_name() -> None:
     for settings, message in cases:
         with pytest.raises(ConfigError, match=message):
             World.from_settings(settings, seed=1, start_s=0.0)
+
+
+def test_all_settings_that_are_wrong_are_told_together() -> None:
+    wrong = {
+        "drif": {},
+        "noise": {"whit_m": 1.0, "scar_m": -1.0, "hum_m": "loud"},
+        "drift": {"relaxing": [{"time_s": 0.0}, {"tim_s": 1.0}]},
+        "surface": {"kind": "steps", "stepp_m": 1.0},
+    }
+    with pytest.raises(ConfigErrors) as told:
+        World.from_settings(wrong, seed=1, start_s=0.0)
+    assert [error.where.removeprefix("simulation.") for error in told.value.errors] == [
+        "drif", "noise.whit_m", "noise.hum_m", "noise.scar_m", "drift.relaxing[0].time_s", "drift.relaxing[1].tim_s",
+        "surface.stepp_m",
+    ]  # fmt: skip
 
 
 def test_a_lattice_is_tunnelled_on_unless_told_otherwise() -> None:

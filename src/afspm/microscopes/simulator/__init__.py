@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from afspm.errors import ConfigError, Gathered, Refused
+from afspm.errors import AfspmError, ConfigError, Gathered, Refused
 from afspm.microscopes.microscope import Action, Microscope, action
 from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.microscopes.simulator import files
@@ -320,7 +320,7 @@ def _loop_of(world_settings: Mapping[str, Any]) -> FeedbackSettings | None:
     of_it = {name: world_settings[name] for name in ("surface", "feedback") if name in world_settings}
     try:
         return read_settings(of_it)[1].feedback
-    except ConfigError:
+    except AfspmError:
         return None
 
 
