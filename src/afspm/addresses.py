@@ -49,15 +49,17 @@ def connectable(bind: str) -> str:
 
 @dataclass(frozen=True)
 class Listens:
-    """Marks a setting at which a component listens, so that a check sees who else does: an address, or a port (0 or
-    none: any that is free).
+    """Marks a setting at which a component listens, so that a check sees who else does: an address, or a port (0: any
+    that is free).
 
     Attributes:
         host: of a port: the setting that names the host; empty: this computer only.
+        usual: the attribute of the class with the value that holds where none is given; empty: any that is free.
         keyed: whether it is ours to keep strangers out, with the keys of the experiment; a page has its passwords.
     """
 
     host: str = ""
+    usual: str = ""
     keyed: bool = True
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:

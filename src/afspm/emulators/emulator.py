@@ -83,7 +83,7 @@ class Emulator(ABC):
     def __init__(
         self,
         *,
-        port: Annotated[int | None, Listens()] = None,
+        port: Annotated[int | None, Listens(usual="usual_port")] = None,
         seed: int = 1,
         faults: Sequence[str | Mapping[str, Any] | Fault] = (),
         **world: Any,

@@ -91,7 +91,12 @@ def listening(component: type, settings: Mapping[str, Any]) -> Iterator[tuple[st
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
     for name, annotation in _annotations(component).items():
         for mark in getattr(annotation, "__metadata__", ()):
-            if isinstance(mark, Listens) and (address := mark.address(everything.get(name), everything)):
+            if not isinstance(mark, Listens):
+                continue
+            value = everything.get(name)
+            if value is None and mark.usual:
+                value = getattr(component, mark.usual, None)
+            if (address := mark.address(value, everything)) is not None:
                 yield name, address, mark.keyed
 
 

@@ -123,6 +123,11 @@ BROKEN = {
         FRAME,
         "both bind",
     ),
+    "an emulated controller where it usually is": (
+        '[controller]\ncomponent = true\nclass = "AsylumEmulator"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:5555"\n',
+        FRAME,
+        "both bind",
+    ),
     "a component of one's own where somebody publishes": (
         '[mine]\ncomponent = true\nclass = "parts.Listener"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9010"\n',
         FRAME,
