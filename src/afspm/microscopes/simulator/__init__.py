@@ -22,7 +22,7 @@ from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatu
 from afspm.simulation import World
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.settings import build
-from afspm.simulation.world_settings import WorldSettings, read_settings
+from afspm.simulation.world_settings import read_settings
 from afspm.units import Duration
 
 if TYPE_CHECKING:
@@ -165,8 +165,7 @@ class Simulator(Microscope):
 
     @classmethod
     def rows(cls, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-        of_world = ("surface", *WorldSettings.__dataclass_fields__)
-        loop = _loop_of({name: settings[name] for name in of_world if settings.get(name) is not None})
+        loop = _loop_of(settings)
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
     def connect(self) -> None:
@@ -315,9 +314,9 @@ def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any
     return merged
 
 
-def _loop_of(world_settings: Mapping[str, Any]) -> FeedbackSettings | None:
+def _loop_of(settings: Mapping[str, Any]) -> FeedbackSettings | None:
     """The feedback at the start, whatever is wrong with the rest of the world; None: it is itself."""
-    of_it = {name: world_settings[name] for name in ("surface", "feedback") if name in world_settings}
+    of_it = {name: settings[name] for name in ("surface", "feedback") if settings.get(name) is not None}
     try:
         return read_settings(of_it)[1].feedback
     except AfspmError:
