@@ -151,6 +151,8 @@ class Arbiter:
             self._desk.call_back(None, Cause.ENDED)
         elif before.holder is not None and after.holder is None:
             self._desk.call_back(before.holder, change.row.cause)
+        elif before.mode is ControlMode.MANUAL and after.mode is not ControlMode.MANUAL:
+            self._desk.call_back(None, None)
         self._desk.errands.send(now_s)
         if publish is not None:
             self._desk.effects.append(publish)

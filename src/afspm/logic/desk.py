@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -36,10 +36,16 @@ _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    """A request that waits for the values its limits depend on: the names of those that are still to come."""
+    """A request that waits for the values its limits depend on.
+
+    Attributes:
+        names: of those that are still to come.
+        deadline_s: when (real) it must be answered.
+    """
 
     event: RequestIn
     names: set[str]
+    deadline_s: float
 
 
 class Desk:
@@ -184,7 +190,7 @@ class Desk:
 
     def call_back(self, former: str | None, cause: Cause | None) -> None:
         """Commands of a former holder, or of anybody, that have not been sent are not sent any more."""
-        reason = f"control was taken before this was sent: {cause.value if cause else ''}"
+        reason = f"control was taken before this was sent: {cause.value if cause else 'the mode was changed'}"
         for job in self.forwarder.call_back(lambda job: job.command and former in (None, job.client)):
             self._finish(job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))
         waiting = [reading.event for reading in self._reading if former in (None, reading.event.name)]
@@ -192,7 +198,7 @@ class Desk:
         if (event := self.mover.call_back(former)) is not None:
             waiting.append(event)
         for event in waiting:
-            self.answer_late(event, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason))
+            self.answer_unsent(event, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason))
 
     def action_in_flight(self) -> str | None:
         """The action that is with the translator."""
@@ -223,7 +229,7 @@ class Desk:
             if (why := self._stays_out(self._control())) is not None:
                 self.answer(event, ControlResponse.NOT_FREE, why)
                 return
-            if not deadline_s and self._reads_first(event, mapped, now_s):
+            if not deadline_s and self._reads_first(event, now_s, now_ns):
                 return
             if self.forwarder.up and not self._is_within_limits(event, mapped, now_ns):
                 return  # if not, there is nobody to tell what is in force, as the asker will hear
@@ -232,35 +238,55 @@ class Desk:
                 return
         self._send(event, mapped, now_s, now_ns, command=command, deadline_s=deadline_s)
 
-    def _reads_first(self, event: RequestIn, mapped: Mapped | None, now_s: float) -> bool:
+    def _reads_first(self, event: RequestIn, now_s: float, now_ns: int) -> bool:
         """Whether the microscope has to be asked for the values that the request's limits depend on; then it is."""
-        sent, used = (event.request, None) if mapped is None else (mapped.request, mapped.names)
-        unread = self.guard.to_be_read(sent, used)
+        unread = self.guard.to_be_read(event.request)
         if not unread or not self.forwarder.up:
             return False
-        deadline_s = now_s + self.forwarder.timeout_s
+        others = [(one.event.name, one.event.request) for one in self._reading]
+        for who, request in others + self.forwarder.requests():
+            if both := set(unread) & set(self.guard.to_be_read(request)):
+                reason = f"{min(both)} is being changed by {who}"
+                self._refused_by_us(event, Response(int(ControlResponse.PARAM_ERROR), b"", reason))
+                return True
+        self._lease.used(now_ns)
         self._once.note(event.name, event.request, Fate.PENDING)
-        waiting = _Reading(event, set(unread))
-        self._reading.append(waiting)
-
-        def told(name: str, response: Response, now_s: float, now_ns: int) -> Iterable[Effect]:
-            waiting.names.discard(name)
-            if response.code != _SUCCESS:
-                self.guard.forget(name)
-            if waiting not in self._reading:
-                return ()  # control was taken meanwhile
-            if response.code == ControlResponse.NO_RESPONSE:
-                self._reading.remove(waiting)
-                self.answer_late(event, response)
-            elif not waiting.names:
-                self._reading.remove(waiting)
-                self.forward(event, now_s, now_ns, command=True, deadline_s=deadline_s)
-            return ()
-
+        reading = _Reading(event, set(unread), now_s + self.forwarder.timeout_s)
+        self._reading.append(reading)
         for name in unread:
-            parameter = Parameter(name)
-            self.ask_own(Request(_PARAM, parameter, self._codec.encode(parameter)), now_s, partial(told, name))
+            self._read(name, now_s, partial(self._was_read, reading, name))
         return True
+
+    def _was_read(
+        self, reading: _Reading, name: str, response: Response, now_s: float, now_ns: int
+    ) -> Iterable[Effect]:
+        """One of the values that a request waits for is known now, or can't be."""
+        self._forget_unread(name, response, now_s, now_ns)
+        reading.names.discard(name)
+        if reading not in self._reading:
+            return ()  # it was called back
+        if response.code == ControlResponse.NO_RESPONSE:
+            self._reading.remove(reading)
+            self.answer_unsent(reading.event, response)
+        elif not reading.names:
+            self._reading.remove(reading)
+            self.forward(reading.event, now_s, now_ns, command=True, deadline_s=reading.deadline_s)
+        return ()
+
+    def read_ahead(self, now_s: float) -> None:
+        """Ask for the values of which it counts for how long they hold."""
+        for name in self.guard.to_be_known():
+            self._read(name, now_s, partial(self._forget_unread, name))
+
+    def _read(self, name: str, now_s: float, ended: OwnEnd) -> None:
+        parameter = Parameter(name)
+        self.ask_own(Request(_PARAM, parameter, self._codec.encode(parameter)), now_s, ended)
+
+    def _forget_unread(self, name: str, response: Response, now_s: float, now_ns: int) -> Iterable[Effect]:
+        """Of a value that can't be read it is not known what it is now."""
+        if response.code != _SUCCESS:
+            self.guard.forget(name)
+        return ()
 
     def _stays_out(self, control: Control) -> str | None:
         """Why nobody commands, since the tip was left in danger; None: whoever is in control may."""
@@ -295,10 +321,8 @@ class Desk:
         return refusal is None
 
     def _refused_by_us(self, event: RequestIn, refusal: Response) -> None:
-        refusal.id = event.request.id
         self._log("WARNING", f"refused {event.name}: {refusal.reason}")
-        self._once.note(event.name, event.request, refusal)
-        self._tell(event, refusal)
+        self.answer_unsent(event, refusal)
 
     def _moves_first(self, event: RequestIn, now_s: float, now_ns: int) -> bool:
         """Whether the microscope has to be moved before an action; then it is, or the action is answered."""
@@ -327,8 +351,7 @@ class Desk:
             return
         event, deadline_s = ready
         if (refusal := self.guard.check_place(event.request)) is not None:  # moved by somebody else meanwhile
-            self._log("WARNING", f"refused {event.name}: {refusal.reason}")
-            self.answer_late(event, refusal)
+            self._refused_by_us(event, refusal)
             return
         self._send(event, None, now_s, now_ns, command=True, deadline_s=deadline_s)
 
@@ -353,7 +376,8 @@ class Desk:
             self._once.forget(name, request)
             self._tell(event, refused.response)
             return
-        is_to_be_saved = command and self.guard.sending(name, request, now_ns)
+        sent, used = _as_sent(job)
+        is_to_be_saved = command and self.guard.sending(name, sent, now_ns, used)
         if request.id:
             self._once.note(name, request, Fate.PENDING)
             if request.kind == _ACTION and (self._frame is not None or not self._ids_known):
@@ -423,7 +447,7 @@ class Desk:
     def _forget(self, job: Job, response: Response) -> None:
         """Nothing was done: asked again, with the same id too, it is."""
         self._once.forget(job.client, job.request)
-        self.guard.not_done(job.client, job.request)
+        self.guard.not_done(job.client, *_as_sent(job))
         self._sent = deque((s for s in self._sent if s[:2] != (job.client, job.request.id)), _SENT_REMEMBERED)
         self._reply_to(job, response)
 
@@ -435,7 +459,7 @@ class Desk:
     def _is_not_done(self, job: Job, response: Response, fate: Fate | None) -> None:
         """What was refused does not count as used; what nobody knows of does."""
         if fate is None and response.code != _SUCCESS:
-            self.guard.not_done(job.client, job.request)
+            self.guard.not_done(job.client, *_as_sent(job))
 
     def _reply_to(self, job: Job, response: Response) -> None:
         """Answer over the newest connection of the client; without an id only over the one that it asked by."""
@@ -448,7 +472,7 @@ class Desk:
         """What a success changed, or told."""
         request = job.request
         told = self._codec.decode_parameter(response.payload) if request.kind == _PARAM and response.payload else None
-        sent, used = (request, None) if job.mapped is None else (job.mapped.request, job.mapped.names)
+        sent, used = _as_sent(job)
         if self.guard.carried_out(sent, now_ns, told, used, job.client):
             self.effects.append(self._save())
         if self._frame is not None:
@@ -478,12 +502,12 @@ class Desk:
     def _moved(self, job: Job, response: Response, now_s: float, now_ns: int) -> Iterable[Effect]:
         """A move before an action was answered."""
         if (event := self.mover.ended(job, response, now_s)) is not None:
-            self.answer_late(event, response)
+            self.answer_unsent(event, response)
         self.act_when_moved(now_s, now_ns)
         return ()
 
-    def answer_late(self, event: RequestIn, response: Response) -> None:
-        """Answer an action that waited for a move, and was not sent."""
+    def answer_unsent(self, event: RequestIn, response: Response) -> None:
+        """Answer a request that is not sent; it may have waited, and be asked by another connection by now."""
         answer = Response(response.code, b"", response.reason, event.request.id)
         if response.code == ControlResponse.NO_RESPONSE:
             answer.reason = NOT_SENT + response.reason.removeprefix(NOT_SENT).removeprefix(UNKNOWN)
@@ -495,6 +519,11 @@ class Desk:
 
     def _log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))
+
+
+def _as_sent(job: Job) -> tuple[Request, Collection[str] | None]:
+    """What the microscope is asked, and the parameters that the asker means to set by that; None: all of them."""
+    return (job.request, None) if job.mapped is None else (job.mapped.request, job.mapped.names)
 
 
 def _was_not_sent(response: Response) -> bool:

@@ -176,6 +176,11 @@ class Forwarder:
             self._next(now_s)
         return settled
 
+    def requests(self) -> list[tuple[str, Request]]:
+        """What clients have asked that is on its way: who, and what."""
+        jobs = [job for job in (self.flight, *self._queue) if job is not None and job.client]
+        return [(job.client, job.request) for job in jobs]
+
     def ask_again(self, client: str, request_id: str, now_s: float) -> bool:
         """The client repeats a request that it was told is overdue: if it still is, it waits for it once more."""
         job = self.flight

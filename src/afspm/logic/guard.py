@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
+from afspm.errors import InvalidValue
 from afspm.logic.limits import Limit, Limits
-from afspm.logic.places import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, Whereabouts, moved
+from afspm.logic.places import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, Whereabouts, changes_by, moved
 from afspm.logic.usage import Usage, Use
 from afspm.logic.values import SenselessError, Value, numbers, values_of
 from afspm.model import (
@@ -57,6 +57,9 @@ class Guard:
         self._limits = limits or Limits()
         self._usage = Usage()
         self._at = Whereabouts()
+        self._unpublished = [
+            name for name, limit in self._limits.parameters.items() if limit.bounds_changes and name not in _TOLD
+        ]
 
     def check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> Response | None:
         """The refusal of a request that breaks a limit or has no meaning; None: it may be sent.
@@ -72,23 +75,20 @@ class Guard:
             return Response(int(ControlResponse.PARAM_ERROR), b"", str(error), request.id)
         return None
 
-    def to_be_read(self, request: Request, used: Collection[str] | None = None) -> list[str]:
+    def to_be_read(self, request: Request) -> list[str]:
         """The parameters that a request sets, whose values in force its limits depend on, and which nobody publishes.
 
         They are read from the microscope first: somebody at the panel may have changed them, or a request of which
         nobody knows what became of it.
         """
-        if not any(limit.bounds_changes for limit in self._limits.parameters.values()):
+        if not self._unpublished:
             return []
-        with suppress(SenselessError):  # it will be refused for that
-            changed = [
-                value.name
-                for subject in self._set_by(request)
-                for value in values_of(subject, self._limits.parameters)
-                if used is None or value.name in used
-            ]
-            return [name for name in dict.fromkeys(changed) if name not in _TOLD and self._bounds_changes(name)]
-        return []
+        set_ = [value.name for subject in self._set_by(request) for value in self._sensible(subject)]
+        return [name for name in dict.fromkeys(set_) if name in self._unpublished]
+
+    def to_be_known(self) -> list[str]:
+        """The parameters that it is good to know of before anybody sets them: how fast one changes takes two looks."""
+        return [name for name in self._unpublished if self._limits.parameters[name].rate_per_s is not None]
 
     def forget(self, name: str) -> None:
         """The value of a parameter could not be read."""
@@ -103,17 +103,25 @@ class Guard:
             return Response(int(ControlResponse.ACTION_ERROR), b"", reason, request.id)
         return None
 
-    def sending(self, who: str, request: Request, now_ns: int) -> bool:
+    def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> bool:
         """A request that was checked is about to be sent. Returns whether that is to be saved first."""
-        if request.kind != ControlRequest.ACTION or not self._has_interval(str(request.subject)):
-            return False
-        self._usage.sending(str(request.subject), Use(now_ns, who, request.id))
-        return True
+        counted = self._counted(request, used)
+        for name in counted:
+            self._usage.sending(name, Use(now_ns, who, request.id))
+        return bool(counted)
 
-    def not_done(self, who: str, request: Request) -> None:
+    def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> None:
         """A request was not carried out, for sure."""
+        for name in self._counted(request, used):
+            self._usage.not_done(name, who, request.id)
+
+    def _counted(self, request: Request, used: Collection[str] | None) -> list[str]:
+        """What a request uses of that which may be used every so often only."""
+        names_ = [value.name for subject in self._set_by(request) for value in self._sensible(subject)]
+        uses = [name for name in names_ if used is None or name in used]
         if request.kind == ControlRequest.ACTION:
-            self._usage.not_done(str(request.subject), who, request.id)
+            uses.append(str(request.subject))
+        return [name for name in dict.fromkeys(uses) if self._has_interval(name)]
 
     def carried_out(
         self,
@@ -128,42 +136,44 @@ class Guard:
         Returns:
             Whether what steps, rates and intervals are measured from has changed.
         """
-        use = Use(now_ns, who, request.id)
-        is_new = False
-        if request.kind == ControlRequest.ACTION and self._has_interval(str(request.subject)):
-            self._usage.done(str(request.subject), use)
-            is_new = True
+        if is_get(request):
+            return self._was_read(request.subject, told, now_ns)
+        counted = self._counted(request, used)
+        for name in counted:
+            self._usage.done(name, Use(now_ns, who, request.id))
+        is_new = bool(counted)
         for subject in self._set_by(request):
             # what was set is what the microscope says it is now
-            said = told if told is not None and isinstance(subject, Parameter) and _tells_of(told, subject) else subject
-            for name, _ in self._sensible(subject):
-                if (used is None or name in used) and self._has_interval(name):
-                    self._usage.done(name, use)
-                    is_new = True
+            said = told if isinstance(subject, Parameter) and told is not None and _tells_of(told, subject) else subject
             is_new |= self._is_in_force(said, now_ns)
-        if told is not None and is_get(request):
-            is_new |= self._is_in_force(told, now_ns)
         return is_new
+
+    def _was_read(self, asked: Any, told: Parameter | None, now_ns: int) -> bool:
+        if told is not None and _tells_of(told, asked):
+            return self._is_in_force(told, now_ns, was_read=True)
+        self._usage.forget(asked.name)
+        return False
 
     def published(self, subject: object, now_ns: int) -> bool:
         """The translator said what is in force: a ScanParameters, Feedback or ProbePosition. Returns as above."""
         return self._is_in_force(subject, now_ns)
 
-    def _is_in_force(self, subject: object, now_ns: int) -> bool:
+    def _is_in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> bool:
         values = numbers(self._sensible(subject))
-        new = [name for name, value in values if self._learn(name, value, now_ns)]
+        if isinstance(subject, Parameter) and not values:  # what a microscope tells is not ours to judge
+            self._usage.forget(subject.name)
+        bounded = [(name, value) for name, value in values if self._bounds_changes(name)]
+        new = [name for name, value in bounded if self._usage.learn(name, value, now_ns, was_read=was_read)]
         if isinstance(subject, Parameter):
             self._at.has_values(values)
         self._at.is_at(subject)
         return bool(new)
 
     def _sensible(self, subject: object) -> list[Value]:
-        """The values that a microscope tells; none if they make no sense: that is not the scheduler's to judge."""
+        """What a subject sets; nothing if it makes no sense."""
         try:
             return values_of(subject, self._limits.parameters)
         except SenselessError:
-            if isinstance(subject, Parameter):
-                self._usage.forget(subject.name)
             return []
 
     def snapshot(self) -> dict[str, Any]:
@@ -182,29 +192,28 @@ class Guard:
             action = str(request.subject)
             self._check_use(who, request.id, action, self._limits.actions.get(action), now_ns, "action")
             try:
-                for parameter in self._set_by(request):
-                    self._check_subject(who, request.id, parameter, now_ns, used)
+                self._check_settings(who, request, now_ns, used)
             except (_Breach, SenselessError) as breach:
                 raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {breach}") from breach
-        elif not is_get(request):
-            self._check_subject(who, request.id, request.subject, now_ns, used)
+        else:
+            self._check_settings(who, request, now_ns, used)
 
-    def _check_subject(
-        self, who: str, request_id: str, subject: object, now_ns: int, used: Collection[str] | None
-    ) -> None:
-        if isinstance(subject, ScanParameters):
-            self._check_scan(subject)
-        elif isinstance(subject, ProbePosition):
-            self._check_point(subject.xy_m)
-        elif isinstance(subject, PositionChange):
-            self._check_move(subject)
-        values = values_of(subject, self._limits.parameters)
-        if isinstance(subject, Parameter):
+    def _check_settings(self, who: str, request: Request, now_ns: int, used: Collection[str] | None) -> None:
+        subjects = self._set_by(request)
+        values = [value for subject in subjects for value in values_of(subject, self._limits.parameters)]
+        if subjects and all(isinstance(subject, Parameter) for subject in subjects):
             self._check_geometry(numbers(values))
+        for subject in subjects:
+            if isinstance(subject, ScanParameters):
+                self._check_scan(subject)
+            elif isinstance(subject, ProbePosition):
+                self._check_point(subject.xy_m)
+            elif isinstance(subject, PositionChange):
+                self._check_move(subject)
         for name, value in values:
             limit = self._limits.parameters.get(name)
             if used is None or name in used:
-                self._check_use(who, request_id, name, limit, now_ns, "parameter")
+                self._check_use(who, request.id, name, limit, now_ns, "parameter")
             if limit is not None and value is not None:
                 self._check_value(name, value, limit, now_ns)
 
@@ -248,10 +257,12 @@ class Guard:
                 f"{said} is a step of {change:g}{unit}, the largest allowed is {limit.step:g}{unit} ({limit.source})"
             )
         allowed = None if limit.rate_per_s is None else limit.rate_per_s * (now_ns - known.since_ns) / 1e9
-        if allowed is not None and change > allowed * (1 + _REACH):
+        moved_since = change + abs(known.value - known.origin)
+        if allowed is not None and moved_since > allowed * (1 + _REACH):
+            ago_s = (now_ns - known.since_ns) / 1e9
             raise _param_error(
-                f"{said} changes by {change:g}{unit}, now allowed is {allowed:.3g}{unit}, at {limit.rate_per_s:g}{unit}"
-                f" per second ({limit.source})"
+                f"{said} changes by {moved_since:g}{unit} since {ago_s:.3g} s ago, now allowed is {allowed:.3g}{unit},"
+                f" at {limit.rate_per_s:g}{unit} per second ({limit.source})"
             )
 
     def _check_scan(self, wanted: ScanParameters, reach: float = _REACH) -> None:
@@ -317,21 +328,18 @@ class Guard:
         self._check_point(moved(self._at.probe, change))
 
     def _check_geometry(self, values: list[tuple[str, float]]) -> None:
-        """A single parameter may move or turn the scan, or make it too many pixels, as well."""
-        for name, value in values:
-            if name in PROBE_CHANGES:
-                self._check_move(PROBE_CHANGES[name](value))
-            elif name in SHAPE_CHANGES:
-                if value < 1 or value != int(value):
-                    raise _param_error(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
-                self._check_scan(ScanParameters(shape=SHAPE_CHANGES[name](int(value))))
-            elif name in REGION_CHANGES:
-                self._check_scan(ScanParameters(REGION_CHANGES[name](value)))
+        """Parameters may move or turn the scan, or make it too many pixels, as well; several do so together."""
+        try:
+            changes = changes_by(values)
+        except InvalidValue as error:
+            raise _param_error(str(error)) from error
+        for change in changes:
+            if isinstance(change, PositionChange):
+                self._check_move(change)
+            else:
+                self._check_scan(change)
 
     # --- what is kept ---
-
-    def _learn(self, name: str, value: float, now_ns: int) -> bool:
-        return self._bounds_changes(name) and self._usage.learn(name, value, now_ns)
 
     def _bounds_changes(self, name: str) -> bool:
         limit = self._limits.parameters.get(name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from afspm.errors import InvalidValue
@@ -61,14 +61,10 @@ class Whereabouts:
             self.probe = moved(self.probe, subject)
 
     def has_values(self, values: Iterable[tuple[str, float]]) -> None:
-        """Single parameters, by their names, in SI."""
-        for name, value in values:
-            if name in PROBE_CHANGES:
-                self.is_at(PROBE_CHANGES[name](value))
-            elif name in REGION_CHANGES:
-                self.is_at(ScanParameters(REGION_CHANGES[name](value)))
-            elif name in SHAPE_CHANGES:
-                self.is_at(ScanParameters(shape=SHAPE_CHANGES[name](int(value))))
+        """Single parameters, by their names, in SI; what is no place is not learned."""
+        with suppress(InvalidValue):
+            for change in changes_by(values):
+                self.is_at(change)
 
     def snapshot(self) -> dict[str, Any]:
         """As plain JSON."""
@@ -89,6 +85,37 @@ class Whereabouts:
             self.scan = replace(self.scan, shape=(int(shape[0]), int(shape[1])))
         if probe is not None:
             self.probe = (float(probe[0]), float(probe[1]))
+
+
+def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | ScanParameters]:
+    """How single parameters, set together, move the probe and the scan.
+
+    Raises:
+        InvalidValue: a number of pixels that is none.
+    """
+    given: dict[type, dict[str, Any]] = {}
+    for name, value in values:
+        change: PositionChange | RegionChange | ShapeChange
+        if name in SHAPE_CHANGES:
+            if value < 1 or value != int(value):
+                raise InvalidValue(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
+            change = SHAPE_CHANGES[name](int(value))
+        elif name in PROBE_CHANGES:
+            change = PROBE_CHANGES[name](value)
+        elif name in REGION_CHANGES:
+            change = REGION_CHANGES[name](value)
+        else:
+            continue
+        parts = given.setdefault(type(change), {})
+        parts.update((part, one) for part, one in asdict(change).items() if one is not None)
+    found: list[PositionChange | ScanParameters] = []
+    if PositionChange in given:
+        found.append(PositionChange(**given[PositionChange]))
+    if RegionChange in given or ShapeChange in given:
+        region = RegionChange(**given[RegionChange]) if RegionChange in given else None
+        shape = ShapeChange(**given[ShapeChange]) if ShapeChange in given else None
+        found.append(ScanParameters(region, shape))
+    return found
 
 
 def moved(xy_m: XY, change: PositionChange) -> XY:

@@ -337,6 +337,7 @@ class SchedulerCore:
     def _on_translator_up(self, event: TranslatorUp, now_s: float, now_ns: int) -> None:
         self._desk.settle_all(self._forwarder.connected(), now_s, now_ns)
         self._desk.errands.begin(now_s)
+        self._desk.read_ahead(now_s)
 
     def _on_translator_down(self, event: TranslatorDown, now_s: float, now_ns: int) -> None:
         self._desk.settle_all(self._forwarder.lost(), now_s, now_ns)

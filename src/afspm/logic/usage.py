@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A value in force, and since when (experiment time)."""
+    """A value in force.
+
+    Attributes:
+        since_ns: when it was set last, in experiment time, or first heard of.
+        origin: the value then. What was only read since may differ: controllers round, and people are at the panel.
+    """
 
     value: float
     since_ns: int
+    origin: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +45,19 @@ class Usage:
         """The value in force, as far as it was learned."""
         return self._known.get(name)
 
-    def learn(self, name: str, value: float, now_ns: int) -> bool:
-        """A value is in force. Returns whether that is new."""
+    def learn(self, name: str, value: float, now_ns: int, *, was_read: bool = False) -> bool:
+        """A value is in force. Returns whether that is new.
+
+        Args:
+            was_read: it was asked for, and may have been so for long.
+        """
         known = self._known.get(name)
         if known is not None and known.value == value:
             return False
-        self._known[name] = Known(value, now_ns)
+        if known is not None and was_read:
+            self._known[name] = replace(known, value=value)
+        else:
+            self._known[name] = Known(value, now_ns, value)
         return True
 
     def forget(self, name: str) -> None:
@@ -81,6 +94,8 @@ class Usage:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take up what `snapshot` wrote."""
-        self._known = {name: Known(float(value), int(ns)) for name, (value, ns) in state["known"].items()}
+        self._known = {
+            name: Known(float(value), int(ns), float(origin)) for name, (value, ns, origin) in state["known"].items()
+        }
         for kept, table in ((self._done, state["done"]), (self._sent, state["sent"])):
             kept.update((name, Use(int(ns), str(who), str(id_))) for name, (ns, who, id_) in table.items())

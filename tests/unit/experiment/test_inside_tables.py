@@ -77,3 +77,8 @@ def test_what_an_emulated_controller_is_told_is_found_at_once(write: Write) -> N
     emulated = '[controller]\ncomponent = true\nclass = "AsylumEmulator"\ntip = { radus_m = 1.0 }\n'
     emulated += 'noise = { whit_m = 1.0 }\nfaults = ["no-such"]\n'
     assert len(errors(write(emulated))) == 3
+
+
+def test_a_row_that_is_no_table_is_an_error_and_no_failure(write: Write) -> None:
+    experiment = write(MICROSCOPE + "parameters = { tip-bias-voltage = 5 }\n", frame=WITHOUT_MICROSCOPE)
+    assert "tip-bias-voltage" in " ".join(error.what for error in errors(experiment))

@@ -8,6 +8,7 @@ from typing import Any
 from afspm.logic.chronicle import PERIOD_S
 from afspm.logic.events import (
     Connected,
+    Disconnected,
     Effect,
     Forward,
     Input,
@@ -126,6 +127,11 @@ class Lab:
 
     def scope_is(self, state: ScopeState) -> list[Effect]:
         return self.publish("ScopeStateMsg", ScopeStatus(state))
+
+    def is_gone(self, name: str) -> None:
+        """Its connection is lost."""
+        if (connection := self.connections.pop(name, None)) is not None:
+            self.step(Disconnected(connection))
 
     @property
     def holder(self) -> str | None:

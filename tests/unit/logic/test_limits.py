@@ -393,6 +393,70 @@ def test_what_an_action_has_set_is_in_force() -> None:
     assert why(g, set_("1.0", "V"))
 
 
+def test_what_an_action_sets_is_limited_as_a_whole() -> None:
+    large = (Parameter("scan-resolution-x", "2048"), Parameter("scan-resolution-y", "2048"))
+    to_the_left = (Parameter("scan-top-left-x", "-5", "um"), Parameter("scan-size-x", "10", "um"))
+    g = Guard(Limits(region=STAGE, most_pixels=1_000_000, sets={"x-large": large, "x-left": to_the_left}))
+    g.published(ScanParameters(Region((4e-6, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
+    assert "2048 x 2048" in why(g, Request(int(ControlRequest.ACTION), "x-large", id="i"))
+    assert not why(g, Request(int(ControlRequest.ACTION), "x-left", id="i"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("scan-resolution-x", "0"), ("scan-resolution-y", "2.5"), ("scan-size-x", "0")]
+)
+def test_a_place_without_sense_that_a_microscope_tells_is_none_and_no_harm(name: str, value: str) -> None:
+    g = Guard(Limits(region=STAGE))
+    g.published(ScanParameters(Region((0.0, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
+    g.carried_out(Request(int(ControlRequest.PARAM), Parameter(name)), 0, Parameter(name, value))
+    assert here(g, "start-scan") == ""
+
+
+def test_what_a_request_without_sense_would_have_set_is_still_known() -> None:
+    g = guard(zctrl_setpoint=Limit(step=0.5))
+    g.published(Feedback(setpoint=1.0), 0)
+    assert why(g, set_("nan", None, "zctrl-setpoint"))
+    assert g.to_be_read(set_("nan", None, "zctrl-setpoint")) == []
+    assert not why(g, set_("1.2", None, "zctrl-setpoint"))
+
+
+def test_a_rate_is_not_measured_from_when_the_value_was_read() -> None:
+    """What a controller tells is never just what was set; and what changed meanwhile is part of the change."""
+    g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
+    get = Request(int(ControlRequest.PARAM), Parameter(BIAS))
+    g.carried_out(set_("1", "V"), 0)
+    g.carried_out(get, 10 * NS, Parameter(BIAS, "1.0004", "V"))
+    assert not why(g, set_("1.9", "V"), now_ns=10 * NS)
+    assert "per second" in why(g, set_("2.1", "V"), now_ns=10 * NS)
+    g.carried_out(get, 10 * NS, Parameter(BIAS, "1.8", "V"))  # somebody was at the panel
+    assert "per second" in why(g, set_("1.5", "V"), now_ns=10 * NS)
+    assert not why(g, set_("1.5", "V"), now_ns=12 * NS)
+
+
+def test_a_microscope_that_does_not_say_the_value_when_asked_is_not_taken_to_have_the_one_before() -> None:
+    g = guard(tip_bias_voltage=Limit(step=0.5))
+    get = Request(int(ControlRequest.PARAM), Parameter(BIAS))
+    for told in (None, Parameter(BIAS), Parameter("scan-speed", "1")):
+        g.carried_out(set_("1", "V"), 0)
+        assert not why(g, set_("1.2", "V"))
+        g.carried_out(get, 0, told)
+        assert "does not tell" in why(g, set_("1.2", "V"))
+
+
+@pytest.mark.parametrize("by_action", [True, False])
+def test_a_parameter_that_may_be_set_every_so_often_counts_from_when_it_is_sent(by_action: bool) -> None:
+    limits = Limits({BIAS: Limit(interval_s=600.0)}, sets=HIGH)
+    request = Request(int(ControlRequest.ACTION), "x-high", id="1") if by_action else set_("1", "V")
+    g = Guard(limits)
+    assert g.sending("experiment", request, 0)
+    again = restarted(limits, g)
+    other = Request(int(ControlRequest.PARAM), Parameter(BIAS, "2", "V"), id="2")
+    for one in (g, again):
+        assert "every 600 s" in why(one, other, now_ns=NS)
+    g.not_done("experiment", request)
+    assert not why(g, other, now_ns=NS)
+
+
 def test_only_what_nobody_publishes_is_to_be_read_and_only_where_it_matters() -> None:
     g = Guard(
         Limits({BIAS: Limit(step=0.5), "scan-size-x": Limit(step=1e-6), "scan-speed": Limit(high=1.0)}, sets=HIGH)

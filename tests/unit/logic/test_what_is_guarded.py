@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from logic_lab import NS, Lab, in_control, killed, kinds, replies
 
-from afspm.logic.events import Effect, Forward, Tick, TranslatorDown
+from afspm.logic.arbitration import Roles, Rules
+from afspm.logic.events import Effect, Forward, Tick, TranslatorCaughtUp, TranslatorDown, TranslatorUp
 from afspm.logic.limits import Limit, Limits
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
+    ControlMode,
     ControlRequest,
     ControlResponse,
     Parameter,
@@ -114,6 +118,56 @@ def test_who_loses_control_while_the_value_is_read_does_not_set_it() -> None:
     (code,) = [reply.response.code for reply in replies(effects) if reply.name == "experiment"]
     assert code == ControlResponse.NOT_IN_CONTROL
     assert not sent(told(lab, "0.1"))
+
+
+def test_two_do_not_change_one_value_at_a_time() -> None:
+    lab = in_control(replace(STEPS, rules=Rules(Roles(operate=("ada", "ben")))))
+    lab.mode("ada", ControlMode.MANUAL)
+    lab.ask("ada", PARAM, Parameter(BIAS, "0.1", "V"), "ada/a/1")
+    read = lab.forwarded[-1]
+    (reply,) = replies(lab.ask("ben", PARAM, Parameter(BIAS, "-0.1", "V"), "ben/a/1"))
+    assert "is being changed by ada" in reply.response.reason
+    lab.answer(read, payload=lab.codec.encode(Parameter(BIAS, "0", "V")))
+    (reply,) = replies(lab.ask("ben", PARAM, Parameter(BIAS, "-0.1", "V"), "ben/a/2"))
+    assert "is being changed by ada" in reply.response.reason
+    lab.answer(lab.forwarded[-1])
+    assert sent(lab.ask("ben", PARAM, Parameter(BIAS, "0", "V"), "ben/a/3")) == [Parameter(BIAS)]
+
+
+def test_what_a_person_waits_to_set_is_not_set_when_the_mode_is_automated_again() -> None:
+    lab = in_control(replace(STEPS, rules=Rules(Roles(operate=("ada", "ben")))))
+    lab.mode("ada", ControlMode.MANUAL)
+    lab.ask("ada", PARAM, Parameter(BIAS, "0.1", "V"), "ada/a/1")
+    read = lab.forwarded[-1]
+    effects = lab.ask("ben", ControlRequest.SET_CONTROL_MODE, int(ControlMode.AUTOMATED))
+    (code,) = [reply.response.code for reply in replies(effects) if reply.name == "ada"]
+    assert code == ControlResponse.NOT_IN_CONTROL
+    assert not sent(lab.answer(read, payload=lab.codec.encode(Parameter(BIAS, "0", "V"))))
+
+
+def test_who_has_a_new_connection_by_the_time_it_is_refused_hears_so_there() -> None:
+    lab = in_control(STEPS)
+    lab.ask("experiment", PARAM, Parameter(BIAS, "3", "V"), "experiment/a/1")
+    read = lab.forwarded[-1]
+    lab.is_gone("experiment")
+    newest = lab.connect("experiment")
+    lab.ask("experiment", PARAM, Parameter(BIAS, "3", "V"), "experiment/a/1")
+    (reply,) = replies(lab.answer(read, payload=lab.codec.encode(Parameter(BIAS, "0", "V"))))
+    assert (reply.connection, "step" in reply.response.reason) == (newest, True)
+
+
+def test_how_fast_a_value_may_change_is_known_once_the_translator_has_been_there_for_a_while() -> None:
+    settings = SchedulerSettings(limits=Limits({BIAS: Limit(rate_per_s=0.1)}))
+    lab = Lab(settings)
+    lab.step(TranslatorUp())
+    lab.answer(next(one for one in lab.forwarded if one.request.kind == ControlRequest.ACTION_SUPPORT))
+    assert lab.forwarded[-1].request.subject == Parameter(BIAS)
+    told(lab, "0")
+    lab.step(TranslatorCaughtUp())
+    lab.take_control("experiment")
+    lab.later(experiment_s=10.0)
+    lab.ask("experiment", PARAM, Parameter(BIAS, "0.9", "V"), "experiment/a/1")
+    assert sent(told(lab, "0")) == [Parameter(BIAS, "0.9", "V")]
 
 
 def test_without_a_translator_nothing_is_read() -> None:

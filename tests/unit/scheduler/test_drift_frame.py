@@ -229,6 +229,15 @@ def test_a_parameter_of_the_region_is_told_in_sample_coordinates(
     assert float(answer.value or "") == pytest.approx(expected, rel=1e-12)
 
 
+def test_a_size_of_nothing_that_the_microscope_tells_is_told_as_it_is(lab: Lab) -> None:
+    set_region(lab, THERE)
+    lab.effects.clear()
+    lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_SIZE_X))
+    told = Parameter(names.SCAN_SIZE_X, "0", "m")
+    lab.answer(lab.sent(), told=told)
+    assert wire.decode_parameter(lab.replies()[0].payload) == told
+
+
 def test_the_probe_s_parameters_are_told_in_sample_coordinates(lab: Lab) -> None:
     lab.publish(ProbePosition((5e-7, 5e-7)))
     lab.effects.clear()

@@ -310,7 +310,8 @@ def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any
     merged: dict[str, dict[str, Any]] = {}
     for table in tables:
         for name, row in table.items():
-            merged[name] = {**merged.get(name, {}), **row}
+            # what is no table is for the table of parameters to refuse
+            merged[name] = {**merged.get(name, {}), **row} if isinstance(row, Mapping) else row
     return merged
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from afspm.drift.mapping import Mapping
-from afspm.errors import AfspmError
+from afspm.errors import AfspmError, InvalidValue
 from afspm.logic.frame import Mapped
 from afspm.logic.places import PROBE_CHANGES, REGION_CHANGES, scan_values
 from afspm.model import (
@@ -235,7 +235,10 @@ class DriftFrame:
         region = self.region.current
         if region is None:
             return None
-        tip = REGION_CHANGES[name](tip_value).onto(region.tip)
+        try:
+            tip = REGION_CHANGES[name](tip_value).onto(region.tip)
+        except InvalidValue:  # the microscope tells what is no frame: that is told as it is
+            return None
         return value_in(name, region.sample if is_same(tip, region.tip) else mapping.to_sample(tip))
 
     # --- packets ---
