@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from afspm.model import ProcessCondition
 from afspm.testing import longrun
 from afspm.testing.deterministic.night import CAST, FAULTS, Fault, Night, Plan, plan
 
 # together a few thousand experiment hours; more: python -m afspm.testing.longrun
+_ALIVE = ProcessCondition.ALIVE
 CHUNKS = [range(first, first + 15) for first in range(0, 150, 15)]
 
 
@@ -44,6 +47,18 @@ def test_what_happens_in_a_night_is_written_down_and_orders_are_carried_out() ->
     night.run()
     assert night.invariants.written.entries > 300
     assert 0 < night.teller.ordered <= night.components["experiment"].life // 2
+
+
+def test_who_has_ended_for_good_loses_control_as_soon_as_its_supervisor_tells() -> None:
+    night = Night(Plan(seed=5, cast=("crasher",)))
+    crasher, over_s = night.components["crasher"], math.inf
+    while night.timeline.monotonic_s() < night.plan.length_s:
+        night.timeline.run_until(night.timeline.monotonic_s() + 0.25)
+        is_over = "crasher" in (state.name for state in night.keeper.states() if state.condition is not _ALIVE)
+        if is_over and night.scheduler.core.control.holder == crasher.name:
+            over_s = min(over_s, night.timeline.monotonic_s())
+            assert night.timeline.monotonic_s() - over_s < night.settings.grace_s / 2.0
+    assert over_s < math.inf
 
 
 def test_the_long_run_tells_what_it_did(capsys: pytest.CaptureFixture[str]) -> None:

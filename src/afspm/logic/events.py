@@ -107,17 +107,6 @@ class TranslatorReply:
 
 
 @dataclass(frozen=True, slots=True)
-class ComponentDied:
-    """Whoever watches the processes says: this component has ended and is not started again.
-
-    There is no use in waiting for it then. (Of one that is being restarted nothing needs to be said: its connection
-    is lost, and its grace period runs.)
-    """
-
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
 class ProblemSeen:
     """The scheduler itself sees that a problem has come, or gone.
 
@@ -165,7 +154,6 @@ Input = (
     | TranslatorDown
     | TranslatorCaughtUp
     | TranslatorReply
-    | ComponentDied
     | ProblemSeen
     | Announced
     | Stopped

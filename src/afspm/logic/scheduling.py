@@ -18,7 +18,6 @@ from afspm.logic.ending import Ending
 from afspm.logic.events import (
     Announced,
     Codec,
-    ComponentDied,
     Connected,
     Disconnected,
     Effect,
@@ -106,7 +105,9 @@ class SchedulerCore:
             settings, codec, self._watchdog, self._lease, self._control, self._save, chronicle, frame
         )
         self._sessions, self._forwarder, self._guard = desk.sessions, desk.forwarder, desk.guard
-        self._absence = Absence(desk.sessions, settings.grace_s, settings.restart_grace_s)
+        self._absence = Absence(
+            desk.sessions, settings.grace_s, settings.restart_grace_s, self._bulletin.telling.over_since_s
+        )
         self._ending = Ending(settings, desk, self._watchdog)
         self._arbiter = Arbiter(
             settings.rules, desk, self._bulletin, chronicle, self._watchdog, self._lease,
@@ -127,7 +128,6 @@ class SchedulerCore:
             TranslatorUp: self._on_translator_up,
             TranslatorDown: self._on_translator_down,
             TranslatorCaughtUp: self._on_translator_caught_up,
-            ComponentDied: self._on_died,
             ProblemSeen: self._on_problem,
             Announced: self._on_announced,
             Stopped: self._on_stopped,
@@ -177,7 +177,7 @@ class SchedulerCore:
         """When, in real monotonic time, a Tick is due at the latest; None: no deadline."""
         soonest_s = self._forwarder.deadline_s()
         others_s = (
-            self._absence.dead_at_s(self.control.holder),
+            self._dead_at_s(),
             self._catching_up.due_s(),
             self._ending.by_s,
             self._desk.unclear_until_s(),
@@ -273,9 +273,6 @@ class SchedulerCore:
     def _on_greeted(self, event: Greeted, now_s: float, now_ns: int) -> None:
         if event.name and (event.user is None or event.user == component_of(event.name)):
             self._sessions.hear(event.connection, event.name, None, now_s)
-
-    def _on_died(self, event: ComponentDied, now_s: float, now_ns: int) -> None:
-        self._arbiter.decide(Ask(Event.DEAD, event.name), None, now_s, now_ns)
 
     def _on_problem(self, event: ProblemSeen, now_s: float, now_ns: int) -> None:
         what = Event.FLAG if event.flagged else Event.CLEAR
@@ -403,6 +400,11 @@ class SchedulerCore:
         """When what has happened is to be published; not while what was before a restart may still come again."""
         return None if self._catching_up.until_s is not None else self._chronicle.due_s
 
+    def _dead_at_s(self) -> float | None:
+        """When control is taken from a holder that is gone, after what was before a restart is told."""
+        dead_at_s, told_at_s = self._absence.dead_at_s(self.control.holder), self._catching_up.until_s
+        return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
+
     def _see_to_deadlines(self, now_s: float, now_ns: int) -> None:
         # one change of control in a step: it is saved and told before the next is decided
         announce_at_s = self._catching_up.until_s
@@ -429,8 +431,7 @@ class SchedulerCore:
             self._effects.append(self._save())
             self._desk.errands.send(now_s)
             return
-        holder = self.control.holder
-        dead_at_s = self._absence.dead_at_s(holder)
+        holder, dead_at_s = self.control.holder, self._dead_at_s()
         if holder is not None and dead_at_s is not None and now_s >= dead_at_s:
             self._arbiter.decide(Ask(Event.DEAD, holder), None, now_s, now_ns)
         lease_ns, holder = self._lease.deadline_ns(), self.control.holder

@@ -44,6 +44,7 @@ class _Session:
     lost_order: int = 0
     lost_s: float = 0.0
     has_ids: bool = True  # until it has asked for something without one
+    since_s: float = -math.inf  # its connection spoke first
 
 
 KEYED = "key"
@@ -119,7 +120,7 @@ class Sessions:
         if session is not None and not self._gives_way(session, token, connection, now_s, without_ids=without_ids):
             return Hearing.UNCLEAR if without_ids else Hearing.TAKEN
         self._bind(name, token, connection)
-        self._names[name].has_ids = has_ids
+        self._names[name].has_ids, self._names[name].since_s = has_ids, now_s
         return Hearing.ACCEPTED
 
     def connection_of(self, name: str) -> int | None:
@@ -132,6 +133,11 @@ class Sessions:
         session = self._names.get(name)
         lost = session is not None and session.connection is None and session.lost_s > -math.inf
         return session.lost_s if session is not None and lost else None
+
+    def since_s(self, name: str) -> float:
+        """Since when (real) a name speaks by the connection that it has, or had last; -inf: it was not heard of yet."""
+        session = self._names.get(name)
+        return -math.inf if session is None else session.since_s
 
     def tokens(self) -> dict[str, str]:
         """The tokens of the sessions that are connected, to be kept over a restart."""

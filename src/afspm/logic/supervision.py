@@ -68,7 +68,7 @@ class Kill:
 
 @dataclass(frozen=True, slots=True)
 class GiveUp:
-    """It is not started again: say so loudly, and to the scheduler (`ComponentDied`)."""
+    """It is not started again: say so loudly. The scheduler, who is told of each process, waits for it no more."""
 
     why: str
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from afspm.logic.events import Codec, RequestIn
-from afspm.model import LogLines, ProcessStates, Progress, Told, component_of
+from afspm.model import LogLines, ProcessCondition, ProcessState, ProcessStates, Progress, Told, component_of
 from afspm.model.words import lasting
 
 SUPERVISOR = "supervisor"
@@ -19,15 +20,21 @@ LONGEST = 256 * 1024
 SILENT_S = 10.0
 """A supervisor that has not been heard of for so long, real time, is given no more orders."""
 _MOST = 64  # supervisors
+_OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 
 
 @dataclass(slots=True)
 class _Supervisor:
-    """One, by the name it asks under; `told_s` is None for one that was known before a restart of ours."""
+    """One, by the name it asks under; `told_s` is None for one that was known before a restart of ours.
+
+    Attributes:
+        over: of its processes those that are over, with how often each was started before and since when that is known.
+    """
 
     processes: tuple[str, ...]
     told_s: float | None = None
     orders: list[str] = field(default_factory=list)
+    over: dict[str, tuple[int, float]] = field(default_factory=dict)
 
 
 class Telling:
@@ -39,14 +46,21 @@ class Telling:
 
     def snapshot(self) -> dict[str, Any]:
         """What must survive a kill, as plain JSON."""
-        return {name: [list(one.processes), list(one.orders)] for name, one in self._supervisors.items()}
+        return {
+            name: [
+                list(one.processes),
+                list(one.orders),
+                {process: starts for process, (starts, _) in one.over.items()},
+            ]
+            for name, one in self._supervisors.items()
+        }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take up what `snapshot` wrote."""
-        self._supervisors = {
-            str(name): _Supervisor(tuple(map(str, processes)), None, list(map(str, orders)))
-            for name, (processes, orders) in state.items()
-        }
+        self._supervisors = {}
+        for name, (processes, orders, *rest) in state.items():  # what a scheduler wrote that was older has no rest
+            over = {str(process): (int(starts), -math.inf) for process, starts in (rest[0] if rest else {}).items()}
+            self._supervisors[str(name)] = _Supervisor(tuple(map(str, processes)), None, list(map(str, orders)), over)
 
     def envelope(self, event: RequestIn, now_s: float) -> tuple[str, str]:
         """The envelope under which to publish what is told, or "" and why it is not."""
@@ -67,8 +81,22 @@ class Telling:
             return told.message, ""
         envelope, why = _named(told.message, thing.supervisor)
         if not why:
-            self._know(event.name, tuple(state.name for state in thing.processes), now_s)
+            self._know(event.name, thing.processes, now_s)
         return envelope, why
+
+    def over_since_s(self, process: str) -> float | None:
+        """Since when, real time, it is known that a process has ended, or is given up, and is not started again.
+
+        -inf: that was known before a restart of ours. None: it is not so, or a supervisor that was heard of lately has
+        a process of this name that is not over.
+        """
+        having = [one for one in self._supervisors.values() if process in one.processes]
+        since_s = max((one.over[process][1] for one in having if process in one.over), default=None)
+        if since_s is None:
+            return None
+        others = [one for one in having if process not in one.over]
+        goes_on = any(one.told_s is None or one.told_s > since_s - SILENT_S for one in others)
+        return None if goes_on else since_s
 
     def orders_for(self, supervisor: str) -> list[str]:
         """Processes that a supervisor is to start anew; it has been told of them then."""
@@ -91,9 +119,15 @@ class Telling:
             newest.orders.append(process)
         return ""
 
-    def _know(self, name: str, processes: tuple[str, ...], now_s: float) -> None:
+    def _know(self, name: str, processes: tuple[ProcessState, ...], now_s: float) -> None:
         known = self._supervisors.pop(name, None) or _Supervisor(())
-        known.processes, known.told_s = processes, now_s
+        known.processes, known.told_s = tuple(state.name for state in processes), now_s
+        before, known.over = known.over, {}
+        # without keys anybody may tell, for all to see; that changes control only if it comes from a supervisor
+        for state in processes if component_of(name) == SUPERVISOR else ():
+            if state.condition in _OVER:
+                starts, since_s = before.get(state.name, (-1, now_s))
+                known.over[state.name] = (state.starts, since_s if starts == state.starts else now_s)
         self._supervisors[name] = known  # the one heard of last is last
         if len(self._supervisors) > _MOST:
             del self._supervisors[next(iter(self._supervisors))]

@@ -25,16 +25,21 @@ from afspm.logic.events import (
 from afspm.logic.scheduling import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
+    TELL_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
     JournalEntry,
     Packet,
     PacketHeader,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
     Request,
     Response,
     ScopeState,
     ScopeStatus,
+    Told,
 )
 from afspm.testing.deterministic.codec import TableCodec
 
@@ -132,6 +137,17 @@ class Lab:
         """Its connection is lost."""
         if (connection := self.connections.pop(name, None)) is not None:
             self.step(Disconnected(connection))
+
+    def tell(self, *states: ProcessState, supervisor: str = "supervisor:lab") -> list[Effect]:
+        """A supervisor says how it is with its processes, and whatever is due because of that is done."""
+        thing = ProcessStates(self.now_ns, supervisor.partition(":")[2], states)
+        self.ask(supervisor, TELL_REQUEST, Told("ProcessStates", self.codec.encode(thing)))
+        return self.step(Tick())
+
+    def give_up(self, name: str) -> list[Effect]:
+        """The process of a component has died, and is not started again."""
+        self.is_gone(name)
+        return self.tell(ProcessState(name, "component", ProcessCondition.GIVEN_UP, 1))
 
     @property
     def holder(self) -> str | None:

@@ -10,7 +10,6 @@ from logic_lab import NS, Lab, published, replies
 from afspm.logic.arbitration import Roles, Rules
 from afspm.logic.envelopes import Envelopes
 from afspm.logic.events import (
-    ComponentDied,
     Disconnected,
     Forward,
     Greeted,
@@ -181,9 +180,9 @@ def test_a_connection_that_says_nothing_does_not_keep_control(lab: Lab) -> None:
 
 def test_a_holder_that_will_not_come_back_is_given_up_at_once(lab: Lab) -> None:
     lab.take_control("experiment")
-    lab.step(ComponentDied("other"))
+    lab.give_up("other")
     assert lab.holder == "experiment"
-    lab.step(ComponentDied("experiment"))
+    lab.give_up("experiment")
     assert lab.holder is None
 
 
@@ -207,7 +206,7 @@ def test_a_restarted_holder_that_gives_control_back_leaves_no_danger_behind(
 def test_the_tip_of_a_holder_that_died_in_danger_is_retracted_and_nobody_disturbs_that(lab: Lab) -> None:
     lab.publish("ZCtrlParameters", Feedback(on=False))
     lab.take_control("experiment")
-    lab.step(ComponentDied("experiment"))
+    lab.give_up("experiment")
     assert lab.forwarded[-1].request.subject == "x-retract"
     lab.take_control("other")
     assert lab.says("other", ACTION, "start-scan") is ControlResponse.NOT_FREE

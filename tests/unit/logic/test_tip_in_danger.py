@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from logic_lab import Lab, in_control, killed, kinds, replies, resumed
 
-from afspm.logic.events import ComponentDied, Kill, Log, Stopped, Tick, TranslatorDown, TranslatorUp
+from afspm.logic.events import Kill, Log, Stopped, Tick, TranslatorDown, TranslatorUp
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import ControlMode, ControlRequest, ControlResponse, Feedback, Parameter, Problem, ScopeState
@@ -140,7 +140,7 @@ def test_after_the_tip_was_retracted_or_could_not_be_nobody_goes_on_until_a_pers
     code: ControlResponse,
 ) -> None:
     lab = feedback_off()
-    lab.step(ComponentDied("experiment"))
+    lab.give_up("experiment")
     lab.take_control("experiment")
     lab.answer(lab.forwarded[-1], code)
     assert lab.core.deadline_s() is not None
@@ -162,7 +162,7 @@ def test_after_the_tip_was_retracted_or_could_not_be_nobody_goes_on_until_a_pers
 def not_retracted(settings: SchedulerSettings) -> Lab:
     """A tip whose holder is dead, and that the microscope did not retract; people were called."""
     lab = feedback_off(settings)
-    lab.step(ComponentDied("experiment"))
+    lab.give_up("experiment")
     lab.answer(lab.forwarded[-1], ControlResponse.ACTION_ERROR, reason="a dialog is open")
     lab.step(Tick())
     assert Problem.DEVICE_MALFUNCTION in lab.core.control.problems
@@ -252,7 +252,7 @@ def test_who_resumes_with_a_tip_that_was_put_right_meanwhile_is_not_disturbed() 
 def test_a_retract_that_waits_for_the_translator_is_dropped_by_who_sees_to_the_tip() -> None:
     lab = feedback_off()
     lab.step(TranslatorDown())
-    lab.step(ComponentDied("experiment"))
+    lab.give_up("experiment")
     assert said(lab, "WARNING")[-1] == "x-retract will be sent when the translator is back, since it is dead"
     lab.later(real_s=10.0)
     lab.step(Tick())
@@ -302,7 +302,7 @@ def test_a_feedback_that_nobody_knows_of_counts_as_off(in_time: bool) -> None:
     else:
         lab.later(real_s=11.0)
         lab.step(Tick())
-    lab.step(ComponentDied("experiment"))
+    lab.give_up("experiment")
     assert sent(lab)[-1] == "x-retract"
 
 

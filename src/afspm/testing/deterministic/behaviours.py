@@ -13,7 +13,6 @@ from afspm.model import (
     ControlResponse,
     Parameter,
     Problem,
-    ProcessCondition,
     ProcessState,
     ProcessStates,
     ScopeState,
@@ -217,23 +216,21 @@ class Teller(Client):
     """A supervisor, as far as it tells how it is with its processes, and restarts those that it is ordered to.
 
     Attributes:
-        processes: says which there are.
+        processes: says how it is with those that there are.
         restart: starts one anew.
         ordered: how often it was ordered to.
     """
 
     def __init__(self, *args: Any, **named: Any) -> None:
         super().__init__(*args, **named)
-        self.processes: Callable[[], tuple[str, ...]] = tuple
+        self.processes: Callable[[], tuple[ProcessState, ...]] = tuple
         self.restart: Callable[[str], None] = lambda name: None
         self.ordered = 0
 
     def behave(self) -> Doing:
         while True:
             now_ns = self.timeline.now_ns()
-            alive = ProcessCondition.ALIVE
-            states = tuple(ProcessState(name, "", alive, 0) for name in self.processes())
-            told = Told("ProcessStates", self.codec.encode(ProcessStates(now_ns, self.name, states)))
+            told = Told("ProcessStates", self.codec.encode(ProcessStates(now_ns, self.name, self.processes())))
             response = yield from self.ask(TELL_REQUEST, told)
             for name in self.codec.decode(response.payload) if response.code == _OK else ():
                 self.ordered += 1

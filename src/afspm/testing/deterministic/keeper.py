@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from afspm.logic.supervision import ChildWatch, Effect, GiveUp, Kill, Phase, Policy, Start
+from afspm.model import ProcessCondition, ProcessState
 from afspm.testing.deterministic.process import Process
 from afspm.testing.deterministic.timeline import Timeline
+
+_OVER = {Phase.DONE: ProcessCondition.ENDED, Phase.GIVEN_UP: ProcessCondition.GIVEN_UP}
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,6 @@ class Keeper:
 
     Attributes:
         given_up: names of those that it gave up.
-        on_over: called with the name of a component that is not started again.
     """
 
     def __init__(self, timeline: Timeline, processes: Iterable[Process], policy: Policy) -> None:
@@ -32,7 +34,6 @@ class Keeper:
         self._policy = policy
         self._children = {process.name: (process, ChildWatch(policy)) for process in processes}
         self.given_up: list[str] = []
-        self.on_over: Callable[[str], None] = lambda name: None
         for process, watch in self._children.values():
             process.exited = lambda code, name=process.name: self._exited(name, code)  # type: ignore[misc]
             self._do(process, watch.begin(timeline.monotonic_s()))
@@ -43,10 +44,12 @@ class Keeper:
         process, watch = self._children[name]
         self._do(process, watch.restart(self._timeline.monotonic_s()))
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of all processes."""
-        return tuple(self._children)
+    def states(self) -> tuple[ProcessState, ...]:
+        """How it is with all processes, as far as anything follows from that."""
+        return tuple(
+            ProcessState(process.name, "", _OVER.get(watch.phase, ProcessCondition.ALIVE), 0, starts=process.life)
+            for process, watch in self._children.values()
+        )
 
     def _beat(self) -> None:
         now_s = self._timeline.monotonic_s()
@@ -63,8 +66,6 @@ class Keeper:
     def _heard(self, name: str, code: int) -> None:
         process, watch = self._children[name]
         self._do(process, watch.exited(code, self._timeline.monotonic_s()))
-        if watch.over:
-            self.on_over(name)
 
     def _do(self, process: Process, effects: Iterable[Effect]) -> None:
         for effect in effects:

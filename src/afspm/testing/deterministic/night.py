@@ -183,7 +183,6 @@ class Night:
         self.components = self._components()
         self.dawn = behaviours.Dawn(timeline, self.weather, self.codec, self.scheduler, "dawn")
         self.keeper = Keeper(timeline, [self.microscope, self.scheduler, *self.components.values()], _policy())
-        self.keeper.on_over = self._over
         self.teller = self._teller()
 
     def make_codec(self) -> TableCodec:
@@ -215,13 +214,9 @@ class Night:
         teller = behaviours.Teller(
             self.timeline, self.weather, self.codec, self.scheduler, "teller", "supervisor:night"
         )
-        teller.processes, teller.restart = (lambda: self.keeper.names), self.keeper.restart
+        teller.processes, teller.restart = self.keeper.states, self.keeper.restart
         teller.start()
         return teller
-
-    def _over(self, name: str) -> None:
-        if name in self.components and self.scheduler.alive:
-            self.scheduler.take(self.scheduler.component_died, name)
 
     def _header(self, packet: Packet) -> PacketHeader:
         thing = self.codec.decode(packet.payload)

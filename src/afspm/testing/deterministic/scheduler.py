@@ -10,7 +10,6 @@ from typing import Any, Protocol
 
 from afspm.logic.events import (
     Codec,
-    ComponentDied,
     Connected,
     Disconnected,
     Effect,
@@ -139,9 +138,6 @@ class SchedulerHost(Process):
         self._link.close()
         self._from_translator.close()
         self._ticking.set(None)
-
-    def component_died(self, name: str) -> None:
-        self._step(ComponentDied(name))
 
     # --- as a server of requests ---
 
