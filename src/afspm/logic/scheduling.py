@@ -41,6 +41,7 @@ from afspm.logic.events import (
     TranslatorUp,
     Unreadable,
 )
+from afspm.logic.farewell import Farewell
 from afspm.logic.frame import CoordinateFrame
 from afspm.logic.intake import Intake
 from afspm.logic.lease import Lease
@@ -109,6 +110,7 @@ class SchedulerCore:
             desk.sessions, settings.grace_s, settings.restart_grace_s, self._bulletin.telling.over_since_s
         )
         self._ending = Ending(settings, desk, self._watchdog)
+        self._farewell = Farewell()
         self._arbiter = Arbiter(
             settings.rules, desk, self._bulletin, chronicle, self._watchdog, self._lease,
             self._catching_up, self._ending, self._save,
@@ -166,6 +168,7 @@ class SchedulerCore:
             self._ending.end()
             self._with_forwards()
             self._effects += [*self._bulletin.entries(now_ns), Kill(not self._watchdog.owes_retract)]
+            self._farewell.begin(now_s)
 
     def _with_forwards(self) -> list[Effect]:
         if self._forwarder.outbox:
@@ -247,6 +250,11 @@ class SchedulerCore:
         return self._cache.newest_source_ns
 
     @property
+    def leave_at_s(self) -> float:
+        """When, in real monotonic time, the scheduler may leave after the end; inf: it has not ended."""
+        return self._farewell.until_s
+
+    @property
     def control(self) -> Control:
         """Who is in control, for what, and who flagged which problem."""
         return self._arbiter.control
@@ -298,6 +306,7 @@ class SchedulerCore:
             return
         if kind == TELL_REQUEST:  # a supervisor's last words come after the end
             self._follow(event, self._bulletin.told(event, now_s, now_ns))
+            self._farewell.told(self._bulletin.telling.states_of(event.name), now_s)
         elif self.control.ended:
             self._ending.answer(event, ControlResponse.FAILURE, HAS_ENDED)
         elif kind == RESTART_REQUEST:

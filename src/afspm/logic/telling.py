@@ -20,7 +20,8 @@ LONGEST = 256 * 1024
 SILENT_S = 10.0
 """A supervisor that has not been heard of for so long, real time, is given no more orders."""
 _MOST = 64  # supervisors
-_OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
+OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
+"""Conditions of a process that does not run and is not started again."""
 
 
 @dataclass(slots=True)
@@ -28,6 +29,7 @@ class _Supervisor:
     """One, by the name it asks under; `told_s` is None for one that was known before a restart of ours.
 
     Attributes:
+        states: as it told them last.
         over: of its processes those that are over, with how often each was started before and since when that is known.
     """
 
@@ -35,6 +37,7 @@ class _Supervisor:
     told_s: float | None = None
     orders: list[str] = field(default_factory=list)
     over: dict[str, tuple[int, float]] = field(default_factory=dict)
+    states: tuple[ProcessState, ...] = ()
 
 
 class Telling:
@@ -84,6 +87,11 @@ class Telling:
             self._know(event.name, thing.processes, now_s)
         return envelope, why
 
+    def states_of(self, supervisor: str) -> tuple[ProcessState, ...]:
+        """How it is with the processes of a supervisor, as it told last."""
+        known = self._supervisors.get(supervisor)
+        return known.states if known is not None else ()
+
     def over_since_s(self, process: str) -> float | None:
         """Since when, real time, it is known that a process has ended, or is given up, and is not started again.
 
@@ -122,10 +130,11 @@ class Telling:
     def _know(self, name: str, processes: tuple[ProcessState, ...], now_s: float) -> None:
         known = self._supervisors.pop(name, None) or _Supervisor(())
         known.processes, known.told_s = tuple(state.name for state in processes), now_s
+        known.states = processes
         before, known.over = known.over, {}
         # without keys anybody may tell, for all to see; that changes control only if it comes from a supervisor
         for state in processes if component_of(name) == SUPERVISOR else ():
-            if state.condition in _OVER:
+            if state.condition in OVER:
                 starts, since_s = before.get(state.name, (-1, now_s))
                 known.over[state.name] = (state.starts, since_s if starts == state.starts else now_s)
         self._supervisors[name] = known  # the one heard of last is last

@@ -29,9 +29,6 @@ _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
 _TELL = bytes([TELL_REQUEST])
-FAREWELL_S = 3.0
-"""How long (real) after the end whoever comes late, or is started again, is still given what was measured and told that
-it is over."""
 
 
 class Core(Protocol):
@@ -46,6 +43,8 @@ class Core(Protocol):
     def cached(self) -> Iterable[tuple[Packet, int | None]]: ...
     @property
     def newest_source_ns(self) -> int: ...
+    @property
+    def leave_at_s(self) -> float: ...
 
 
 class Shell:
@@ -72,7 +71,6 @@ class Shell:
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
-        self._leave_at_s = math.inf
         sockets.publisher.history = self._history
 
     def start(self) -> None:
@@ -80,13 +78,13 @@ class Shell:
 
     def wait(self) -> list[Source]:
         """Wait for whatever comes first, a message or a deadline."""
-        timeout_s = (self._leave_at_s if self.ended else self._look_at_s) - self._clock.monotonic_s()
+        timeout_s = (self._core.leave_at_s if self.ended else self._look_at_s) - self._clock.monotonic_s()
         return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
 
     @property
     def over(self) -> bool:
         """The experiment has ended, and nobody is waited for any more."""
-        return self._clock.monotonic_s() >= self._leave_at_s
+        return self.ended and self._clock.monotonic_s() >= self._core.leave_at_s
 
     def handle(self, ready: list[Source]) -> None:
         """See to what has come, and to the deadlines."""
@@ -147,7 +145,7 @@ class Shell:
             self._sockets.link.send(0, [wire.CLOSE])
 
     def _asked_late(self, asked: PeerAsked) -> None:
-        """A supervisor says its last words; all others hear that it is over."""
+        """A supervisor says its last words, or who is still at work; all others hear that it is over."""
         if asked.frames[0] == _TELL:
             self._request(asked)
             return
@@ -257,7 +255,6 @@ class Shell:
                     self._tip_is_safe = effect.tip_is_safe
                     self._let_translator_go()
                     self.ended = True
-                    self._leave_at_s = self._clock.monotonic_s() + FAREWELL_S
 
 
 def _id_of(asked: PeerAsked) -> str:

@@ -34,7 +34,7 @@ _LEVELS = {Why.STOPPED: logging.INFO, Why.LOST: logging.CRITICAL}
 
 
 LOOK_S = 0.1  # between two looks at how it is with the processes, for those who are told
-START_AT_THE_END_S = 15.0  # what is started again at the end has so long to come up
+START_AT_THE_END_S = 15.0  # what is started again at the end has so long to come up, and to hear what it missed
 
 
 @dataclass(frozen=True)
@@ -93,17 +93,19 @@ class _Child:
         longest_s = self.beat.longest_step_s or liveness.longest_step_s
         return now_s - self.beat_s < liveness.silence_s and self.beat.step_age_s <= longest_s
 
-    def may_still_finish(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Whether it is too early to say that it has nothing left to do: it starts, has not beaten for a moment, or is
-        frozen and can be started again."""
+    def may_still_finish(self, now_s: float, liveness: LivenessPolicy, *, can_hear: bool) -> bool:
+        """Whether it is too early to say that it has nothing left to do: it starts, has not beaten for a moment, is
+        frozen and can be started again, or was, and has yet to hear what it missed, if it still can."""
         if self.process is None or not self.task.beats or self.task.role is not Role.COMPONENT:
             return False
         if not self.up:
             return now_s - self.started_s < START_AT_THE_END_S
-        silent_s = now_s - self.beat_s
         closing = self.beat is not None and self.beat.closing
         given_up = self.rescued and self.is_silent(now_s, liveness)
-        return not closing and not given_up and silent_s > 1.5 * liveness.beat_period_s
+        # between two steps of its start it looks as if it had nothing to do
+        begins_anew = can_hear and self.starts > 1 and now_s - self.started_s < START_AT_THE_END_S
+        is_late = now_s - self.beat_s > 1.5 * liveness.beat_period_s
+        return not closing and not given_up and (begins_anew or is_late)
 
     def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
         """Whether it should have beaten long ago."""
@@ -367,11 +369,13 @@ class Supervisor:
         """The names of those who have something to finish; a translator has after it was asked to end, too: the tip."""
         liveness = self._policy.liveness
         is_asked, has_ended = ending.last is not None, ending.why is Why.EXPERIMENT_ENDED
+        # a scheduler on another computer may be there
+        can_hear = all(child.process for child in self._children.values() if child.task.role is Role.SCHEDULER)
         return [
             child.name
             for child in self._children.values()
             if (child.is_busy(now_s, liveness) and (not is_asked or child.task.role is Role.TRANSLATOR))
-            or (child.may_still_finish(now_s, liveness) and has_ended and not is_asked)
+            or (child.may_still_finish(now_s, liveness, can_hear=can_hear) and has_ended and not is_asked)
         ]
 
     def _go_on_ending(self, ending: Ending, now_s: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 from experiment_lab import AfspmRun, Run, require_each_once, require_each_row_once
@@ -86,6 +87,23 @@ def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run) ->
     for name in faults:
         assert (one.folder / f"{name} has finished.txt").exists(), one.output
     require_each_once(one, 4)
+
+
+def test_what_freezes_over_the_last_scan_still_gets_it_when_it_is_started_again_after_the_end(
+    run: Run, tmp_path: Path
+) -> None:
+    """With the settings that everybody has: the scheduler is to be there longer than it takes to find it frozen."""
+    more = f"""
+[late]
+component = true
+class = "witness.Late"
+scans = 2
+begun = '{tmp_path / "late has begun.txt"}'
+"""
+    one = run(more=more, scans=2)
+    assert one.end() == 0, one.output
+    one.wait_for(" late ", "it is started again, to finish")
+    assert (one.folder / "late has them all.txt").exists(), one.output
 
 
 def test_a_component_that_always_crashes_does_not_keep_the_rest_from_ending(run: Run) -> None:

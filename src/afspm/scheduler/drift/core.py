@@ -166,6 +166,10 @@ class DriftCore:
             if packet.envelope == "ScopeStateMsg":
                 self._note_state(packet.payload, packet.time_ns if source_ns is None else source_ns)
 
+    @property
+    def leave_at_s(self) -> float:
+        return self.core.leave_at_s
+
     def cached(self) -> Iterable[tuple[Packet, int | None]]:
         return self.core.cached()
 
