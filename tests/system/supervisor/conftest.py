@@ -34,6 +34,7 @@ def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
             try:
                 outcomes.append(supervisor.run())
             finally:
+                log.close()  # lines are shown by a thread of its own: the last may still wait
                 terminal.close_for_waiters()
 
         thread = threading.Thread(target=run, daemon=True)
