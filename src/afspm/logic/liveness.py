@@ -1,4 +1,7 @@
-"""Whether a process lives, judged by its heartbeats: busy is not dead, and late is not dead if it was we who slept."""
+"""Whether a process lives, judged by its heartbeats: busy is not dead, and late is not dead if it was we who slept.
+
+Nor is dead who does not beat and is seen to work: something in it keeps the thread that beats from its turn.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,12 @@ class Vital(Enum):
     ALIVE = auto()
     SLOW_START = auto()
     """It has not sent a first beat within the time that a start may take."""
+    BUSY = auto()
+    """Its beats have stopped, but it is seen to work, and for no longer than it declared that a step may take."""
     SILENT = auto()
     """Its beats have stopped: the whole process hangs."""
     FROZEN = auto()
-    """It beats, but its current step has taken longer than it declared that one may."""
+    """It beats, or works, but its current step has taken longer than it declared that one may."""
     NOT_CLOSING = auto()
     """It said that it is closing and is still there."""
 
@@ -57,6 +62,8 @@ class Liveness:
         self._vital = Vital.STARTING
         self._deadline_s = now_s + policy.start_s
         self._checked_s = now_s
+        self._step_began_s = now_s
+        self._longest_s = policy.longest_step_s
         self._frozen = False
 
     def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> None:
@@ -66,6 +73,7 @@ class Liveness:
         longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
         self._vital = Vital.ALIVE
         self._frozen = step_age_s > longest_s
+        self._step_began_s, self._longest_s = now_s - step_age_s, longest_s  # where it had no step, one may begin now
         self._deadline_s = now_s + self._policy.silence_s
 
     def closing(self, now_s: float) -> None:
@@ -73,24 +81,33 @@ class Liveness:
         self._vital = Vital.NOT_CLOSING
         self._deadline_s = now_s + self._policy.closing_s
 
-    def check(self, now_s: float) -> Vital:
-        """How it is. To be asked at least once a beat period, since we can't judge while we sleep ourselves."""
+    def check(self, now_s: float, *, works: bool | None = None) -> Vital:
+        """How it is. To be asked at least once a beat period, since we can't judge while we sleep ourselves.
+
+        Args:
+            works: whether it was seen to work lately; None: that is not known.
+        """
         asleep_s = now_s - self._checked_s - self._policy.beat_period_s
         self._checked_s = now_s
         if asleep_s > self._policy.beat_period_s:  # a suspended computer: its beats wait to be read, or it slept too
             self._deadline_s += asleep_s
+            self._step_began_s += asleep_s
         if self._frozen and self._vital is Vital.ALIVE:
             return Vital.FROZEN
         if self._has_no_deadline:
             return Vital.ALIVE
         if now_s < self._deadline_s:
             return Vital.STARTING if self._vital is Vital.STARTING else Vital.ALIVE
+        if works and self._vital is Vital.ALIVE:
+            return Vital.BUSY if now_s - self._step_began_s <= self._longest_s else Vital.FROZEN
         return {Vital.STARTING: Vital.SLOW_START, Vital.ALIVE: Vital.SILENT}.get(self._vital, self._vital)
 
     def next_check_s(self) -> float:
         """When to check at the latest."""
         next_s = self._checked_s + self._policy.beat_period_s
-        return next_s if self._has_no_deadline else min(self._deadline_s, next_s)
+        # a deadline that has passed was seen: it works on without beating
+        is_due = not self._has_no_deadline and self._deadline_s > self._checked_s
+        return min(self._deadline_s, next_s) if is_due else next_s
 
     @property
     def _has_no_deadline(self) -> bool:

@@ -170,13 +170,17 @@ class ChildWatch:
             self.phase = Phase.DONE
         return []
 
-    def tick(self, now_s: float) -> list[Effect]:
-        """Time has passed."""
+    def tick(self, now_s: float, *, works: bool | None = None) -> list[Effect]:
+        """Time has passed.
+
+        Args:
+            works: whether the process was seen to work lately, though it does not beat; None: that is not known.
+        """
         if self.phase is Phase.WAITING and now_s >= self._again_s:
             return self._start(now_s)
         if self.phase is not Phase.RUNNING or self._liveness is None:
             return []
-        vital = self._liveness.check(now_s)
+        vital = self._liveness.check(now_s, works=works)
         if vital not in _WHY:
             return []
         self.phase = Phase.KILLING

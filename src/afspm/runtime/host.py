@@ -68,8 +68,8 @@ def main() -> int:
 def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
     clock = ExperimentClock.from_dict(launch.clock)
     activity = Activity(clock)
+    activity.longest_step_s = LOADED_WITHIN_S  # before the first beat: it may be the last until all is loaded
     with _beating(launch, activity, logger), _telling(launch, clock):
-        activity.longest_step_s = LOADED_WITHIN_S
         with activity.step():
             register_all(launch.messages)
             process = load(launch)

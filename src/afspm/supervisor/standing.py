@@ -38,6 +38,8 @@ class Child(Protocol):
     @property
     def beat_s(self) -> float: ...
     @property
+    def works(self) -> bool | None: ...
+    @property
     def starts(self) -> int: ...
     @property
     def given_up(self) -> bool: ...
@@ -83,7 +85,7 @@ class Standing:
             return ProcessCondition.STARTING
         closing = child.beat is not None and child.beat.closing
         if not closing and now_s - child.beat_s >= SILENT_PERIODS * self._liveness.beat_period_s:
-            return ProcessCondition.SILENT
+            return ProcessCondition.BUSY if child.works else ProcessCondition.SILENT
         return ProcessCondition.BUSY if self._step_age_s(child, now_s) else ProcessCondition.ALIVE
 
     @staticmethod

@@ -25,6 +25,7 @@ from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, 
 from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter
 from afspm.supervisor.standing import Standing
 from afspm.supervisor.task import Task
+from afspm.supervisor.vital_signs import VitalSigns
 from afspm.supervisor.wall import Wall
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 from afspm.transport.wakeup import WakeUp
@@ -78,6 +79,8 @@ class _Child:
     up: bool = False
     beat: Heartbeat | None = None
     beat_s: float = 0.0
+    signs: VitalSigns | None = None
+    works: bool | None = None  # though it does not beat; None: that is not known
     given_up: bool = False
     last_exit: str = ""
     last_error: str = ""
@@ -87,11 +90,29 @@ class _Child:
         return self.task.name
 
     def is_busy(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Whether it works on a step, as its last beat says, and for no longer than it declared."""
-        if self.process is None or self.beat is None or self.beat.closing or not self.beat.step_age_s:
+        """Whether it works on a step, as its last beat says or is seen, and for no longer than it declared."""
+        if self.process is None or self.beat is None or self.beat.closing:
             return False
-        longest_s = self.beat.longest_step_s or liveness.longest_step_s
-        return now_s - self.beat_s < liveness.silence_s and self.beat.step_age_s <= longest_s
+        longest_s, age_s = self.beat.longest_step_s or liveness.longest_step_s, self.beat.step_age_s or 0.0
+        silent_s = now_s - self.beat_s
+        if silent_s >= liveness.silence_s:
+            return bool(self.works) and age_s + silent_s <= longest_s
+        return 0.0 < age_s <= longest_s
+
+    def look(self, now_s: float, liveness: LivenessPolicy) -> None:
+        """See whether it works, if a beat is overdue."""
+        lately_s = liveness.silence_s / 2.0
+        if self.process is None or not self.up or now_s < self.beat_s + lately_s:
+            self.signs = self.works = None
+            return
+        self.signs = self.signs or VitalSigns(self.process.pid, lately_s)
+        self.works = self.signs.work(now_s)
+
+    def look_at_s(self, liveness: LivenessPolicy) -> float | None:
+        """When to look next, if no beat comes: before it is too late, since a single look says little."""
+        if self.process is None or self.beat is None or self.beat.closing:
+            return None
+        return self.beat_s + liveness.silence_s / 2.0 if self.signs is None else self.signs.again_s
 
     def may_still_finish(self, now_s: float, liveness: LivenessPolicy, *, can_hear: bool) -> bool:
         """Whether it is too early to say that it has nothing left to do: it starts, has not beaten for a moment, is
@@ -108,9 +129,9 @@ class _Child:
         return not closing and not given_up and (begins_anew or is_late)
 
     def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Whether it should have beaten long ago."""
+        """Whether it should have beaten long ago, and does not work either."""
         beating = self.process is not None and self.up and self.beat is not None and not self.beat.closing
-        return beating and now_s - self.beat_s >= liveness.silence_s
+        return beating and now_s - self.beat_s >= liveness.silence_s and not self.is_busy(now_s, liveness)
 
     @property
     def over(self) -> bool:
@@ -216,6 +237,7 @@ class Supervisor:
             deadlines = [self._ending.deadline_s()]
         else:
             deadlines = [child.watch.deadline_s() for child in self._children.values()]
+        deadlines += [child.look_at_s(self._policy.liveness) for child in self._children.values()]
         if self._reporter is not None:
             deadlines = [*deadlines, self._looked_s + LOOK_S]
         soonest_s = min((s for s in deadlines if s is not None), default=None)
@@ -275,11 +297,13 @@ class Supervisor:
         """Do what the time has come for."""
         self._wall.look()
         now_s = self._clock.monotonic_s()
+        for child in self._children.values():
+            child.look(now_s, self._policy.liveness)
         if self._ending is not None:
             self._go_on_ending(self._ending, now_s)
             return
         for child in self._children.values():
-            self._carry_out(child, child.watch.tick(now_s))
+            self._carry_out(child, child.watch.tick(now_s, works=child.works))
         if self._ending is None and all(child.over for child in self._children.values()):
             if all(child.given_up for child in self._children.values()):
                 self._end(Why.LOST, "everything is given up")

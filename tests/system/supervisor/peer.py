@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import socket
 import sys
 import threading
+import time
 from pathlib import Path
 
 from afspm.clock import ExperimentClock
@@ -18,12 +20,17 @@ def main() -> int:
     settings = launch.settings
     clock = ExperimentClock.real()
     began_s = clock.monotonic_s()
-    busy = threading.Event()
+    busy, beats_sent = threading.Event(), threading.Semaphore(0)
+
+    def step_age_s() -> float:
+        beats_sent.release()
+        return clock.monotonic_s() - began_s if busy.is_set() else 0.0
+
     assert launch.sockets.heartbeat
     beats = HeartbeatSender(
         launch.sockets.heartbeat,
         launch.beat_period_s,
-        lambda: clock.monotonic_s() - began_s if busy.is_set() else 0.0,
+        step_age_s,
         lambda: float(settings.get("longest_step_s", 30.0)),
     )
     if port := settings.get("call"):  # open as long as we live
@@ -42,6 +49,15 @@ def main() -> int:
             say("no longer busy")
         case "deaf":
             threading.Event().wait()
+        case "grip":  # one call into C that holds Python's lock: no other thread has its turn
+            busy.set()
+            wait_for_a_beat(beats_sent)
+            grip(float(settings["busy_s"]))
+            busy.clear()
+            say("has let go")
+        case "stuck":  # the same, and waits there
+            wait_for_a_beat(beats_sent)
+            ctypes.PyDLL(None).pause()
         case "exit":
             beats.close()
             return int(settings["code"])
@@ -53,6 +69,20 @@ def main() -> int:
 def say(text: str) -> None:
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
+
+
+def wait_for_a_beat(beats_sent: threading.Semaphore) -> None:
+    """The first is out when the second is made."""
+    beats_sent.acquire()
+    beats_sent.acquire()
+
+
+def grip(for_s: float) -> None:
+    """Compute for so long, of processor time, in one call."""
+    began_s = time.process_time()
+    sum(range(10**6))
+    say("holds on")
+    sum(range(round(10**6 * for_s / (time.process_time() - began_s))))
 
 
 def _count(file: Path) -> int:

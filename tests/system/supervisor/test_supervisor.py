@@ -18,6 +18,7 @@ from afspm.supervisor.ending import Why
 from afspm.supervisor.task import Task
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+look_only = pytest.mark.skipif(sys.platform not in ("linux", "win32"), reason="a process can't be looked at there")
 
 
 def test_when_all_are_done_the_run_ends_well(run_tasks: RunTasks) -> None:
@@ -56,6 +57,36 @@ def test_one_that_is_busy_within_what_it_declared_is_left_alone(run_tasks: RunTa
     running = run_tasks(peer("a", first="busy", busy_s=2.0, longest_step_s=60.0))
     running.terminal.wait_for(" a ", "no longer busy")
     assert running.stop().reports[0].starts == 1
+
+
+@look_only
+def test_one_that_holds_pythons_lock_does_not_beat_and_is_left_alone(run_tasks: RunTasks) -> None:
+    silence_s = QUICK.liveness.silence_s
+    running = run_tasks(peer("a", first="grip", busy_s=2.5 * silence_s, longest_step_s=60.0))
+    running.terminal.wait_for(" a ", "has let go")
+    assert running.stop().reports[0].starts == 1
+
+
+@look_only
+def test_one_that_holds_pythons_lock_longer_than_it_declared_is_killed(run_tasks: RunTasks, tmp_path: Path) -> None:
+    lives = str(tmp_path / "lives")
+    running = run_tasks(peer("a", first="grip", busy_s=600.0, longest_step_s=2.0, lives=lives))
+    running.terminal.wait_for(" a ", "frozen")
+    running.terminal.wait_for(" a ", "life 2")
+
+
+@posix_only
+@pytest.mark.parametrize("fault", [signal.SIGSTOP, None] if sys.platform != "win32" else [])
+def test_one_that_holds_pythons_lock_and_stands_still_is_killed(
+    run_tasks: RunTasks, tmp_path: Path, fault: signal.Signals | None
+) -> None:
+    first = "stuck" if fault is None else "grip"
+    running = run_tasks(peer("a", first=first, busy_s=600.0, longest_step_s=600.0, lives=str(tmp_path / "lives")))
+    if fault is not None:
+        running.terminal.wait_for(" a ", "holds on")
+        os.kill(running.pid("a"), fault)
+    running.terminal.wait_for(" a ", "no heartbeat")
+    running.terminal.wait_for(" a ", "life 2")
 
 
 def test_one_that_is_busy_longer_than_it_declared_is_killed(run_tasks: RunTasks, tmp_path: Path) -> None:
@@ -111,11 +142,16 @@ def test_the_end_of_the_experiment_ends_all_even_the_deaf(run_tasks: RunTasks) -
     running.terminal.wait_for(" deaf ", "does not end: killed")
 
 
-def test_at_the_end_of_the_experiment_one_that_is_busy_may_finish(run_tasks: RunTasks, tmp_path: Path) -> None:
-    busy = peer("busy", first="busy", busy_s=4.0, longest_step_s=60.0)
+@pytest.mark.parametrize(
+    ("how", "last_words"), [("busy", "no longer busy"), pytest.param("grip", "has let go", marks=look_only)]
+)
+def test_at_the_end_of_the_experiment_one_that_is_busy_may_finish(
+    run_tasks: RunTasks, how: str, last_words: str
+) -> None:
+    busy = peer("busy", first=how, busy_s=4.0, longest_step_s=60.0)
     running = run_tasks(busy, peer("ends", first="exit", code=80))
-    running.outcome()
-    running.terminal.wait_for(" busy ", "no longer busy")
+    assert running.outcome().reports[0].starts == 1
+    running.terminal.wait_for(" busy ", last_words)
     running.terminal.wait_for("waiting for busy to finish", "Ctrl-C")
 
 

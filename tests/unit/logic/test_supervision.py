@@ -23,13 +23,13 @@ class Beat:
 QUICK = LivenessPolicy(beat_period_s=1.0, missed_beats=3, start_s=10.0, longest_step_s=30.0, closing_s=5.0)
 
 
-def checked(life: Liveness, until_s: float, from_s: float = 0.0) -> Vital:
+def checked(life: Liveness, until_s: float, from_s: float = 0.0, *, works: bool | None = None) -> Vital:
     """Its health at `until_s`, looked at every half second until then."""
     now_s = from_s
     while now_s < until_s:
-        life.check(now_s)
+        life.check(now_s, works=works)
         now_s += 0.5
-    return life.check(until_s)
+    return life.check(until_s, works=works)
 
 
 def test_three_missed_beats_are_silence() -> None:
@@ -47,6 +47,49 @@ def test_a_long_step_is_busy_as_long_as_it_was_said_to_take() -> None:
     assert life.check(2.0) is Vital.ALIVE
     life.beat(3.0, step_age_s=301.0, longest_step_s=300.0)
     assert life.check(3.0) is Vital.FROZEN
+
+
+@pytest.mark.parametrize(("age_s", "longest_s"), [(0.0, None), (5.0, 35.0)])
+def test_who_works_without_beating_is_busy_as_long_as_a_step_may_take(age_s: float, longest_s: float | None) -> None:
+    life = Liveness(QUICK, 0.0)
+    life.beat(0.0, age_s, longest_s)
+    assert checked(life, 2.9, works=True) is Vital.ALIVE
+    assert checked(life, 30.0, 2.9, works=True) is Vital.BUSY
+    assert life.next_check_s() == 31.0, "nobody is to look all the time"
+    assert checked(life, 30.1, 30.0, works=True) is Vital.FROZEN
+
+
+@pytest.mark.parametrize("works", [False, None])
+def test_who_neither_beats_nor_works_any_more_is_silent_at_once(works: bool | None) -> None:
+    life = Liveness(QUICK, 0.0)
+    life.beat(0.0)
+    assert checked(life, 10.0, works=True) is Vital.BUSY
+    assert life.check(10.1, works=works) is Vital.SILENT
+
+
+def test_who_beats_again_after_it_was_busy_is_alive() -> None:
+    life = Liveness(QUICK, 0.0)
+    life.beat(0.0)
+    assert checked(life, 10.0, works=True) is Vital.BUSY
+    life.beat(10.5, step_age_s=10.5)
+    assert life.check(10.5) is Vital.ALIVE
+    assert checked(life, 30.0 + QUICK.silence_s, 10.5, works=True) is Vital.FROZEN, "it is the same step"
+
+
+def test_work_does_not_excuse_from_a_first_beat_or_from_closing() -> None:
+    life = Liveness(QUICK, 0.0)
+    assert checked(life, 10.0, works=True) is Vital.SLOW_START
+    life.beat(10.0)
+    life.closing(11.0)
+    assert checked(life, 16.0, 10.0, works=True) is Vital.NOT_CLOSING
+
+
+def test_while_we_slept_a_busy_step_did_not_go_on() -> None:
+    life = Liveness(QUICK, 0.0)
+    life.beat(0.0)
+    assert checked(life, 10.0, works=True) is Vital.BUSY
+    assert life.check(3610.0, works=True) is Vital.BUSY
+    assert checked(life, 3640.0, 3610.0, works=True) is Vital.FROZEN
 
 
 def test_a_start_may_take_longer_than_a_beat() -> None:
@@ -108,6 +151,16 @@ def test_a_child_is_started_watched_killed_when_frozen_and_started_again() -> No
     effects = watch.exited(-9, 3.0)
     assert Start() in effects
     assert watch.phase is Phase.RUNNING
+
+
+def test_a_child_that_works_without_beating_is_left_alone_until_it_stands_still() -> None:
+    watch = ChildWatch(Policy(QUICK))
+    watch.begin(0.0)
+    watch.beat(Beat(), 1.0)
+    for tenths in range(10, 200):
+        assert watch.tick(tenths / 10.0, works=True) == []
+    effects = watch.tick(20.0, works=False)
+    assert [type(e) for e in effects] == [Log, Kill]
 
 
 @pytest.mark.parametrize("code", [0, 78, 80])

@@ -42,6 +42,7 @@ class Child:
     up: bool = False
     beat: Heartbeat | None = None
     beat_s: float = 0.0
+    works: bool | None = None
     starts: int = 0
     given_up: bool = False
     last_exit: str = ""
@@ -74,6 +75,8 @@ def test_through_its_life(standing: Standing) -> None:
     child.beats(3.0, step_age_s=0.5)
     assert standing.condition(child, 3.5) is Condition.BUSY
     assert standing.condition(child, 5.5) is Condition.SILENT
+    child.works = True
+    assert standing.condition(child, 5.5) is Condition.BUSY
     child.beats(6.0)
     child.ends(1, 6.1)
     child.start(8)
