@@ -21,7 +21,7 @@ demo-drift: $(SETUP)
 	@$(BIN)/afspm run experiments/drift_night/experiment.toml
 
 ## all tests: more at a time than there are cores, since many of them wait. Tests and modules stay compiled
-TESTS_AT_A_TIME ?= 7
+TESTS_AT_A_TIME ?= 8
 COLLECTED := .venv/.tests-collected
 SAMPLES := tests/system/experiment/test_samples_run.py
 test: $(COLLECTED)

@@ -36,11 +36,12 @@ def _bad_night(seed: int) -> Plan:
     away = [Fault("outage", "experiment", (seed % 10) / 10.0, 60.0)]
     drawn = plan(seed, hours=4.0)
     if seed % 4 == 3:  # few others and slow, so that control stays where it is
-        drawn = replace(drawn, hours=6.0, speed=30.0, cast=(*_FEW, "greedy"), lease_s=900.0)
+        drawn = replace(drawn, hours=6.0, speed=60.0, cast=(*_FEW, "greedy"), lease_s=900.0)
         away += [Fault("outage", holder, ((seed + place) % 10) / 10.0, 60.0) for place, holder in enumerate(_FEW)]
     there = ("scheduler", "translator", *drawn.cast)
     faults = (*(fault for fault in drawn.faults if fault.whom in there), *away)
-    return replace(drawn, faults=faults, ids_known=seed % 2 == 0, dies_in_step=0.003, doubles=0.1, hangs=0.005)
+    slow = replace(drawn, speed=drawn.speed / 2.0)  # in more real time more connections come and go
+    return replace(slow, faults=faults, ids_known=seed % 2 == 0, dies_in_step=0.003, doubles=0.1, hangs=0.005)
 
 
 def _rows(patch: Patch, event: Event, change: Callable[[tuple[Row, ...]], tuple[Row, ...]]) -> None:

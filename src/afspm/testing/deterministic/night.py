@@ -126,7 +126,7 @@ def plan(seed: int, hours: float = 8.0) -> Plan:
     return Plan(
         seed,
         hours,
-        chance.choice((30.0, 60.0, 200.0)),
+        chance.choice((60.0, 120.0, 240.0)),
         tuple(cast),
         impostor=chance.random() < 0.25,
         ids_known=chance.random() < 0.75,
