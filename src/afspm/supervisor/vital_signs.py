@@ -29,11 +29,13 @@ class Signs:
         processor_s: the processor time that it has used in its life.
         waits_for_disk: one of its threads does.
         stopped: somebody has stopped it: it does nothing now, whatever it did a moment before.
+        runs: its main thread does, or would if the processor were free.
     """
 
     processor_s: float
     waits_for_disk: bool = False
     stopped: bool = False
+    runs: bool = False
 
 
 Look = Callable[[int], Signs | None]
@@ -79,6 +81,8 @@ class VitalSigns:
         since_s, first = self._seen[0]
         if now_s - since_s < self._lately_s / 2.0:
             return None
+        if 2 * sum(seen.runs for _, seen in self._seen) > len(self._seen):
+            return True  # on a busy computer its share may be less than any
         return signs.processor_s - first.processor_s >= LEAST_SHARE * (now_s - since_s)
 
 
@@ -94,6 +98,7 @@ def of_process(pid: int) -> Signs | None:
 if sys.platform == "linux":
     _WAITS_FOR_DISK = "D"
     _STOPPED = "Tt"
+    _RUNS = "R"
 
     def _on_linux(pid: int) -> Signs | None:
         folder = Path("/proc") / str(pid)
@@ -102,7 +107,7 @@ if sys.platform == "linux":
             threads = list((folder / "task").iterdir())
         except (OSError, ValueError, IndexError):  # it ends at this moment
             return None
-        return Signs(processor_s, any(map(_waits_for_disk, threads)), state in _STOPPED)
+        return Signs(processor_s, any(map(_waits_for_disk, threads)), state in _STOPPED, state == _RUNS)
 
     def _waits_for_disk(thread: Path) -> bool:
         try:

@@ -62,7 +62,7 @@ def test_one_that_is_busy_within_what_it_declared_is_left_alone(run_tasks: RunTa
 @look_only
 def test_one_that_holds_pythons_lock_does_not_beat_and_is_left_alone(run_tasks: RunTasks) -> None:
     silence_s = QUICK.liveness.silence_s
-    running = run_tasks(peer("a", first="grip", busy_s=2.5 * silence_s, longest_step_s=60.0))
+    running = run_tasks(peer("a", first="grip", busy_s=1.5 * silence_s, longest_step_s=60.0))
     running.terminal.wait_for(" a ", "has let go")
     assert running.stop().reports[0].starts == 1
 
@@ -143,12 +143,13 @@ def test_the_end_of_the_experiment_ends_all_even_the_deaf(run_tasks: RunTasks) -
 
 
 @pytest.mark.parametrize(
-    ("how", "last_words"), [("busy", "no longer busy"), pytest.param("grip", "has let go", marks=look_only)]
+    ("how", "busy_s", "last_words"),
+    [("busy", 4.0, "no longer busy"), pytest.param("grip", 2.5, "has let go", marks=look_only)],
 )
 def test_at_the_end_of_the_experiment_one_that_is_busy_may_finish(
-    run_tasks: RunTasks, how: str, last_words: str
+    run_tasks: RunTasks, how: str, busy_s: float, last_words: str
 ) -> None:
-    busy = peer("busy", first=how, busy_s=4.0, longest_step_s=60.0)
+    busy = peer("busy", first=how, busy_s=busy_s, longest_step_s=60.0)
     running = run_tasks(busy, peer("ends", first="exit", code=80))
     assert running.outcome().reports[0].starts == 1
     running.terminal.wait_for(" busy ", last_words)
