@@ -57,9 +57,9 @@ class Guard:
         self._limits = limits or Limits()
         self._usage = Usage()
         self._at = Whereabouts()
-        self._unpublished = [
-            name for name, limit in self._limits.parameters.items() if limit.bounds_changes and name not in _TOLD
-        ]
+        parameters, actions = self._limits.parameters, self._limits.actions
+        self._bounded = {name for name, limit in parameters.items() if limit.bounds_changes}
+        self._counted = {name for name, limit in {**parameters, **actions}.items() if limit.interval_s is not None}
 
     def check(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> Response | None:
         """The refusal of a request that breaks a limit or has no meaning; None: it may be sent.
@@ -71,7 +71,7 @@ class Guard:
             self._check(who, request, now_ns, used)
         except _Breach as breach:
             return Response(int(breach.code), b"", breach.reason, request.id)
-        except SenselessError as error:
+        except (SenselessError, InvalidValue) as error:
             return Response(int(ControlResponse.PARAM_ERROR), b"", str(error), request.id)
         return None
 
@@ -81,14 +81,13 @@ class Guard:
         They are read from the microscope first: somebody at the panel may have changed them, or a request of which
         nobody knows what became of it.
         """
-        if not self._unpublished:
-            return []
-        set_ = [value.name for subject in self._set_by(request) for value in self._sensible(subject)]
-        return [name for name in dict.fromkeys(set_) if name in self._unpublished]
+        unpublished = self._bounded - _TOLD
+        return [name for name in self._names_set_by(request) if name in unpublished] if unpublished else []
 
     def to_be_known(self) -> list[str]:
         """The parameters that it is good to know of before anybody sets them: how fast one changes takes two looks."""
-        return [name for name in self._unpublished if self._limits.parameters[name].rate_per_s is not None]
+        rated = (name for name, limit in self._limits.parameters.items() if limit.rate_per_s is not None)
+        return [name for name in rated if name not in _TOLD]
 
     def forget(self, name: str) -> None:
         """The value of a parameter could not be read."""
@@ -105,23 +104,29 @@ class Guard:
 
     def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> bool:
         """A request that was checked is about to be sent. Returns whether that is to be saved first."""
-        counted = self._counted(request, used)
+        counted = self._uses(request, used)
         for name in counted:
             self._usage.sending(name, Use(now_ns, who, request.id))
         return bool(counted)
 
     def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> None:
         """A request was not carried out, for sure."""
-        for name in self._counted(request, used):
+        for name in self._uses(request, used):
             self._usage.not_done(name, who, request.id)
 
-    def _counted(self, request: Request, used: Collection[str] | None) -> list[str]:
+    def _uses(self, request: Request, used: Collection[str] | None) -> list[str]:
         """What a request uses of that which may be used every so often only."""
-        names_ = [value.name for subject in self._set_by(request) for value in self._sensible(subject)]
-        uses = [name for name in names_ if used is None or name in used]
+        if not self._counted:
+            return []
+        uses = [name for name in self._names_set_by(request) if used is None or name in used]
         if request.kind == ControlRequest.ACTION:
             uses.append(str(request.subject))
-        return [name for name in dict.fromkeys(uses) if self._has_interval(name)]
+        return [name for name in uses if name in self._counted]
+
+    def _names_set_by(self, request: Request) -> list[str]:
+        """The parameters that a request sets, each once; none if it makes no sense."""
+        values = [value for subject in self._set_by(request) for value in self._sensible(subject)]
+        return list(dict.fromkeys(value.name for value in values))
 
     def carried_out(
         self,
@@ -138,7 +143,7 @@ class Guard:
         """
         if is_get(request):
             return self._was_read(request.subject, told, now_ns)
-        counted = self._counted(request, used)
+        counted = self._uses(request, used)
         for name in counted:
             self._usage.done(name, Use(now_ns, who, request.id))
         is_new = bool(counted)
@@ -162,7 +167,7 @@ class Guard:
         values = numbers(self._sensible(subject))
         if isinstance(subject, Parameter) and not values:  # what a microscope tells is not ours to judge
             self._usage.forget(subject.name)
-        bounded = [(name, value) for name, value in values if self._bounds_changes(name)]
+        bounded = [(name, value) for name, value in values if name in self._bounded]
         new = [name for name, value in bounded if self._usage.learn(name, value, now_ns, was_read=was_read)]
         if isinstance(subject, Parameter):
             self._at.has_values(values)
@@ -193,7 +198,7 @@ class Guard:
             self._check_use(who, request.id, action, self._limits.actions.get(action), now_ns, "action")
             try:
                 self._check_settings(who, request, now_ns, used)
-            except (_Breach, SenselessError) as breach:
+            except (_Breach, SenselessError, InvalidValue) as breach:
                 raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {breach}") from breach
         else:
             self._check_settings(who, request, now_ns, used)
@@ -201,15 +206,15 @@ class Guard:
     def _check_settings(self, who: str, request: Request, now_ns: int, used: Collection[str] | None) -> None:
         subjects = self._set_by(request)
         values = [value for subject in subjects for value in values_of(subject, self._limits.parameters)]
-        if subjects and all(isinstance(subject, Parameter) for subject in subjects):
-            self._check_geometry(numbers(values))
-        for subject in subjects:
-            if isinstance(subject, ScanParameters):
-                self._check_scan(subject)
-            elif isinstance(subject, ProbePosition):
-                self._check_point(subject.xy_m)
-            elif isinstance(subject, PositionChange):
-                self._check_move(subject)
+        # parameters may move or turn the scan, or make it too many pixels, as well; several do so together
+        are_parameters = all(isinstance(subject, Parameter) for subject in subjects)
+        for place in changes_by(numbers(values)) if are_parameters else subjects:
+            if isinstance(place, ScanParameters):
+                self._check_scan(place)
+            elif isinstance(place, ProbePosition):
+                self._check_point(place.xy_m)
+            elif isinstance(place, PositionChange):
+                self._check_move(place)
         for name, value in values:
             limit = self._limits.parameters.get(name)
             if used is None or name in used:
@@ -326,28 +331,6 @@ class Guard:
         if self._at.probe is None:
             raise _param_error("where the probe is now is not known, so a part of its place can't be checked")
         self._check_point(moved(self._at.probe, change))
-
-    def _check_geometry(self, values: list[tuple[str, float]]) -> None:
-        """Parameters may move or turn the scan, or make it too many pixels, as well; several do so together."""
-        try:
-            changes = changes_by(values)
-        except InvalidValue as error:
-            raise _param_error(str(error)) from error
-        for change in changes:
-            if isinstance(change, PositionChange):
-                self._check_move(change)
-            else:
-                self._check_scan(change)
-
-    # --- what is kept ---
-
-    def _bounds_changes(self, name: str) -> bool:
-        limit = self._limits.parameters.get(name)
-        return limit is not None and limit.bounds_changes
-
-    def _has_interval(self, name: str) -> bool:
-        limit = self._limits.actions.get(name) or self._limits.parameters.get(name)
-        return limit is not None and limit.interval_s is not None
 
 
 def _param_error(reason: str) -> _Breach:
