@@ -8,21 +8,34 @@ from typing import Any
 
 from vendor_bench import AtPanel, VendorBench
 
-from afspm.emulators.nanonis import NanonisEmulator
+from afspm.emulators.nanonis import NanonisEmulator, Waiting
 
 
 class Emulated(AtPanel, NanonisEmulator):
-    """With somebody at its panel, who sees when a scan has ended."""
+    """With somebody at its panel, who sees when a scan has ended.
+
+    Attributes:
+        ends_as_awaited: a scan is over as soon as a client waits for that, and so never between two of its questions.
+    """
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.scan_ended = Event()
+        self.ends_as_awaited = False
 
     def tick(self, now_s: float) -> float | None:
+        scanning = self.panel.scanning
+        if self.ends_as_awaited and scanning is not None and self._waits_for("Scan.WaitEndOfScan"):
+            scanning.scan._paused_s = -1e6  # all of it is behind
         next_s = super().tick(now_s)
         if self.panel.ends:
             self.scan_ended.set()
         return next_s
+
+    def _waits_for(self, function: str) -> bool:
+        """Whether a client does."""
+        waiting = [connection.waits_for for connection in self._server.connections]
+        return any(isinstance(one, Waiting) and one.name == function for one in waiting)
 
 
 class Bench(VendorBench[Emulated]):

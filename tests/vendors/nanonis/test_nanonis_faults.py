@@ -246,10 +246,11 @@ def test_a_spectrum_that_somebody_takes_unsaved_is_not_that_of_before(bench: Mak
 
 
 def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
-    made = bench(speed=SEEN)
+    made = bench(speed=1.0)
     peer = small(made, result_timeout_s=1e6)  # whoever waits for a file waits longer than this test does
     made.strike("autosave-off", duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
+    made.emulator.ends_as_awaited = True
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith(".npz")
 
