@@ -28,6 +28,9 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# while tests are collected hardly anything becomes garbage
+gc.disable()
+
 COMPUTING = ("tests/deterministic/", "tests/unit/")
 """How the names of tests begin that need the processor all the time; the others wait for processes of their own."""
 COMPUTERS = 2
@@ -80,6 +83,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+    gc.enable()
 
 
 @pytest.fixture

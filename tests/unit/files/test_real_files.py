@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +22,7 @@ pytest.importorskip("h5py")
 pytest.importorskip("scipy")
 
 
+@cache
 def real(name: str) -> FileContent:
     if not (DATA / name).is_file():
         pytest.skip(f"{DATA / name} is missing")
