@@ -28,6 +28,9 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("ERROR guard: no command given\n")
         return ExitCode.CONFIG
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # a terminal's or a supervisor's wish to end us must not leave the command behind, however early it comes
+    wished = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: wished.set())
     try:
         # in our process group, so that a supervisor who kills us, or finds us killed, sweeps the command away too
         child = subprocess.Popen(command, stdin=subprocess.PIPE)
@@ -35,8 +38,9 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"ERROR {command[0]} can't be started: {error} (is it installed and executable?)\n")
         return ExitCode.CONFIG
     guard = _Guard(child)
-    # a terminal's or a supervisor's wish to end us must not leave the command behind
     signal.signal(signal.SIGTERM, lambda *_: guard.end_soon())
+    if wished.is_set():
+        guard.end_soon()
     threading.Thread(target=guard.pass_on, name="stdin", daemon=True).start()
     code = child.wait()
     guard.sweep()

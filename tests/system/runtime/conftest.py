@@ -75,6 +75,8 @@ class Child:
         self.popen.wait(PATIENCE_S)
         for reader in self._readers:
             reader.join(PATIENCE_S)
+            # its pipe is not closed then: that would wait for the reader
+            assert not reader.is_alive(), "something that it has started was left behind, and holds its output open"
         for pipe in (self.popen.stdin, self.popen.stdout, self.popen.stderr):
             if pipe is not None:
                 pipe.close()

@@ -51,6 +51,26 @@ def test_a_guard_that_is_terminated_takes_its_command_along(start: Any) -> None:
     assert child.exit_code() == ExitCode.ORPHAN
 
 
+TERMINATED_AT_ONCE = """
+import os, signal, subprocess, sys
+from afspm.runtime import guard
+
+class Popen(subprocess.Popen):
+    def __init__(self, *args, **settings):
+        super().__init__(*args, **settings)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+subprocess.Popen = Popen
+sys.exit(int(guard.main(sys.argv[1:])))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
+def test_a_guard_that_is_terminated_as_its_command_starts_takes_it_along(start: Any) -> None:
+    child = start([*python(TERMINATED_AT_ONCE), *python(DEAF)], "{}")
+    assert child.exit_code() == ExitCode.ORPHAN
+
+
 def test_a_crash_is_a_crash(start: Any) -> None:
     child = start([*GUARD, *python("import os; os.abort()")], "{}")
     assert child.exit_code() not in (ExitCode.DONE, ExitCode.ENDED, ExitCode.ORPHAN, ExitCode.CONFIG)
