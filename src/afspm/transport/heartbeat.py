@@ -41,6 +41,9 @@ class HeartbeatSender:
         period_s: real seconds between beats.
         step_age_s: for how long the current step has been running; called in the thread.
         longest_step_s: how long a step may take; called in the thread.
+
+    Attributes:
+        heard: set as soon as somebody listens: what is beaten from then on arrives.
     """
 
     def __init__(
@@ -56,6 +59,7 @@ class HeartbeatSender:
         self._step_age_s = step_age_s
         self._longest_step_s = longest_step_s
         self._stop: WakeUp[None] = WakeUp()
+        self.heard = threading.Event()
         # XPUB, since it sees the listener subscribe: a beat sent before that would be lost
         self._socket = self._network.socket(zmq.XPUB)
         self._network.connect(self._socket, address)
@@ -70,6 +74,7 @@ class HeartbeatSender:
             ready = dict(poller.poll(self._period_ms))
             while readable(self._socket):
                 self._socket.recv(zmq.NOBLOCK)
+                self.heard.set()
             if self._stop.fileno() in ready:
                 break
             self._send(BEAT)

@@ -51,12 +51,12 @@ def main() -> int:
             threading.Event().wait()
         case "grip":  # one call into C that holds Python's lock: no other thread has its turn
             busy.set()
-            wait_for_a_beat(beats_sent)
+            wait_for_a_beat(beats, beats_sent)
             grip(float(settings["busy_s"]))
             busy.clear()
             say("has let go")
         case "stuck":  # the same, and waits there
-            wait_for_a_beat(beats_sent)
+            wait_for_a_beat(beats, beats_sent)
             ctypes.PyDLL(None).pause()
         case "exit":
             beats.close()
@@ -71,8 +71,11 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
-def wait_for_a_beat(beats_sent: threading.Semaphore) -> None:
-    """The first is out when the second is made."""
+def wait_for_a_beat(beats: HeartbeatSender, beats_sent: threading.Semaphore) -> None:
+    """Of those that are heard the first is out when the second is made."""
+    beats.heard.wait()
+    while beats_sent.acquire(blocking=False):
+        pass
     beats_sent.acquire()
     beats_sent.acquire()
 
