@@ -208,7 +208,7 @@ def test_a_file_of_another_name_is_found(bench: Make) -> None:
 
 @pytest.mark.parametrize("partial", [False, True])
 def test_a_scan_that_somebody_stops_is_interrupted(bench: Make, partial: bool) -> None:
-    made = bench(speed=20.0, saves_partial=partial)
+    made = bench(speed=4.0, saves_partial=partial)
     peer = small(made, result_timeout_s=3.0)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
