@@ -115,11 +115,9 @@ def test_a_user_s_own_estimator_that_fails_or_hangs_costs_no_scan(rig: Rig) -> N
     options = 'estimator = "surveyor.Fails", longest_registration = "3 s", rescan = { rule = "never" }'
     run = rig.start(options, scans=5, speed=QUICK)
     assert run.end() == 0, run.output
-    late = run.output.count("was not registered within 3 s, it goes out as predicted")
-    assert late >= 1, run.output
+    run.wait_for("scheduler .*was not registered within 3 s, it goes out as predicted")
     rows = table(run)
-    # none of what hangs, nor of what a busy computer was too slow for
-    assert [row["matched"] for row in rows] == ["yes", "no", *["yes"] * (3 - late)], (rows, run.output)
+    assert [row["matched"] for row in rows] == ["yes", "no", "yes", "yes"], rows  # none of what hangs
     assert "ZeroDivisionError: nothing is known" in rows[1]["reason"]
     found = surveyed(run)
     assert len(found.said_m) == 5
