@@ -112,10 +112,11 @@ def test_a_controller_that_is_given_the_rate_keeps_the_tip_on_the_sample_by_itse
 
 
 def test_a_user_s_own_estimator_that_fails_or_hangs_costs_no_scan(rig: Rig) -> None:
-    options = 'estimator = "surveyor.Fails", longest_registration = "3 s", rescan = { rule = "never" }'
-    run = rig.start(options, scans=5, speed=QUICK)
+    # long enough for a busy computer to start a worker, and short enough on the sample to go on as predicted
+    options = 'estimator = "surveyor.Fails", longest_registration = "9 s", rescan = { rule = "never" }'
+    run = rig.start(options, scans=5, speed=40.0)
     assert run.end() == 0, run.output
-    run.wait_for("scheduler .*was not registered within 3 s, it goes out as predicted")
+    run.wait_for("scheduler .*was not registered within 9 s, it goes out as predicted")
     rows = table(run)
     assert [row["matched"] for row in rows] == ["yes", "no", "yes", "yes"], rows  # none of what hangs
     assert "ZeroDivisionError: nothing is known" in rows[1]["reason"]
