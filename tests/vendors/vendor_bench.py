@@ -213,7 +213,7 @@ class VendorBench(Generic[Emulated]):
             emulated = Emulated
             translator = "afspm.microscopes.mine.Mine"
             data_name = "mine"
-            settings = {"reply_timeout_s": 2.0}
+            settings = {"reply_timeout_s": 10.0}
 
     Attributes:
         emulated: the class of the emulator.

@@ -18,4 +18,4 @@ class Bench(VendorBench[Emulated]):
     emulated = Emulated
     translator = "afspm.microscopes.asylum.Asylum"
     data_name = "data of the day"
-    settings: Mapping[str, Any] = {"reply_timeout_s": 2.0, "poll_period_s": 0.1}
+    settings: Mapping[str, Any] = {"reply_timeout_s": 10.0, "poll_period_s": 0.1}

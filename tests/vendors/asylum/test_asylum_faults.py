@@ -16,7 +16,7 @@ from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, Sc
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
 UNDEFINED = ScopeState.UNDEFINED
-SOON = {"reply_timeout_s": 1.0}
+SOON = {"reply_timeout_s": 2.5}
 
 
 def scans_again(peer: Peer) -> list[Scan]:
@@ -46,7 +46,7 @@ def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, 
     made = bench()
     peer = small(made, **SOON)
     # of nan the first two are of the status, where they mean that a release has no such value
-    made.strike(kind, count=6 if kind == "nan" else 1, duration_s=200.0)
+    made.strike(kind, count=6 if kind == "nan" else 1, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
     made.until_said(told)
@@ -65,7 +65,7 @@ def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, 
 def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str, told: str) -> None:
     made = bench(speed=1.0)
     peer = small(made, **SOON)
-    made.strike(kind, duration_s=4.0)
+    made.strike(kind, duration_s=8.0)
     peer.until(UNDEFINED)
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE

@@ -105,8 +105,8 @@ def test_a_tip_that_its_frame_takes_along_is_on_its_way_too(bench: Make) -> None
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
 def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, Any]) -> None:
     made = bench(speed=1.0, **settings)
-    peer = small(made, reply_timeout_s=1.0)
-    made.strike("wedge", duration_s=4.0)
+    peer = small(made, reply_timeout_s=2.5)
+    made.strike("wedge", duration_s=8.0)
     peer.until(UNDEFINED)
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
@@ -285,10 +285,10 @@ def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path:
 
 def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
     made = bench(speed=20.0)
-    peer = small(made, reply_timeout_s=1.0)
+    peer = small(made, reply_timeout_s=2.5)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
-    made.strike("wedge", duration_s=60.0)
+    made.strike("wedge", duration_s=160.0)
     heard = peer.until(FREE)
     assert "UNDEFINED" in states(heard)
     assert scans(heard)

@@ -42,4 +42,4 @@ class Bench(VendorBench[Emulated]):
     emulated = Emulated
     translator = "afspm.microscopes.nanonis.Nanonis"
     data_name = "session"
-    settings: Mapping[str, Any] = {"reply_timeout_s": 3.0}
+    settings: Mapping[str, Any] = {"reply_timeout_s": 10.0}
