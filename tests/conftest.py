@@ -80,7 +80,6 @@ def pytest_collection_finish() -> None:
 
     Nor as often as Python does: a simulated night makes a great many things and little garbage.
     """
-    gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
     gc.enable()

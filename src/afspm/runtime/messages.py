@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
@@ -43,6 +42,8 @@ def _compiled(path: Path) -> ModuleType:
     """The module that protoc makes of a file. It is used once and not kept: the file is what counts."""
     if not path.is_file():
         raise ConfigError("there is no such file", where=str(path))
+    import tempfile  # imported late: few have messages of their own, and all would start later for it
+
     try:
         from grpc_tools import protoc
     except ImportError:
