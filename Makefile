@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test test-docs test-ui test-translators check bench bench-drift soak chaos simulate power-cut clean
+.PHONY: demo demo-drift test test-samples test-ui test-translators check bench bench-drift soak chaos simulate power-cut clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -20,20 +20,20 @@ demo: $(SETUP)
 demo-drift: $(SETUP)
 	@$(BIN)/afspm run experiments/drift_night/experiment.toml
 
-## all tests of the software: more at a time than there are cores, since many of them wait. Tests stay compiled
+## all tests: more at a time than there are cores, since many of them wait. Tests and modules stay compiled
 TESTS_AT_A_TIME ?= 8
 COLLECTED := .venv/.tests-collected
-SHOWN := tests/docs/test_snippets.py tests/docs/test_notebook_page.py tests/system/experiment/test_samples_run.py
+SAMPLES := tests/system/experiment/test_samples_run.py
 test: $(COLLECTED)
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME) $(SHOWN:%=--ignore %)
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME) --ignore $(SAMPLES)
 
 # asserts are rewritten once, not by each of the processes that run tests; what can't be collected is told by them
 $(COLLECTED): $(SETUP) $(shell find tests -name '*.py')
 	@ls -d tests/*/ | PYTHONDONTWRITEBYTECODE= xargs -P 2 -n 1 $(BIN)/pytest --collect-only -qq > /dev/null 2>&1; touch $@
 
-## what we show: every snippet of the README and the docs, and every sample in experiments/, shortened, to its end
-test-docs: $(SETUP)
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 4 $(SHOWN)
+## every sample in experiments/, shortened, to its end
+test-samples: $(SETUP)
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 4 $(SAMPLES)
 
 ## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots
 test-ui: $(SETUP)
