@@ -39,6 +39,12 @@ from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
 DEADLINE_S = 30.0
+PATIENT: Mapping[str, Any] = {"reply_timeout_s": 10.0}
+"""As long as a controller on a busy computer may need to answer."""
+
+SOON: Mapping[str, Any] = {"reply_timeout_s": 2.5}
+"""Where its silence is what is tested."""
+
 TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
 """A frame that is no square, not in the middle and not straight: what is mistaken for something else shows."""
 
@@ -213,7 +219,7 @@ class VendorBench(Generic[Emulated]):
             emulated = Emulated
             translator = "afspm.microscopes.mine.Mine"
             data_name = "mine"
-            settings = {"reply_timeout_s": 10.0}
+            settings = PATIENT
 
     Attributes:
         emulated: the class of the emulator.

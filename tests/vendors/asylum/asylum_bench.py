@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from vendor_bench import AtPanel, VendorBench
+from vendor_bench import PATIENT, AtPanel, VendorBench
 
 from afspm.emulators.asylum import AsylumEmulator
 
@@ -18,4 +18,4 @@ class Bench(VendorBench[Emulated]):
     emulated = Emulated
     translator = "afspm.microscopes.asylum.Asylum"
     data_name = "data of the day"
-    settings: Mapping[str, Any] = {"reply_timeout_s": 10.0, "poll_period_s": 0.1}
+    settings: Mapping[str, Any] = {**PATIENT, "poll_period_s": 0.1}

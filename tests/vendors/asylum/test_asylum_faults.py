@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from asylum_bench import Bench, Emulated
-from vendor_bench import Peer, scans, small, states
+from vendor_bench import SOON, Peer, scans, small, states
 
 from afspm.emulators.faults import Fault
 from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
@@ -16,7 +16,6 @@ from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, Sc
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
 UNDEFINED = ScopeState.UNDEFINED
-SOON = {"reply_timeout_s": 2.5}
 
 
 def scans_again(peer: Peer) -> list[Scan]:

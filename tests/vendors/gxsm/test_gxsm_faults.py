@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from gxsm_bench import Bench
-from vendor_bench import SHAPE, Peer, ready, scans, states
+from vendor_bench import SHAPE, SOON, Peer, ready, scans, states
 
 from afspm.emulators.gxsm.program import Program
 from afspm.model import (
@@ -105,7 +105,7 @@ def test_a_tip_that_its_frame_takes_along_is_on_its_way_too(bench: Make) -> None
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
 def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, Any]) -> None:
     made = bench(speed=1.0, **settings)
-    peer = small(made, reply_timeout_s=2.5)
+    peer = small(made, **SOON)
     made.strike("wedge", duration_s=8.0)
     peer.until(UNDEFINED)
     response = peer.act(names.START_SCAN)
@@ -285,7 +285,7 @@ def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path:
 
 def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
     made = bench(speed=20.0)
-    peer = small(made, reply_timeout_s=2.5)
+    peer = small(made, **SOON)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike("wedge", duration_s=160.0)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from threading import Event
 from typing import Any
 
-from vendor_bench import AtPanel, VendorBench
+from vendor_bench import PATIENT, AtPanel, VendorBench
 
 from afspm.emulators.nanonis import NanonisEmulator, Waiting
 
@@ -42,4 +42,4 @@ class Bench(VendorBench[Emulated]):
     emulated = Emulated
     translator = "afspm.microscopes.nanonis.Nanonis"
     data_name = "session"
-    settings: Mapping[str, Any] = {"reply_timeout_s": 10.0}
+    settings: Mapping[str, Any] = PATIENT

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nanonis_bench import Bench
-from vendor_bench import scans, small, states
+from vendor_bench import SOON, scans, small, states
 
 from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
 from afspm.supervisor.ports import FreePorts
@@ -35,7 +35,7 @@ SEEN = 5.0
 )
 def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, kind: str, told: str) -> None:
     made = bench()
-    peer = small(made, reply_timeout_s=2.5)
+    peer = small(made, **SOON)
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
@@ -46,7 +46,7 @@ def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, k
 
 def test_a_dialog_on_its_screen_silences_it_until_it_is_answered(bench: Make) -> None:
     made = bench(speed=1.0)
-    peer = small(made, reply_timeout_s=2.5)
+    peer = small(made, **SOON)
     made.strike("dialog", duration_s=8.0)
     peer.until(UNDEFINED)
     response = peer.act(names.START_SCAN)
