@@ -11,6 +11,11 @@ from experiment_lab import AfspmRun, Run, require_each_once, require_each_row_on
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
+QUICK = """
+[restart]
+beat_period = 0.25
+missed_beats = 6
+"""
 MORE = """
 [tip_classifier]
 component = true
@@ -25,10 +30,6 @@ test_center = ["0 um", "4 um"]
 [metadata]
 component = true
 class = "Metadata"
-
-[restart]
-beat_period = 0.25
-missed_beats = 6
 """
 # the series last: what else is still being restarted has caught up when it has taken its last scan
 EACH = ("recorder", "metadata", "tip_classifier", "tip_corrector", "microscope", "scheduler", "series")
@@ -36,7 +37,7 @@ EACH = ("recorder", "metadata", "tip_classifier", "tip_corrector", "microscope",
 
 @pytest.mark.parametrize("when", ["while scanning", "between scans"])
 def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, when: str) -> None:
-    one = run(more=MORE, scans=20)
+    one = run(more=MORE + QUICK, scans=20)
     one.wait_for("scan 1 of 20")
     for name in EACH:
         one.wait_for_next(" witness ", "state SCANNING" if when == "while scanning" else "state FREE")
@@ -50,7 +51,7 @@ def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, w
 
 
 def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run) -> None:
-    one = run(more=MORE, scans=10)
+    one = run(more=QUICK, scans=10)
     one.wait_for("scan 2 of 10")
     for name in ("microscope", "scheduler", "series"):
         one.wait_for_next(" witness ", "state SCANNING")
@@ -62,7 +63,7 @@ def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run) -> 
 
 
 def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Run) -> None:
-    one = run(more=MORE, scans=5)
+    one = run(more=MORE + QUICK, scans=5)
     one.wait_for("scan 2 of 5")
     one.wait_for_next(" witness ", "state SCANNING")
     for name in EACH:
@@ -75,7 +76,7 @@ def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Ru
 def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run) -> None:
     faults = {"dies": signal.SIGKILL, "freezes": signal.SIGSTOP}
     finishers = (f'[{name}]\ncomponent = true\nclass = "witness.Finisher"\n' for name in faults)
-    one = run(more=MORE + "".join(finishers))
+    one = run(more=QUICK + "".join(finishers))
     for name in faults:
         one.wait_for(f" {name} ", "finishing")
     one.wait_for(" afspm ", "the experiment has ended$")

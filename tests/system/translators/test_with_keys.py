@@ -49,16 +49,17 @@ def afspm(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With the experiment file, and keys for each of its processes."""
-    (tmp_path / "experiment.toml").write_text(EXPERIMENT.format(port=FreePorts().take()), encoding="utf-8")
-    assert afspm("keys", "experiment.toml", cwd=tmp_path).returncode == 0
-    return tmp_path
+    made = tmp_path_factory.mktemp("with_keys")
+    (made / "experiment.toml").write_text(EXPERIMENT.format(port=FreePorts().take()), encoding="utf-8")
+    assert afspm("keys", "experiment.toml", cwd=made).returncode == 0
+    return made
 
 
 def test_an_experiment_with_keys_scans_on_an_emulated_controller(folder: Path) -> None:
-    done = afspm("run", "experiment.toml", cwd=folder)
+    done = afspm("run", "experiment.toml", "--no-report", cwd=folder)
     assert done.returncode == 0, done.stdout
     assert "scan 1 of 1 at" in done.stdout
 

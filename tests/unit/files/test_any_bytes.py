@@ -88,7 +88,7 @@ def test_pieces_of_files_are_refused_or_make_sense(pieces: list[bytes], suffix: 
 
 
 @pytest.mark.parametrize("name", [*WHOLE, *REAL])
-@settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_a_number_that_can_not_be_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
     """Of text: one of the numbers in it, of the same length where places are counted."""
@@ -117,7 +117,7 @@ def mended(content: bytes, name: str) -> bytes:
 
 
 @pytest.mark.parametrize("name", BINARY)
-@settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_a_size_that_can_not_be_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
     content = bytearray(whole(name))

@@ -33,7 +33,7 @@ def need(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*WHOLE, *SOME])
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(data=st.data())
 def test_a_file_that_was_cut_off_is_refused_or_holds_the_same(name: str, data: st.DataObject) -> None:
     """The same: what follows the last that is needed; and a table of text that ends with a line is a shorter one."""
@@ -59,7 +59,7 @@ def test_values_that_are_cut_off_are_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*WHOLE, *SOME])
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_damaged_bytes_are_refused_or_read_and_nothing_else(name: str, data: st.DataObject) -> None:
     need(name)

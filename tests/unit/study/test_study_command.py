@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 from typer.testing import CliRunner
 
 from afspm.cli.app import app
@@ -27,9 +26,3 @@ def test_settings_that_fail_are_told_and_the_others_go_on() -> None:
     output = told(*SMALL, "tracker=bank,paper", "paper.queue=0", "-n", "2", "-j", "1")
     assert "tracker=paper: 2 nights failed" in output
     assert "The defaults are the best." in output
-
-
-@pytest.mark.timeout(60)
-def test_the_same_study_on_a_cluster_says_the_same(cluster: str) -> None:
-    here = told(*SMALL, "-n", "2", "-j", "1")
-    assert told(*SMALL, "-n", "2", "--cluster", cluster) == here

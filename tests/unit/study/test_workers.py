@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from afspm.errors import ConfigError, InvalidValue
-from afspm.study.workers import Outcome, on_cluster, on_cores, processes
+from afspm.errors import InvalidValue
+from afspm.study.workers import Outcome, on_cores, processes
 
 
 def doubled(number: int) -> int:
@@ -56,19 +56,3 @@ def test_what_kills_every_worker_is_told_instead_of_tried_for_ever() -> None:
     done = list(on_cores(deadly, [(1,), (2,)], jobs=2))
     assert len(done) == 2
     assert all("died 3 times" in outcome.error for outcome in done)
-
-
-@pytest.mark.timeout(60)
-def test_a_cluster_loses_no_task_with_a_worker(cluster: str, tmp_path: Path) -> None:
-    tasks = [(n, tmp_path) for n in range(6)]
-    done = by_index(list(on_cluster(doubled_by_the_next, tasks, address=cluster)))
-    failed = list(on_cluster(doubled, [(-1,)], address=cluster))
-    assert [outcome.value for outcome in done] == [2 * n for n in range(6)]
-    assert (tmp_path / "died").exists()
-    assert failed == [Outcome(0, error="below zero")]
-
-
-def test_a_cluster_that_is_not_there_is_told() -> None:
-    pytest.importorskip("distributed", reason="needs Dask, the extra `study`")
-    with pytest.raises(ConfigError, match="no cluster"):
-        list(on_cluster(doubled, [(1,)], address="nonsense://nowhere"))
