@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import inspect
 import typing
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from datetime import date, datetime
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +175,7 @@ def _has_own_config(annotation: Any) -> bool:
     )
 
 
+@cache
 def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
     """The parameters of the constructor; where it hands **settings on to its base class, those of that as well."""
     found: dict[str, inspect.Parameter] = {}
@@ -184,7 +186,8 @@ def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
     return found
 
 
-def _constructors(component: type) -> list[Callable[..., Any]]:
+@cache
+def _constructors(component: type) -> Sequence[Callable[..., Any]]:
     """`__init__` of the class, and of its bases for as long as each passes **keywords on."""
     chain: list[Callable[..., Any]] = []
     for base in component.__mro__:
@@ -197,7 +200,8 @@ def _constructors(component: type) -> list[Callable[..., Any]]:
     return chain
 
 
-def _annotations(component: type) -> dict[str, Any]:
+@cache
+def _annotations(component: type) -> Mapping[str, Any]:
     """Of every parameter, resolved; those that can't be (imported for typing only) are left out."""
     kinds: dict[str, Any] = {}
     for init in reversed(_constructors(component)):

@@ -20,6 +20,7 @@ WIDTH_IN = 7.2  # two columns of a journal
 ORANGE, BLUE, GREEN, MAGENTA, GREY = "#EE7733", "#0077BB", "#009988", "#EE3377", "#999999"  # P. Tol's vibrant scheme
 TIME_COLOURS = "viridis"  # of even lightness: also told apart in grey
 DPI = 200
+LAYOUT = "constrained"
 HOUR_S = 3600.0
 _UNITS = ((1e-9, "pm", 1e12), (1e-6, "nm", 1e9), (np.inf, "µm", 1e6))
 _STYLE: dict[str, Any] = {
@@ -43,7 +44,7 @@ def styled() -> Any:
 
 def figure(width_in: float, height_in: float) -> Figure:
     """An empty figure that needs no screen."""
-    made = Figure(figsize=(width_in, height_in), facecolor="white", layout="constrained")
+    made = Figure(figsize=(width_in, height_in), facecolor="white", layout=LAYOUT)
     FigureCanvasAgg(made)
     return made
 
