@@ -52,17 +52,8 @@ def run(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[AfspmRun]:
     address = ADDRESSES[request.param].format(port=port)
     (tmp_path / "overlay.toml").write_text(OVERLAY.format(port=port, address=address), encoding="utf-8")
     files = (str(FILES / "experiment.toml"), str(FILES / f"{request.param}.toml"), str(tmp_path / "overlay.toml"))
-    command = (
-        *AFSPM,
-        "run",
-        *files,
-        "--runs",
-        str(tmp_path / "runs"),
-        "--verbose",
-        "--no-report",
-        "--without",
-        "metadata",
-    )
+    options = ("--runs", str(tmp_path / "runs"), "--verbose", "--no-report", "--without", "metadata")
+    command = (*AFSPM, "run", *files, *options)
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, cwd=tmp_path
     )

@@ -31,7 +31,7 @@ PIXELS, EVERY_S, SWITCHED_ON = 48, 600.0, 4
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a figure looks like is not asked here."""
     monkeypatch.setattr("afspm.drift.figures.style.DPI", 30)
-    monkeypatch.setattr("afspm.drift.figures.style.LAYOUT", "none")
+    monkeypatch.setattr("afspm.drift.figures.style.LAYOUT", None)
 
 
 def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -> None:

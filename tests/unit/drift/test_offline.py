@@ -80,7 +80,7 @@ def test_an_album_holds_every_figure_that_there_is_something_for(
     from afspm.drift.registration import Matches
 
     monkeypatch.setattr(style, "DPI", 30)
-    monkeypatch.setattr(style, "LAYOUT", "none")
+    monkeypatch.setattr(style, "LAYOUT", None)
     run = record(12)
     scans = [DriftScan(np.random.default_rng(k).normal(size=(16, 16)), REGION, t, t) for k, t in enumerate(run.time_s)]
     at = np.random.default_rng(1).uniform(0.5e-6, 1.5e-6, (9, 2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib.style
 import numpy as np
@@ -20,7 +20,7 @@ WIDTH_IN = 7.2  # two columns of a journal
 ORANGE, BLUE, GREEN, MAGENTA, GREY = "#EE7733", "#0077BB", "#009988", "#EE3377", "#999999"  # P. Tol's vibrant scheme
 TIME_COLOURS = "viridis"  # of even lightness: also told apart in grey
 DPI = 200
-LAYOUT = "constrained"
+LAYOUT: Literal["constrained"] | None = "constrained"
 HOUR_S = 3600.0
 _UNITS = ((1e-9, "pm", 1e12), (1e-6, "nm", 1e9), (np.inf, "µm", 1e6))
 _STYLE: dict[str, Any] = {
