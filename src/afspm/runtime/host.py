@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -73,6 +74,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
         with activity.step():
             register_all(launch.messages)
             process = load(launch)
+        gc.freeze()  # what is loaded is there to the end, and is not looked through for garbage again and again
         activity.longest_step_s = DEFAULT_LONGEST_STEP_S
         context = Context(
             launch,

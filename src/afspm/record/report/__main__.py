@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 
+from afspm import garbage
 from afspm.errors import AfspmError
 from afspm.record.report.writing import write
 
+garbage.seldom()
 try:
     write(sys.argv[1])
 except AfspmError as error:

@@ -6,6 +6,7 @@ The first message on its standard input says what it is; the end of that input e
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -31,6 +32,7 @@ def main() -> int:
     except AfspmError as error:
         pipe.write(answers, {"is": "broken", "reason": str(error)})
         return 1
+    gc.freeze()  # what is loaded is there to the end, and is not looked through for garbage again and again
     try:
         while (message := pipe.read(asked)) is not None:
             worker.take(*message)
