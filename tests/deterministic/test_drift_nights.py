@@ -9,7 +9,7 @@ from drift_night import DriftNight
 from afspm.testing.deterministic.night import Plan, plan
 
 
-@pytest.mark.parametrize("seeds", [range(first, first + 6) for first in range(0, 18, 6)], ids=str)
+@pytest.mark.parametrize("seeds", [range(first, first + 6) for first in range(0, 12, 6)], ids=str)
 def test_every_invariant_holds_in_many_nights(seeds: range) -> None:
     for seed in seeds:
         DriftNight(plan(seed), trouble=(0.0, 0.1, 0.5)[seed % 3]).run()
@@ -33,7 +33,7 @@ def test_a_worker_in_trouble_costs_no_scan() -> None:
 
 
 def test_a_night_replays_exactly() -> None:
-    first, second = DriftNight(plan(7), trouble=0.3), DriftNight(plan(7), trouble=0.3)
+    first, second = (DriftNight(plan(7, hours=3.0), trouble=0.3) for _ in range(2))
     assert first.run() == second.run()
     assert first.scheduler.disk == second.scheduler.disk
     assert first.misplaced_m == second.misplaced_m

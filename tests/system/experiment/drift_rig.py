@@ -197,7 +197,8 @@ class Rig:
         (self._folder / "surveyor.py").write_text(SURVEYOR, encoding="utf-8")
         file = self._folder / "experiment.toml"
         file.write_text(EXPERIMENT.format(drift=drift, scans=scans, speed=speed), encoding="utf-8")
-        command = (*AFSPM, "run", str(file), "--runs", str(self._folder / "runs"), "--verbose", "--no-report")
+        options = ("--runs", str(self._folder / "runs"), "--verbose", "--no-report", "--without", "recorder")
+        command = (*AFSPM, "run", str(file), *options)
         process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,

@@ -35,19 +35,20 @@ class = "Metadata"
 EACH = ("recorder", "metadata", "tip_classifier", "tip_corrector", "microscope", "scheduler", "series")
 
 
-@pytest.mark.parametrize("when", ["while scanning", "between scans"])
-def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run, when: str) -> None:
-    one = run(more=MORE + QUICK, scans=20)
-    one.wait_for("scan 1 of 20")
-    for name in EACH:
-        one.wait_for_next(" witness ", "state SCANNING" if when == "while scanning" else "state FREE")
-        one.signal(name, signal.SIGKILL)
-        one.wait_up(name, times=2)
+def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run) -> None:
+    """While scanning, and between scans."""
+    one = run(more=MORE + QUICK, scans=40)
+    one.wait_for("scan 1 of 40")
+    for times, state in ((2, "SCANNING"), (3, "FREE")):
+        for name in EACH:
+            one.wait_for_next(" witness ", f"state {state}")
+            one.signal(name, signal.SIGKILL)
+            one.wait_up(name, times)
     assert one.end() == 0, one.output
-    require_each_once(one, 20)
-    require_each_row_once(one, 20)
+    require_each_once(one, 40)
+    require_each_row_once(one, 40)
     for name in EACH:
-        one.wait_for(f"{name} was restarted once")
+        one.wait_for(f"{name} was restarted twice")
 
 
 def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run) -> None:

@@ -48,7 +48,7 @@ def scans_on(microscope: str, folder: Path) -> Kept:
     (folder / "keeper.py").write_text(Path(__file__).with_name("keeper.py").read_text(encoding="utf-8"))
     files = [str(FILES / "experiment.toml"), str(FILES / f"{microscope}.toml"), str(overlay)]
     done = subprocess.run(
-        [*AFSPM, "run", *files, "--runs", str(folder / "runs"), "--no-report", "--without", "metadata"],
+        [*AFSPM, "run", *files, "--runs", str(folder / "runs"), "--no-report", "--without", "metadata,recorder"],
         capture_output=True,
         text=True,
         timeout=DEADLINE_S,

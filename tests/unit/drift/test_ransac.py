@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from afspm.drift.estimators.ransac import (
@@ -32,6 +32,7 @@ def points(seed: int, count: int = 30) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", FORMS)
+@settings(max_examples=30)
 @given(numbers=st.tuples(small, small, small, small), seed=st.integers(0, 1000))
 def test_what_made_the_points_is_found_among_wrong_pairs(
     name: str, numbers: tuple[float, float, float, float], seed: int
