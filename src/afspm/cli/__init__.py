@@ -5,13 +5,12 @@ from __future__ import annotations
 import io
 import sys
 
+from afspm import garbage
+
 
 def main() -> None:
     """Entry point. An error of ours is told in its own words; a traceback is kept for what nobody foresaw."""
-    from afspm import garbage
-
     garbage.seldom()
-
     from afspm.cli.app import app
     from afspm.errors import AfspmError
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
 import signal
@@ -13,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from afspm import wire
+from afspm import garbage, wire
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
@@ -74,7 +73,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
         with activity.step():
             register_all(launch.messages)
             process = load(launch)
-        gc.freeze()  # what is loaded is there to the end, and is not looked through for garbage again and again
+        garbage.loaded()
         activity.longest_step_s = DEFAULT_LONGEST_STEP_S
         context = Context(
             launch,

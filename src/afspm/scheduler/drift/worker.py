@@ -6,7 +6,6 @@ The first message on its standard input says what it is; the end of that input e
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 import sys
@@ -14,6 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
+from afspm import garbage
 from afspm.errors import AfspmError, FileError
 from afspm.scheduler.drift import pipe
 from afspm.scheduler.drift.settings import DriftSettings
@@ -32,7 +32,7 @@ def main() -> int:
     except AfspmError as error:
         pipe.write(answers, {"is": "broken", "reason": str(error)})
         return 1
-    gc.freeze()  # what is loaded is there to the end, and is not looked through for garbage again and again
+    garbage.loaded()
     try:
         while (message := pipe.read(asked)) is not None:
             worker.take(*message)
