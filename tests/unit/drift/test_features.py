@@ -108,7 +108,7 @@ def test_what_was_not_scanned_leaves_no_border_that_would_be_a_feature(kind: str
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_different_places_are_refused(kind: str) -> None:
-    for seed in range(2):
+    for seed in range(4):
         first, second = scanned(Waves(100 + seed), REGION, SHAPE), scanned(Waves(200 + seed), REGION, SHAPE, seed=1)
         found = estimator(kind).register(first, second)
         assert not found.accepted
