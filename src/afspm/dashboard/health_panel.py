@@ -43,7 +43,8 @@ class _Row:
             self._since = ui.label().classes("quiet").props('role="cell"')
             self._restarts = ui.label().classes("quiet").props('role="cell"')
             self._button = ui.button("Restart", on_click=lambda: steering.ask_restart(name))
-            self._button.props(f'flat dense no-caps aria-label="Restart {name}"')
+            self._button.props("flat dense no-caps")
+            self._button.props["aria-label"] = f"Restart {name}"  # as text of properties a name could set others
         self._steering = steering
         self._style = ""
 

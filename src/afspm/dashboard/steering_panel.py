@@ -194,7 +194,7 @@ def _button(text: str, on_click: Callable[..., object], colour: str | None = Non
 async def _asked(title: str, text: str, yes: str) -> bool:
     """Ask the viewer, in a dialog that Escape leaves."""
     with ui.dialog() as dialog, ui.card().classes("question").props('role="alertdialog"'):
-        ui.html(f"<h3>{title}</h3>", sanitize=True)
+        ui.html(f"<h3>{escape(title)}</h3>", sanitize=False)
         ui.label(text)
         with ui.element("div").classes("acts"):
             ui.button("Cancel", on_click=lambda: dialog.submit(None), color=None).props("no-caps flat autofocus")

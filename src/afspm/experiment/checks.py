@@ -14,7 +14,8 @@ from afspm.experiment.handlers import check_handlers
 from afspm.experiment.known import WIRE_SETTINGS
 from afspm.experiment.parts import Role, wire_of
 from afspm.experiment.resolved import Resolved
-from afspm.model import component_of
+from afspm.model import component_of, is_process_name
+from afspm.model.journal import LONGEST_PROCESS_NAME
 from afspm.transport.network import is_local
 
 # What translators and schedulers publish by themselves; scans and spectra continue with their kind.
@@ -34,8 +35,6 @@ PUBLISHED: Final = (
 CONTINUED: Final = ("Scan2d", "Spec1d", "ProcessStates", "Progress")
 LIVE: Final = "ScanLines"
 """Published only where it is asked for."""
-LONGEST_NAME = 100
-_NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
 
 
@@ -79,11 +78,11 @@ def _all_loaded(resolved: Resolved) -> bool:
 def check_names(resolved: Resolved) -> None:
     """A component's name is also that of files, on every system, and of a connection."""
     for part in resolved.parts.components:
-        if not _NAME.fullmatch(part.name) or len(part.name.encode()) > LONGEST_NAME:
+        if not is_process_name(part.name):
             resolved.findings.error(
                 f"[{part.name}] can't be the name of a component",
                 part.place,
-                f"letters, digits, _, - and spaces, at most {LONGEST_NAME} bytes, as in [tip_corrector]",
+                f"letters, digits, _, - and spaces, at most {LONGEST_PROCESS_NAME} bytes, as in [tip_corrector]",
             )
 
 

@@ -8,7 +8,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from afspm.logic.events import Codec, RequestIn
-from afspm.model import LogLines, ProcessCondition, ProcessState, ProcessStates, Progress, Told, component_of
+from afspm.model import (
+    LogLines,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    Progress,
+    Told,
+    component_of,
+    is_process_name,
+)
+from afspm.model.journal import LONGEST_PROCESS_NAME, PERSON
 from afspm.model.words import lasting
 
 SUPERVISOR = "supervisor"
@@ -80,6 +90,8 @@ class Telling:
             return "", f"a {told.message[:80]} is not published for others, or can't be read"
         if event.user not in (None, SUPERVISOR):
             return "", f"it takes the key of {SUPERVISOR!r} to speak of processes, not that of {event.user}"
+        if wrong := [name for name in _names(thing) if not is_process_name(name)]:
+            return "", f"{wrong[0][:LONGEST_PROCESS_NAME]!r} can't be the name of a process"
         if isinstance(thing, LogLines):
             return told.message, ""
         envelope, why = _named(told.message, thing.supervisor)
@@ -142,7 +154,12 @@ class Telling:
             del self._supervisors[next(iter(self._supervisors))]
 
 
+def _names(thing: ProcessStates | LogLines) -> list[str]:
+    """The names of the processes that are spoken of."""
+    return [one.name for one in (thing.lines if isinstance(thing, LogLines) else thing.processes)]
+
+
 def _named(message: str, whose: str) -> tuple[str, str]:
-    if not whose or len(whose) > 200 or "\0" in whose:
-        return "", f"a {message} does not say whose it is"
+    if not all(map(is_process_name, whose.split(PERSON))):
+        return "", f"a {message} does not say whose it is: {whose[:LONGEST_PROCESS_NAME]!r}"
     return f"{message}_{whose}", ""

@@ -27,6 +27,7 @@ from afspm.model.journal import (
     Progress,
     Told,
     component_of,
+    is_process_name,
 )
 from afspm.model.lines import ScanLines
 from afspm.model.packet import Packet, PacketHeader
@@ -76,5 +77,6 @@ __all__ = [
     "Spectrum",
     "Told",
     "component_of",
+    "is_process_name",
     "request_name",
 ]

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from enum import IntEnum
 
 PERSON = ":"
 """Between a component and the person that it acts for: "dashboard:Ada"."""
+LONGEST_PROCESS_NAME = 100
+"""In bytes: it is also the name of files, on every system."""
+_PROCESS_NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
+
+
+def is_process_name(name: str) -> bool:
+    """Return whether a process may be called so: letters, digits, _, -, +, dots and spaces between them."""
+    return _PROCESS_NAME.fullmatch(name) is not None and len(name.encode()) <= LONGEST_PROCESS_NAME
 
 
 def component_of(who: str) -> str:

@@ -105,6 +105,13 @@ def test_what_is_too_long_or_nobodys_is_refused(lab: Lab) -> None:
     assert "whose" in tell(lab, states("a", supervisor="")).reason
 
 
+@pytest.mark.parametrize("name", ["", "a\" autofocus onfocus='steal()'", "<b>", "a\0b", "x" * 101])
+def test_what_can_not_be_the_name_of_a_process_is_refused(lab: Lab, name: str) -> None:
+    for thing in (states("a", name), LogLines((LogLine(1, name, "INFO", "hello"),)), states("a", supervisor=name)):
+        assert tell(lab, thing).code == ControlResponse.FAILURE
+    assert orders(lab, tell(lab, states("tip corrector-2.b"))) == ()
+
+
 def test_with_keys_it_takes_that_of_the_supervisor(lab: Lab) -> None:
     assert tell(lab, states("a"), user="supervisor").code == OK
     assert tell(lab, states("a"), "series", user="series").code == ControlResponse.FAILURE
