@@ -29,21 +29,26 @@ def dashboard(
     port: Annotated[int | None, typer.Option(help="By default 8080, or any that is free.", show_default=False)] = None,
     certificate: Annotated[Path | None, typer.Option(help="PEM file, for https.", show_default=False)] = None,
     certificate_key: Annotated[Path | None, typer.Option(help="PEM file, its key.", show_default=False)] = None,
+    people: Annotated[
+        Path | None,
+        typer.Option(help='TOML file with a line for each person who may steer: Ada = "scrypt:…".', show_default=False),
+    ] = None,
     make_password: Annotated[
-        bool, typer.Option("--make-password", help="Ask for a password, print the line for the file, and end.")
+        bool, typer.Option("--make-password", help="Ask for a name and a password, print their line, and end.")
     ] = False,
 ) -> None:
     """Show a running experiment in the browser, and steer it.
 
     It joins the run as a notebook would: the experiment does not notice when it comes and goes. With an experiment file
-    of which nothing runs here it connects to where the file says that the scheduler is. A password for others is in the
-    environment: AFSPM_DASHBOARD_PASSWORD.
+    of which nothing runs here it connects to where the file says that the scheduler is. A password for those who only
+    look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
     """
     if make_password:
         _print_password()
         return
     settings: dict[str, Any] = {
         "host": host, "port": port, "certificate": certificate, "certificate_key": certificate_key,
+        "people": None if people is None else _people_in(people),
     }  # fmt: skip
     folder = _running_here(where)
     if folder is not None:
@@ -76,10 +81,27 @@ def _overlay() -> Path:
 
 
 def _print_password() -> None:
-    from afspm.dashboard.access import hashed
+    from afspm.dashboard.access import check_name, hashed
 
+    person = check_name(typer.prompt("Name (empty: a password for all who look)", default="", show_default=False))
     password = typer.prompt("Password", hide_input=True, confirmation_prompt=True)
-    typer.echo(f'password_hash = "{hashed(password)}"')
+    typer.echo(f'people."{person}" = "{hashed(password)}"' if person else f'password_hash = "{hashed(password)}"')
+
+
+def _people_in(file: Path) -> dict[str, str]:
+    """The names and hashes in a file of `--people`, with or without the `people.` that an experiment file needs."""
+    import tomllib
+
+    from afspm.errors import ConfigError
+
+    try:
+        found = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"can't be read: {error}", where=str(file), hint='lines like Ada = "scrypt:…"') from error
+    table = found.get("people", found)
+    if not isinstance(table, dict) or not all(isinstance(kept, str) for kept in table.values()):
+        raise ConfigError("that is no table of names and hashes", where=str(file), hint='lines like Ada = "scrypt:…"')
+    return table
 
 
 def _running_here(where: Path) -> Path | None:

@@ -1,4 +1,4 @@
-"""Who may look and who may steer: names, passwords, and the cookies that remember them."""
+"""Who may look and who may steer: names and passwords."""
 
 from __future__ import annotations
 
@@ -11,14 +11,11 @@ import re
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
+from afspm.dashboard.sessions import Sessions
 from afspm.errors import ConfigError
 
 PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
-TOKEN = "AFSPM_DASHBOARD_TOKEN"
-COOKIE = "afspm_dashboard"
-REMEMBERED_S = 30 * 24 * 3600
 LONGEST_NAME = 40
 _COST = {"n": 2**14, "r": 8, "p": 1}
 _NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
@@ -61,13 +58,15 @@ def check_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class Visitor:
-    """Whoever looks at the page.
+    """A viewer of the page.
 
     Attributes:
         person: the name; empty: only looks.
+        session: the key of the session; empty for a program that shows its password with each request.
     """
 
     person: str = ""
+    session: str = ""
 
     @property
     def may_steer(self) -> bool:
@@ -75,65 +74,73 @@ class Visitor:
 
 
 class Access:
-    """Decides who comes in.
+    """Decides who comes in, and who may steer.
+
+    On loopback without passwords everybody may look, and any name may steer. Where there is a common password, only
+    those who know it may look. Where there are persons, only they may steer, each with a password of the own.
 
     Args:
-        host: the address that is listened at. On loopback everybody may look, and gives a name to steer.
-        password_hash: see `hashed`; the password itself may be in the environment instead (AFSPM_DASHBOARD_PASSWORD),
-            as may a token (AFSPM_DASHBOARD_TOKEN) for programs and links.
-        now_s: the time in real seconds, for what is remembered and how often one may try.
-        secret: what cookies are signed with.
+        host: the address that is listened at.
+        password_hash: of the common password, see `hashed`; the password itself may be in the environment instead
+            (AFSPM_DASHBOARD_PASSWORD).
+        people: the hash of each person's password.
+        now_s: the time in real seconds, for sessions and for how often an address may try.
+        sessions: who has signed in.
 
     Raises:
-        ConfigError: other computers could reach it, and there is neither password nor token.
+        ConfigError: other computers could reach it, and there is no password; or a hash or a name is none.
     """
 
     def __init__(
         self,
         host: str,
         password_hash: str,
+        people: Mapping[str, str],
         now_s: Callable[[], float],
-        secret: bytes,
+        sessions: Sessions,
         environment: Mapping[str, str] = os.environ,
     ) -> None:
-        if password_hash and not is_hash(password_hash):
+        for person, kept in {"": password_hash, **people}.items():
+            _require_hash(person, kept)
+        password = environment.get(PASSWORD, "")
+        # "" is the name of those who only look
+        self._hashes = {**people, "": hashed(password) if password else password_hash}
+        self._local = is_loopback(host)
+        if not self._local and not any(self._hashes.values()):
             raise ConfigError(
-                "password_hash is not the hash of a password", where="dashboard",
-                hint="`afspm dashboard --make-password` makes one; the password itself doesn't belong into the file",
+                f"at {host} other computers can reach the dashboard, and it has no password", where="dashboard",
+                hint="set people or password_hash (`afspm dashboard --make-password`), or "
+                f"{PASSWORD} in the environment; or listen on 127.0.0.1",
             )  # fmt: skip
-        password, token = environment.get(PASSWORD, ""), environment.get(TOKEN, "")
-        self._password = hashed(password) if password else password_hash
-        self._token = hashlib.sha256(token.encode()).digest() if token else b""
-        self.is_open = is_loopback(host) and not self._password and not self._token
-        if not is_loopback(host) and not self._password and not self._token:
-            raise ConfigError(
-                f"at {host} other computers can reach the dashboard, and it has neither password nor token",
-                where="dashboard",
-                hint=f"set password_hash (`afspm dashboard --make-password`), or {PASSWORD} or {TOKEN} in the "
-                "environment; or listen on 127.0.0.1",
-            )
-        # with another password, what was signed before counts no more
-        self._key = hmac.digest(secret, f"{self._password and password_hash}|{password}|{token}".encode(), "sha256")
+        self._sessions = sessions
         self._now_s = now_s
         self._failures: OrderedDict[str, deque[float]] = OrderedDict()
+        self._proved: set[bytes] = set()
 
     @property
-    def wants_password(self) -> bool:
-        return bool(self._password)
+    def is_open(self) -> bool:
+        """Whether a name alone is enough to steer."""
+        return self._local and not any(self._hashes.values())
+
+    @property
+    def lets_look(self) -> bool:
+        """Whether everybody may look."""
+        return self._local and not self._hashes[""]
 
     def visitor(self, cookie: str | None) -> Visitor | None:
-        """Who shows a cookie; None: nobody who may come in."""
-        found = self._signed(cookie or "")
-        return Visitor() if found is None and self.is_open else found
+        """Return who shows a cookie; None: nobody who may come in."""
+        session = self._sessions.find(cookie or "")
+        if session is not None and session.proof == self._proof_of(session.person):
+            return Visitor(session.person, session.key)
+        return Visitor() if self.lets_look else None
 
-    def by_token(self, token: str, person: str, address: str) -> Visitor | None:
-        """Who shows a token; None if it is wrong, or was wrong too often."""
-        if self.wait_s(address):
-            return None
-        if self._is_token(token):
-            return Visitor(check_name(person))
-        self._remember_failure(address)
-        return None
+    def is_signed_in(self, visitor: Visitor) -> bool:
+        """Return whether the session of a visitor still stands: it ends when the person signs out anywhere."""
+        return not visitor.session or self._sessions.has(visitor.session)
+
+    def by_password(self, person: str, password: str, address: str) -> Visitor | None:
+        """Return who shows a name and a password with a request; None if that is wrong, or was wrong too often."""
+        return Visitor(person) if not self.wait_s(address) and self._proves(person, password, address) else None
 
     def wait_s(self, address: str) -> float:
         """How long an address that was wrong too often has to wait until it may try again; 0 if it needn't."""
@@ -143,38 +150,42 @@ class Access:
         return max(0.0, failures[0] + _TRIES_WITHIN_S - self._now_s())
 
     def enter(self, person: str, password: str, address: str) -> str | None:
-        """Come in by password or token; returns the cookie, None if it is wrong (then `wait_s` may be above zero).
+        """Sign in; returns the cookie, None if the password is wrong (then `wait_s` may be above zero).
 
-        It takes some hundredths of a second. Whoever has to wait is not even looked at.
+        It takes some hundredths of a second. An address that has to wait is not even looked at.
         """
-        if self.wait_s(address):
-            return None
-        if not self.is_open and not self._is_right(password):
-            self._remember_failure(address)
+        if self.wait_s(address) or not self._proves(person, password, address):
             return None
         self._failures.pop(address, None)
         return self.cookie(person)
 
     def cookie(self, person: str) -> str:
-        """What the browser shows next time."""
-        body = base64.urlsafe_b64encode(f"{int(self._now_s())}|{person}".encode()).decode()
-        return f"{body}.{self._signature(body)}"
+        """Begin a session; returns what the browser shows next time."""
+        return self._sessions.begin(person, self._proof_of(person))
 
-    def _signed(self, cookie: str) -> Visitor | None:
-        body, _, signature = cookie.partition(".")
-        if not signature or not hmac.compare_digest(self._signature(body).encode(), signature.encode()):
-            return None
-        since, _, person = base64.urlsafe_b64decode(body).decode().partition("|")
-        return Visitor(person) if self._now_s() - float(since) < REMEMBERED_S else None
+    def leave(self, cookie: str | None, *, everywhere: bool = False) -> None:
+        """End a session, or all of its person."""
+        self._sessions.end(cookie or "", everywhere=everywhere)
 
-    def _signature(self, body: str) -> str:
-        return hmac.new(self._key, body.encode(), "sha256").hexdigest()
+    def _proof_of(self, person: str) -> str:
+        """What a session was begun with: with another password it counts no more."""
+        if self.is_open:
+            return ""
+        return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()
 
-    def _is_right(self, password: str) -> bool:
-        return self._is_token(password) or (bool(self._password) and matches(password, self._password))
-
-    def _is_token(self, token: str) -> bool:
-        return bool(self._token) and hmac.compare_digest(hashlib.sha256(token.encode()).digest(), self._token)
+    def _proves(self, person: str, password: str, address: str) -> bool:
+        if self.is_open or (not person and self.lets_look):
+            return True
+        shown = hashlib.sha256(f"{person}\0{password}".encode()).digest()
+        if shown in self._proved:
+            return True
+        # for a name that nobody has it takes as long as for the others
+        kept = self._hashes.get(person) or _NOBODYS
+        if matches(password, kept) and kept is not _NOBODYS:
+            self._proved.add(shown)
+            return True
+        self._remember_failure(address)
+        return False
 
     def _remember_failure(self, address: str) -> None:
         failures = self._failures.setdefault(address, deque(maxlen=_TRIES))
@@ -186,19 +197,18 @@ class Access:
             failures.popleft()
 
 
-def secret_in(file: Path | None) -> bytes:
-    """The secret that cookies are signed with, kept so that they outlive a restart; None: of this life only."""
-    if file is None:
-        return os.urandom(32)
-    try:
-        return file.read_bytes()
-    except FileNotFoundError:
-        pass
-    secret = os.urandom(32)
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with os.fdopen(descriptor, "wb") as stream:
-        stream.write(secret)
-    return secret
+def _require_hash(person: str, kept: str) -> None:
+    setting = f"people, {person!r}" if person else "password_hash"
+    if person != check_name(person):
+        raise ConfigError(
+            f"{setting}: that can't be a name", where="dashboard",
+            hint=f"letters, digits, spaces, - . and ', at most {LONGEST_NAME}",
+        )  # fmt: skip
+    if (kept or person) and not is_hash(kept):
+        raise ConfigError(
+            f"{setting} is not the hash of a password", where="dashboard",
+            hint="`afspm dashboard --make-password` makes one; the password itself doesn't belong into the file",
+        )  # fmt: skip
 
 
 def _scrypt(password: str, salt: bytes) -> bytes:
@@ -207,3 +217,6 @@ def _scrypt(password: str, salt: bytes) -> bytes:
 
 def _text(data: bytes) -> str:
     return base64.b64encode(data).decode()
+
+
+_NOBODYS = f"scrypt:{_text(bytes(16))}:{_text(bytes(32))}"

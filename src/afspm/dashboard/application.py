@@ -60,7 +60,7 @@ def application(
     live.add_to(app)
     app.mount("/assets", StaticFiles(directory=ASSETS))
     audience = Audience()
-    services = Services(watch, Contents(watch, limits), steering, audience, title, simulated)
+    services = Services(watch, Contents(watch, limits), steering, audience, access, title, simulated)
 
     def page() -> None:
         request = ui.context.client.request

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from afspm.addresses import Listens
 from afspm.clock import ExperimentClock
-from afspm.dashboard.access import Access, is_loopback, secret_in
+from afspm.dashboard.access import Access, is_loopback
 from afspm.dashboard.allowed import allowed_region
 from afspm.dashboard.record import Archive
 from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
+from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.watch import Watch
 from afspm.errors import ConfigError
 from afspm.record.facts import name_in
@@ -29,10 +31,11 @@ class Dashboard(Component):
     processor first.
 
     Args:
-        host: the address to listen at. At any other than this computer's own a password or token is needed.
+        host: the address to listen at. At any other than this computer's own a password is needed.
         port: 0 for any that is free; None: 8080, or any if that is taken. A restart takes the same one.
-        password_hash: of the password, as `afspm dashboard --make-password` prints it. The password itself, or a token
-            for programs and links, may be in the environment: AFSPM_DASHBOARD_PASSWORD, AFSPM_DASHBOARD_TOKEN.
+        people: who may steer: the hash of each person's password, as `afspm dashboard --make-password` prints it.
+        password_hash: of a common password, with which one may look. The password itself may be in the environment:
+            AFSPM_DASHBOARD_PASSWORD.
         certificate, certificate_key: PEM files, for https.
 
     Raises:
@@ -47,6 +50,7 @@ class Dashboard(Component):
         self,
         host: str = "127.0.0.1",
         port: Annotated[int | None, Listens(host="host", keyed=False)] = None,
+        people: Mapping[str, str] | None = None,
         password_hash: str = "",
         certificate: Path | None = None,
         certificate_key: Path | None = None,
@@ -54,7 +58,7 @@ class Dashboard(Component):
         if (certificate is None) != (certificate_key is None):
             raise ConfigError("certificate and certificate_key belong together", where="dashboard")
         self._host, self._port = host, port
-        self._password_hash = password_hash
+        self._people, self._password_hash = dict(people or {}), password_hash
         self._certificate = None if certificate is None else Path(certificate)
         self._certificate_key = None if certificate_key is None else Path(certificate_key)
         self._server: PageServer | None = None
@@ -70,13 +74,14 @@ class Dashboard(Component):
 
         launch = self._context.launch
         state_dir = Path(launch.state_dir) if launch.state_dir else None
-        secret = secret_in(state_dir / f"{self.name}.secret" if state_dir else None)
-        access = Access(self._host, self._password_hash, ExperimentClock.real().now_s, secret)
+        now_s = ExperimentClock.real().now_s
+        sessions = Sessions(state_dir / f"{self.name}.sessions" if state_dir else None, now_s)
+        access = Access(self._host, self._password_hash, self._people, now_s, sessions)
         bound = listening(self._host, self._port or None, self._usual_ports())
         archive = Archive(self.run_dir if launch.run_dir else None)
         problems = self._context.problems
         self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off(self.run_dir))
-        self._steering = Steering(launch, self.clock, self._watch)
+        self._steering = Steering(launch, self.clock, self._watch, access)
         app, self._farewell = application(
             self._watch,
             self._steering,

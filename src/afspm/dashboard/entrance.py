@@ -6,8 +6,8 @@ import asyncio
 import html
 from typing import TYPE_CHECKING
 
-from afspm.dashboard.access import COOKIE, REMEMBERED_S, Access, check_name
-from afspm.dashboard.guard import ENTRANCE
+from afspm.dashboard.access import Access, check_name
+from afspm.dashboard.guard import ENTRANCE, cookie_header, cookie_in
 
 if TYPE_CHECKING:
     from fastapi import FastAPI, Request, Response
@@ -16,6 +16,7 @@ TLS_HINT = (
     "This connection is not encrypted: whoever is in between can read the password and steer. "
     "Set certificate and certificate_key of the dashboard in the experiment file."
 )
+WRONG = "That is not right. Each person has a password; the one for all lets you look, without a name."
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Sign in: {title}</title><link rel="stylesheet" href="/assets/dashboard.css"></head>
@@ -29,7 +30,7 @@ _PAGE = """<!doctype html>
 <button type="submit">{button}</button>
 {look}
 </form>{hint}</main></body></html>"""
-_PASSWORD = """<label for="password">{label}</label>
+_PASSWORD = """<label for="password">Password</label>
 <input id="password" name="password" type="password" autocomplete="current-password">"""
 
 
@@ -53,33 +54,31 @@ def add_entrance(app: FastAPI, access: Access, title: str, *, encrypted: bool, o
         cookie = await asyncio.to_thread(access.enter, name, password, address)
         if cookie is None:
             wait_s = access.wait_s(address)
-            later = f"Too many wrong ones: try again in {wait_s:.0f} s." if wait_s else "That is not right."
+            later = f"Too many wrong ones: try again in {wait_s:.0f} s." if wait_s else WRONG
             return page(person, later, 429 if wait_s else 403)
-        answer = RedirectResponse("/", 303)
-        answer.set_cookie(COOKIE, cookie, max_age=REMEMBERED_S, httponly=True, samesite="strict", secure=encrypted)
-        return answer
+        return RedirectResponse("/", 303, {"set-cookie": cookie_header(cookie, secure=encrypted)})
 
-    async def leave() -> Response:
-        answer = RedirectResponse(ENTRANCE, 303)
-        answer.delete_cookie(COOKIE)
-        return answer
+    async def leave(request: Request, everywhere: str = Form("")) -> Response:
+        cookie = cookie_in(request.headers.get("cookie", ""))
+        await asyncio.to_thread(access.leave, cookie, everywhere=bool(everywhere))
+        return RedirectResponse(ENTRANCE, 303, {"set-cookie": cookie_header("", secure=encrypted)})
 
     # annotations as text would be looked for where these names are not
     enter.__annotations__ = {"request": Request, "person": str, "password": str}
+    leave.__annotations__ = {"request": Request, "everywhere": str}
     app.get(ENTRANCE, response_model=None)(show)
     app.post(ENTRANCE, response_model=None)(enter)
     app.post("/logout", response_model=None)(leave)
 
 
 def _page(access: Access, title: str, person: str, wrong: str, hint: str) -> str:
-    label = "Password" if access.wants_password else "Token"
     return _PAGE.format(
         title=html.escape(title),
         person=html.escape(person, quote=True),
         why="What you do is in the record of the experiment with your name.",
-        password="" if access.is_open else _PASSWORD.format(label=label),
+        password="" if access.is_open else _PASSWORD,
         wrong=f'<p class="wrong" role="alert">{html.escape(wrong)}</p>' if wrong else "",
         button="Sign in",
-        look='<a href="/">Only look</a>' if access.is_open else "<small>Without a name you may only look.</small>",
+        look='<a href="/">Only look</a>' if access.lets_look else "<small>Without a name you may only look.</small>",
         hint=f'<p class="hint">{html.escape(hint)}</p>' if hint else "",
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable, MutableMapping
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from afspm.dashboard.access import COOKIE, Access, Visitor, is_loopback
+from afspm.dashboard.access import Access, Visitor, is_loopback
+from afspm.dashboard.sessions import COOKIE, REMEMBERED_S
 
 Scope = MutableMapping[str, Any]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
@@ -51,10 +53,12 @@ class Guard:
             await _refuse(scope, send, 403, wrong)
             return
         visitor = self._access.visitor(cookie_in(headers.get("cookie", "")))
-        if (shown := _token_in(scope, headers)) is not None:
-            visitor = self._access.by_token(*shown, address=(scope.get("client") or ("",))[0])
+        if (shown := _password_in(scope, headers)) is not None:
+            address = (scope.get("client") or ("",))[0]
+            visitor = await asyncio.to_thread(self._access.by_password, *shown, address)
             if visitor is not None and scope["path"] == "/" and "authorization" not in headers:
-                await self._remember(visitor, send)  # and out of the address line, where others see it
+                # and out of the address line, where others see it
+                await self._remember(visitor, send, secure=scope.get("scheme") in ("https", "wss"))
                 return
         if visitor is None and scope["path"] not in PUBLIC:
             await self._show_entrance(scope, headers, send)
@@ -71,8 +75,8 @@ class Guard:
             return f"a page of {origin} may not ask this dashboard"
         return None
 
-    async def _remember(self, visitor: Visitor, send: Send) -> None:
-        cookie = f"{COOKIE}={self._access.cookie(visitor.person)}; Path=/; HttpOnly; SameSite=Strict"
+    async def _remember(self, visitor: Visitor, send: Send, *, secure: bool) -> None:
+        cookie = cookie_header(self._access.cookie(visitor.person), secure=secure)
         headers = [(b"location", b"/"), (b"set-cookie", cookie.encode())]
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
@@ -95,14 +99,20 @@ def cookie_in(header: str) -> str | None:
     return found.value if found else None
 
 
-def _token_in(scope: Scope, headers: dict[str, str]) -> tuple[str, str] | None:
-    """(token, name of the person) as a program shows it, or a link."""
+def cookie_header(cookie: str, *, secure: bool) -> str:
+    """What sets our cookie in a browser; an empty one takes it away."""
+    life_s = REMEMBERED_S if cookie else 0
+    return f"{COOKIE}={cookie}; Path=/; Max-Age={life_s}; HttpOnly; SameSite=Strict{'; Secure' if secure else ''}"
+
+
+def _password_in(scope: Scope, headers: dict[str, str]) -> tuple[str, str] | None:
+    """(name of the person, password) as a program shows it, or a link."""
     asked = parse_qs(scope.get("query_string", b"").decode("latin-1"))
     person = asked.get("name", [""])[0]
     shown = headers.get("authorization", "")
     if shown.startswith("Bearer "):
-        return shown.removeprefix("Bearer "), person
-    return (asked["token"][0], person) if "token" in asked else None
+        return person, shown.removeprefix("Bearer ")
+    return (person, asked["token"][0]) if "token" in asked else None
 
 
 async def _refuse(scope: Scope, send: Send, status: int, why: str) -> None:

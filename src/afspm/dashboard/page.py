@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 from nicegui import events, ui
 
-from afspm.dashboard.access import Visitor
+from afspm.dashboard.access import Access, Visitor
 from afspm.dashboard.audience import Audience
 from afspm.dashboard.content import Content, Contents
 from afspm.dashboard.curves import spectrum_html
+from afspm.dashboard.guard import ENTRANCE
 from afspm.dashboard.health_panel import HealthPanel
 from afspm.dashboard.log_panel import LogPanel
 from afspm.dashboard.palettes import PALETTES
@@ -42,6 +43,7 @@ class Services:
     contents: Contents
     steering: Steering
     audience: Audience
+    access: Access
     title: str
     simulated: bool
 
@@ -91,7 +93,8 @@ class Page:
         name = escape(self._visitor.person)
         ui.html(
             f'<form method="post" action="/logout"><span class="person">{name}</span> '
-            '<button type="submit" class="sign">Sign out</button></form>',
+            '<button type="submit" class="sign">Sign out</button> '
+            '<button type="submit" class="sign" name="everywhere" value="yes">everywhere</button></form>',
             sanitize=False,
         )
 
@@ -122,6 +125,11 @@ class Page:
 
     async def _refresh(self) -> None:
         """Bring the page up to date, and wait until the browser has drawn that: nothing is queued for a slow one."""
+        if not self._services.access.is_signed_in(self._visitor):
+            self._timer.deactivate()
+            self._services.audience.leave(self)
+            ui.navigate.to(ENTRANCE)
+            return
         content = self._services.contents.get()
         self._status.set_content(content.status)
         self._content = content

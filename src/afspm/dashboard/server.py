@@ -84,6 +84,7 @@ class PageServer:
             log_config=None,
             access_log=False,
             lifespan="on",
+            proxy_headers=False,  # what a request says of its origin is anybody's word, and passwords are tried by it
             timeout_graceful_shutdown=1,
             ssl_certfile=certificate,
             ssl_keyfile=key,

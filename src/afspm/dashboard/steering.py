@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from afspm.clock import Clock
-from afspm.dashboard.access import check_name
+from afspm.dashboard.access import Access, Visitor, check_name
 from afspm.dashboard.acts import Acts, Outcome
 from afspm.dashboard.watch import Watch
 from afspm.errors import AfspmError
@@ -40,19 +40,22 @@ class Steering:
 
     Args:
         launch: the line that the dashboard was started with; persons reach the scheduler as it does, with its keys.
+        access: knows who has signed in.
     """
 
-    def __init__(self, launch: Launch, clock: Clock, watch: Watch) -> None:
+    def __init__(self, launch: Launch, clock: Clock, watch: Watch, access: Access) -> None:
         self._launch = launch
+        self._access = access
         self._clock = clock
         self._watch = watch
         self._lock = threading.Lock()
         self._persons: OrderedDict[str, _Person] = OrderedDict()
         self._log = logging.getLogger("afspm.dashboard")
 
-    def do(self, person: str, act: Act) -> Future[Outcome]:
-        """Carry out an act in the name of a person, who must have one."""
-        if not check_name(person):
+    def do(self, visitor: Visitor, act: Act) -> Future[Outcome]:
+        """Carry out an act in the name of a person, who must have one and not have signed out."""
+        person = check_name(visitor.person)
+        if not person or not self._access.is_signed_in(visitor):
             done: Future[Outcome] = Future()
             done.set_result(Outcome("Sign in first: what is done is in the record with a name.", ok=False))
             return done

@@ -173,7 +173,7 @@ class SteeringPanel:
         background_tasks.create(doing())
 
     async def _carry_out(self, act: Act) -> Outcome:
-        return await asyncio.wrap_future(self._steering.do(self._visitor.person, act))
+        return await asyncio.wrap_future(self._steering.do(self._visitor, act))
 
     def _say(self, outcome: Outcome) -> None:
         style = "done" if outcome.ok else "refused"

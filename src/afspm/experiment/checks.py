@@ -15,7 +15,7 @@ from afspm.experiment.known import WIRE_SETTINGS
 from afspm.experiment.parts import Role, wire_of
 from afspm.experiment.resolved import Resolved
 from afspm.model import component_of, is_process_name
-from afspm.model.journal import LONGEST_PROCESS_NAME
+from afspm.model.journal import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
 
 # What translators and schedulers publish by themselves; scans and spectra continue with their kind.
@@ -268,6 +268,12 @@ def check_names_of_people(resolved: Resolved) -> None:
                 place = resolved.document.place("control", "roles", role, i)
                 what = f"[control.roles] {role}: there is no {member!r} among components and keys"
                 resolved.findings.error(what, place, nearest(member, names))
+            elif not _has_password(resolved, member):
+                resolved.findings.warning(
+                    f"[control.roles] {role}: {member!r} has no password, whoever types the name has the role",
+                    resolved.document.place("control", "roles", role, i),
+                    f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]",
+                )
     if any_role and keys is None:
         resolved.findings.warning(
             "[control.roles] without keys: whoever takes the name has the role",
@@ -279,6 +285,13 @@ def check_names_of_people(resolved: Resolved) -> None:
             f"[security] keys: there is no folder {str(keys)!r}", resolved.document.place("security", "keys"),
             "`afspm keys` makes it"
         )  # fmt: skip
+
+
+def _has_password(resolved: Resolved, member: str) -> bool:
+    """False for a person of a dashboard that does not know the password of this person."""
+    component, _, person = member.partition(PERSON)
+    operates = getattr(resolved.classes.get(component), "operates", False) is True
+    return not (person and operates) or person in (resolved.settings[component].get("people") or {})
 
 
 def check_likely_typos(resolved: Resolved) -> None:

@@ -23,14 +23,23 @@ _DAMAGED = (ValueError, KeyError, TypeError)
 LONGEST = 1 << 20
 """Bytes of a file with its generations, before it is begun anew."""
 _TRIES, _AGAIN_S = 50, 0.01
+_ANYONE = 0o666
 
 
-def replace(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True, aside: Path | None = None) -> None:
+def replace(
+    path: Path,
+    parts: Iterable[bytes | memoryview],
+    *,
+    synced: bool = True,
+    aside: Path | None = None,
+    mode: int = _ANYONE,
+) -> None:
     """Write a file so that it is there completely or as it was before, whenever the process is killed.
 
     Args:
         synced: the same of a power cut; that waits for the disk.
         aside: where it is written before it has its name; None: under a hidden name of this process beside it.
+        mode: of the file, before the umask; 0o600 for secrets: it never has another, not even for a moment.
 
     Raises:
         OSError: it can't be written.
@@ -38,7 +47,9 @@ def replace(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = T
     aside = aside or path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(exist_ok=True)  # and no more: under a drive that is away there may be an empty folder
-        with aside.open("wb") as file:
+        if mode != _ANYONE:
+            aside.unlink(missing_ok=True)  # one that was left there has a mode of its own
+        with open(aside, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.writelines(parts)
             if synced:
                 file.flush()

@@ -8,7 +8,6 @@ import pytest
 
 from afspm.dashboard.access import (
     PASSWORD,
-    TOKEN,
     Access,
     Visitor,
     check_name,
@@ -16,11 +15,12 @@ from afspm.dashboard.access import (
     is_hash,
     is_loopback,
     matches,
-    secret_in,
 )
+from afspm.dashboard.sessions import MOST, Sessions
 from afspm.errors import ConfigError
 
 KEPT = hashed("open sesame")
+ADAS = hashed("analytical")
 
 
 class Time:
@@ -31,8 +31,22 @@ class Time:
         return self.now_s
 
 
-def access(host: str = "0.0.0.0", kept: str = KEPT, time: Time | None = None, **environment: str) -> Access:
-    return Access(host, kept, time or Time(), b"s" * 32, environment)
+def access(
+    host: str = "0.0.0.0",
+    kept: str = KEPT,
+    time: Time | None = None,
+    people: dict[str, str] | None = None,
+    file: Path | None = None,
+    **environment: str,
+) -> Access:
+    time = time or Time()
+    return Access(host, kept, {"Ada": ADAS} if people is None else people, time, Sessions(file, time), environment)
+
+
+def who(guard: Access, cookie: str | None) -> str | None:
+    """The name of who shows a cookie; None: nobody who may come in."""
+    visitor = guard.visitor(cookie)
+    return None if visitor is None else visitor.person
 
 
 def test_a_password_is_kept_as_a_hash_that_is_different_each_time() -> None:
@@ -53,104 +67,159 @@ def test_loopback_is_this_computer_alone(host: str, expected: bool) -> None:
 
 
 def test_on_loopback_anybody_may_look_and_a_name_is_enough_to_steer() -> None:
-    guard = access("127.0.0.1", "")
+    guard = access("127.0.0.1", "", people={})
     assert guard.visitor(None) == Visitor("")
-    cookie = guard.enter("Ada", "", "127.0.0.1")
-    assert guard.visitor(cookie) == Visitor("Ada")
+    assert who(guard, guard.enter("Ada", "", "127.0.0.1")) == "Ada"
     assert Visitor("Ada").may_steer
     assert not Visitor().may_steer
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.4", "::", ""])
 def test_where_others_can_reach_it_it_refuses_to_start_without_a_password(host: str) -> None:
-    with pytest.raises(ConfigError, match="neither password nor token"):
-        access(host, "")
+    with pytest.raises(ConfigError, match="has no password"):
+        access(host, "", people={})
 
 
 def test_a_plain_password_in_the_file_is_refused() -> None:
     with pytest.raises(ConfigError, match="not the hash"):
         access(kept="open sesame")
+    with pytest.raises(ConfigError, match="'Ada' is not the hash"):
+        access(people={"Ada": "analytical"})
+    with pytest.raises(ConfigError, match="not the hash"):
+        access(people={"Ada": ""})
+    with pytest.raises(ConfigError, match="can't be a name"):
+        access(people={"a:b": ADAS})
 
 
-def test_elsewhere_nobody_looks_without_the_password() -> None:
+def test_elsewhere_nobody_looks_without_a_password() -> None:
     guard = access()
     assert guard.visitor(None) is None
-    assert guard.enter("Ada", "wrong", "10.0.0.2") is None
-    cookie = guard.enter("Ada", "open sesame", "10.0.0.2")
-    assert guard.visitor(cookie) == Visitor("Ada")
+    assert guard.enter("", "wrong", "10.0.0.2") is None
+    assert who(guard, guard.enter("", "open sesame", "10.0.0.2")) == ""
+    assert who(guard, guard.enter("Ada", "analytical", "10.0.0.2")) == "Ada"
 
 
-def test_the_password_may_be_in_the_environment() -> None:
-    guard = access(kept="", **{PASSWORD: "from the shell"})
-    assert guard.enter("Ada", "from the shell", "x") is not None
-    assert guard.enter("Ada", "", "x") is None
+@pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1"])
+@pytest.mark.parametrize("kept", [KEPT, ""], ids=["common", "none"])
+def test_nobody_takes_the_name_of_another_nor_one_that_is_not_in_the_file(host: str, kept: str) -> None:
+    guard = access(host, kept, people={"Ada": ADAS, "Max": KEPT})
+    assert guard.enter("Ada", "open sesame", "x") is None
+    assert guard.enter("Eve", "analytical", "x") is None
+    assert guard.enter("Eve", "open sesame", "x") is None
+    assert guard.by_password("Ada", "open sesame", "x") is None
+    assert who(guard, guard.enter("Ada", "analytical", "y")) == "Ada"
+
+
+def test_the_common_password_may_be_in_the_environment_and_lets_look_only() -> None:
+    guard = access(kept="", people={}, **{PASSWORD: "from the shell"})
+    assert who(guard, guard.enter("", "from the shell", "x")) == ""
+    assert guard.enter("Ada", "from the shell", "x") is None
+    assert guard.enter("", "", "x") is None
 
 
 def test_a_password_on_loopback_is_asked_for_too() -> None:
     assert access("127.0.0.1").visitor(None) is None
 
 
-def test_a_token_lets_in_and_may_say_who() -> None:
-    guard = access(kept="", **{TOKEN: "t0ken"})
-    assert guard.by_token("t0ken", "Ada", "x") == Visitor("Ada")
-    assert guard.by_token("t0ken", "", "x") == Visitor("")
-    assert guard.by_token("token", "Ada", "x") is None
-    assert guard.by_token("", "Ada", "x") is None
+def test_on_loopback_with_persons_everybody_looks_and_only_they_steer() -> None:
+    guard = access("127.0.0.1", "")
+    assert guard.visitor(None) == Visitor()
+    assert who(guard, guard.enter("", "", "x")) == ""
+    assert guard.enter("Ada", "", "x") is None
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda cookie: cookie[:-1] + ("0" if cookie[-1] != "0" else "1"),
-        lambda cookie: "x" + cookie,
-        lambda cookie: "",
-        lambda cookie: cookie.split(".")[0],
-        lambda cookie: "QWRh." + cookie.split(".")[1],
-        lambda cookie: cookie + "é",
-    ],
-)
-def test_a_cookie_that_was_not_signed_here_counts_for_nothing(change: object) -> None:
+def test_a_program_shows_its_name_and_password_each_time() -> None:
     guard = access()
-    cookie = guard.enter("Ada", "open sesame", "x")
+    for _ in range(2):
+        assert guard.by_password("Ada", "analytical", "x") == Visitor("Ada")
+    assert guard.by_password("", "open sesame", "x") == Visitor("")
+    assert guard.by_password("Ada", "", "x") is None
+
+
+@pytest.mark.parametrize("change", [lambda c: c[:-1], lambda c: "x" + c, lambda c: "", lambda c: c + "é"])
+def test_a_cookie_that_was_not_given_here_counts_for_nothing(change: object) -> None:
+    guard = access()
+    cookie = guard.enter("Ada", "analytical", "x")
     assert cookie is not None
     assert callable(change)
     assert guard.visitor(change(cookie)) is None
 
 
-def test_a_cookie_outlives_a_restart_but_not_another_password() -> None:
-    cookie = access().cookie("Ada")
-    assert access().visitor(cookie) == Visitor("Ada")
-    assert access(kept=hashed("another")).visitor(cookie) is None
-    assert Access("0.0.0.0", KEPT, Time(), b"other", {}).visitor(cookie) is None
+def test_a_session_outlives_a_restart_but_not_another_password(tmp_path: Path) -> None:
+    file = tmp_path / "dashboard.sessions"
+    cookie = access(file=file).cookie("Ada")
+    assert who(access(file=file), cookie) == "Ada"
+    assert who(access(file=file, people={"Ada": hashed("another")}), cookie) is None
+    assert who(access(file=file, people={}), cookie) is None
+    assert who(access(), cookie) is None
+    assert cookie not in file.read_text(encoding="utf-8")
+    if sys.platform != "win32":
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
-def test_a_cookie_is_forgotten_after_a_month() -> None:
+def test_after_signing_out_a_cookie_counts_no_more_even_after_a_restart(tmp_path: Path) -> None:
+    file = tmp_path / "dashboard.sessions"
+    guard = access(file=file)
+    here, there, others = guard.cookie("Ada"), guard.cookie("Ada"), guard.cookie("")
+    visitor = guard.visitor(here)
+    assert visitor is not None
+    assert guard.is_signed_in(visitor)
+    guard.leave(here)
+    assert not guard.is_signed_in(visitor)
+    for one in (guard, access(file=file)):
+        assert [who(one, cookie) for cookie in (here, there, others)] == [None, "Ada", ""]
+    guard.leave(there, everywhere=True)
+    assert [who(access(file=file), cookie) for cookie in (there, others)] == [None, ""]
+
+
+def test_everywhere_means_every_session_of_this_person() -> None:
+    guard = access()
+    cookies = [guard.cookie("Ada") for _ in range(3)]
+    guard.leave(cookies[0], everywhere=True)
+    assert [who(guard, cookie) for cookie in cookies] == [None] * 3
+
+
+def test_a_damaged_file_of_sessions_means_signing_in_anew(tmp_path: Path) -> None:
+    file = tmp_path / "dashboard.sessions"
+    for damaged in (b"", b"[{}]", b"{", b"7", b"\xff"):
+        file.write_bytes(damaged)
+        assert access(file=file).visitor("x") is None
+
+
+def test_sessions_are_no_more_than_can_be_kept() -> None:
+    guard = access()
+    first, last = guard.cookie("Ada"), [guard.cookie("Ada") for _ in range(MOST)][-1]
+    assert [who(guard, first), who(guard, last)] == [None, "Ada"]
+
+
+def test_a_session_ends_after_a_month() -> None:
     time = Time()
     guard = access(time=time)
     cookie = guard.cookie("Ada")
     time.now_s += 29 * 24 * 3600
-    assert guard.visitor(cookie) == Visitor("Ada")
+    assert who(guard, cookie) == "Ada"
     time.now_s += 2 * 24 * 3600
     assert guard.visitor(cookie) is None
 
 
 def test_whoever_was_wrong_too_often_has_to_wait_even_with_the_right_password() -> None:
     time = Time()
-    guard = access(time=time, **{TOKEN: "t0ken"})
+    guard = access(time=time)
     for _ in range(5):
-        assert guard.by_token("guess", "", "10.0.0.9") is None
+        assert guard.by_password("Ada", "guess", "10.0.0.9") is None
     assert guard.wait_s("10.0.0.9") == pytest.approx(60.0)
-    assert guard.enter("Eve", "open sesame", "10.0.0.9") is None
-    assert guard.by_token("t0ken", "", "10.0.0.9") is None
-    assert guard.enter("Ada", "open sesame", "10.0.0.2") is not None
+    assert guard.enter("Ada", "analytical", "10.0.0.9") is None
+    assert guard.by_password("Ada", "analytical", "10.0.0.9") is None
+    assert guard.enter("Ada", "analytical", "10.0.0.2") is not None
     time.now_s += 61.0
-    assert guard.enter("Eve", "open sesame", "10.0.0.9") is not None
+    assert guard.enter("Ada", "analytical", "10.0.0.9") is not None
 
 
-def test_many_that_are_wrong_take_no_more_memory() -> None:
+def test_many_that_are_wrong_take_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("afspm.dashboard.access.matches", lambda password, kept: False)  # which takes its time
     guard = access()
     for i in range(3000):
-        guard.by_token("guess", "", f"10.0.{i // 256}.{i % 256}")
+        guard.by_password("", "guess", f"10.0.{i // 256}.{i % 256}")
     assert len(guard._failures) <= 1000
 
 
@@ -161,13 +230,3 @@ def test_many_that_are_wrong_take_no_more_memory() -> None:
 )  # fmt: skip
 def test_names_are_what_may_stand_in_the_record(given: str, expected: str) -> None:
     assert check_name(given) == expected
-
-
-def test_the_secret_is_kept_for_oneself(tmp_path: Path) -> None:
-    file = tmp_path / "dashboard.secret"
-    secret = secret_in(file)
-    assert secret_in(file) == secret
-    assert len(secret) == 32
-    assert secret_in(None) != secret_in(None)
-    if sys.platform != "win32":
-        assert stat.S_IMODE(file.stat().st_mode) == 0o600

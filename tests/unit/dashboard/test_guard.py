@@ -9,11 +9,13 @@ import httpx
 import pytest
 from fastapi import FastAPI, Request, WebSocket
 
-from afspm.dashboard.access import TOKEN, Access, hashed
+from afspm.dashboard.access import Access, hashed
 from afspm.dashboard.entrance import add_entrance
 from afspm.dashboard.guard import VISITOR, Guard
+from afspm.dashboard.sessions import Sessions
 
 KEPT = hashed("open sesame")
+PEOPLE = {"Ada": hashed("analytical")}
 
 
 def completed(doing: Coroutine[Any, Any, Any]) -> Any:
@@ -68,8 +70,8 @@ Served = Callable[..., Browser]
 
 @pytest.fixture
 def served() -> Served:
-    def serve(host: str = "127.0.0.1", kept: str = "", at: str = "http://127.0.0.1:8080", **more: str) -> Browser:
-        access = Access(host, kept, lambda: 1000.0, b"s" * 32, more)
+    def serve(host: str = "127.0.0.1", kept: str = "", at: str = "http://127.0.0.1:8080") -> Browser:
+        access = Access(host, kept, PEOPLE if kept else {}, lambda: 1000.0, Sessions(None, lambda: 1000.0), {})
         app = FastAPI()
         add_entrance(app, access, "night <1>", encrypted=at.startswith("https"), only_here=host == "127.0.0.1")
 
@@ -117,11 +119,22 @@ def test_elsewhere_everything_but_the_entrance_is_closed(served: Served) -> None
 def test_the_password_opens_it(served: Served) -> None:
     browser = served("0.0.0.0", KEPT, "https://lab:8080")
     assert browser.post("/login", data={"person": "Eve", "password": "guess"}).status_code == 403
-    answer = browser.post("/login", data={"person": "Ada", "password": "open sesame"})
+    answer = browser.post("/login", data={"person": "Ada", "password": "analytical"})
     assert answer.status_code == 303
     assert "secure" in answer.headers["set-cookie"].lower()
     assert browser.get("/").json() == {"person": "Ada"}
     assert browser.talk("https://lab:8080") == ["accept", "hello", "close"]
+
+
+@pytest.mark.parametrize("everywhere", ["", "yes"])
+def test_a_cookie_is_worth_nothing_after_signing_out(served: Served, everywhere: str) -> None:
+    browser = served("0.0.0.0", KEPT, "https://lab:8080")
+    browser.post("/login", data={"person": "Ada", "password": "analytical"})
+    (kept,) = [f"{cookie.name}={cookie.value}" for cookie in browser._cookies.jar]
+    assert browser.get("/", headers={"cookie": kept}).status_code == 200
+    browser.post("/logout", data={"everywhere": everywhere})
+    assert not browser._cookies.jar._cookies.get("lab", {})  # type: ignore[attr-defined]
+    assert browser.get("/", headers={"cookie": kept}).status_code == 401
 
 
 def test_guessing_is_slowed_down_and_said_to_be(served: Served) -> None:
@@ -132,16 +145,18 @@ def test_guessing_is_slowed_down_and_said_to_be(served: Served) -> None:
 
 
 def test_a_link_with_a_token_opens_it_and_the_token_is_not_left_in_the_address(served: Served) -> None:
-    browser = served("0.0.0.0", "", "http://lab:8080", **{TOKEN: "t0ken"})
-    answer = browser.get("/?token=t0ken&name=Ada", headers={"accept": "text/html"})
+    browser = served("0.0.0.0", KEPT, "http://lab:8080")
+    answer = browser.get("/?token=analytical&name=Ada", headers={"accept": "text/html"})
     assert (answer.status_code, answer.headers["location"]) == (303, "/")
     assert browser.get("/").json() == {"person": "Ada"}
 
 
 def test_a_program_shows_its_token_each_time(served: Served) -> None:
-    browser = served("0.0.0.0", "", "http://lab:8080", **{TOKEN: "t0ken"})
-    assert browser.post("/act", headers={"authorization": "Bearer t0ken"}).status_code == 200
-    assert browser.post("/act", headers={"authorization": "Bearer other"}).status_code == 401
+    browser = served("0.0.0.0", KEPT, "http://lab:8080")
+    shown = {"authorization": "Bearer analytical"}
+    assert browser.post("/act?name=Ada", headers=shown).json() == {"person": "Ada"}
+    assert browser.post("/act", headers=shown).status_code == 401
+    assert browser.post("/act", headers={"authorization": "Bearer open sesame"}).json() == {"person": ""}
     assert browser.post("/act").status_code == 401
 
 

@@ -10,7 +10,7 @@ import ssl
 import subprocess
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 import pytest
 
@@ -58,6 +58,26 @@ def test_whoever_trusts_the_certificate_comes_in_encrypted(certificate: Path) ->
     finally:
         server.stop()
     assert not server.has_failed
+
+
+def test_a_forged_header_is_not_the_address_of_whoever_asks() -> None:
+    """By the address it is counted how often somebody was wrong."""
+
+    async def origin(scope: Any, receive: Any, send: Any) -> None:
+        await hello({**scope, "scheme": scope.get("client", ("",))[0]}, receive, send)
+
+    bound = listening("127.0.0.1", 0)
+    server = PageServer(origin, bound, None, None)
+    server.start()
+    try:
+        forged = Request(
+            url_of("127.0.0.1", bound.getsockname()[1], encrypted=False),
+            headers={"X-Forwarded-For": "10.9.8.7", "X-Forwarded-Proto": "https"},
+        )
+        with urlopen(forged, timeout=10.0) as answer:
+            assert answer.read() == b"127.0.0.1"
+    finally:
+        server.stop()
 
 
 def test_what_is_no_certificate_is_refused(certificate: Path) -> None:

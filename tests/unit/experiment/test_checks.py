@@ -262,6 +262,14 @@ def test_roles_without_keys_are_a_warning(write: Write) -> None:
     assert any("without keys" in f.what for f in experiment.check())
 
 
+def test_a_role_of_a_person_without_a_password_is_told(write: Write) -> None:
+    roles = '[dashboard]\ncomponent = true\nclass = "Dashboard"\n{}[control.roles]\nset_mode = ["dashboard:Ada"]\n'
+    people = f'people.Ada = "scrypt:{"A" * 24}:{"A" * 44}"\n'
+    for more, told in (("", True), (people, False), (people.replace("Ada", "Max"), True)):
+        found = write(CORRECTOR + roles.format(more)).check()
+        assert any("has no password" in finding.what for finding in found) is told
+
+
 def test_a_text_that_is_nearly_a_variable_is_a_warning(write: Write) -> None:
     experiment = write('channel_id = "Height"\n' + ANYTHING + 'channel = "chanel_id"\n')
     assert not errors(experiment)
