@@ -40,7 +40,7 @@ test-ui: $(SETUP)
 	@$(BIN)/pytest tests/ui
 
 ## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
-TRANSLATORS ?= simulator image nanonis asylum gxsm
+TRANSLATORS ?= simulator image emulated_nanonis emulated_asylum emulated_gxsm
 test-translators: $(SETUP)
 	@failed=; for name in $(TRANSLATORS); do \
 	  $(BIN)/afspm test-translator experiments/every_microscope/$$name.toml --frame "500 nm" --runs build/translators \

@@ -54,12 +54,10 @@ class Listens:
 
     Attributes:
         host: of a port: the setting that names the host; empty: this computer only.
-        usual: the attribute of the class with the value that holds where none is given; empty: any that is free.
         keyed: whether it is ours to keep strangers out, with the keys of the experiment; a page has its passwords.
     """
 
     host: str = ""
-    usual: str = ""
     keyed: bool = True
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:

@@ -19,10 +19,10 @@ def emulate(
             metavar="SETTING=VALUE…", help="Other settings, values as in TOML: surface=steps", show_default=False
         ),
     ] = None,
-    port: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="0: any free one. Default: the vendor's usual one.", show_default=False),
-    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
+    usual: Annotated[
+        bool, typer.Option("--usual", help="Listen where the vendor's own controller does, for clients that expect it.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Everything left to chance follows from it.")] = 1,
     speed: Annotated[float, typer.Option(min=1e-6, help="Experiment seconds in a real second.")] = 1.0,
     fault: Annotated[
@@ -38,7 +38,8 @@ def emulate(
 ) -> None:
     """Emulate a vendor's controller: its own protocol, simulated physics behind it.
 
-    Runs until Ctrl-C. It listens on this computer only.
+    Runs until Ctrl-C. It listens on this computer only, at a free port unless it is told another: whoever connects
+    to the vendor's usual port may expect a real controller there.
     """
     from afspm.emulators.known import emulator, names
 
@@ -47,7 +48,8 @@ def emulate(
             typer.echo(_described(known, emulator(known)))
         return
     class_ = emulator(name)
-    made = class_(port=port, seed=seed, faults=fault or [], **_settings(settings or []))
+    given = {**(class_.usual if usual else {}), **({"port": port} if port else {}), **_settings(settings or [])}
+    made = class_(seed=seed, faults=fault or [], **given)
     made.check()
     _run(made, speed, folder or Path(f"emulated-{class_.vendor.lower()}"))
 
@@ -64,7 +66,8 @@ def _run(emulator: Emulator, speed: float, folder: Path) -> None:
         signal.signal(number, lambda *_: emulator.stop())
 
     def listening(address: str) -> None:
-        typer.echo(f"SIMULATED {emulator.vendor} controller: listening at {address}, files in {folder.resolve()}")
+        where = f"listening at {address}, files in {folder.resolve()}" if address else "does not listen for now"
+        typer.echo(f"SIMULATED {emulator.vendor} controller: {where}")
 
     try:
         emulator.run(ExperimentClock.starting_now(speed=speed), folder.resolve(), log, listening)

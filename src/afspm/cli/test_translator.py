@@ -93,9 +93,9 @@ def _list() -> None:
 
 
 def _is_simulated(options: Options) -> bool:
-    from afspm.testing.translators.session import prepare
+    from afspm.testing.translators.session import is_simulated, prepare
 
-    return prepare(options).resolved.simulated
+    return is_simulated(prepare(options), options)
 
 
 def _run(options: Options, console: Console, copy: Path | None) -> None:

@@ -17,6 +17,7 @@ from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, Gathered
 from afspm.exit_codes import ExitCode
+from afspm.microscopes.emulated import Notice, notice_file
 from afspm.transport.launching import open_port
 from afspm.transport.port import Killed
 from afspm.transport.wakeup import WakeUp
@@ -41,7 +42,7 @@ class Emulator(ABC):
 
         class Mine(Emulator):
             vendor = "Mine"
-            usual_port = 1234
+            usual = {"port": 1234}
             fault_kinds = {"no-reply": "a request is not answered"}
 
             def open(self): ...bind; return f"127.0.0.1:{port}"
@@ -49,7 +50,7 @@ class Emulator(ABC):
             def tick(self, now_s): ...end scans, write files; return when there is more to do
 
     Args:
-        port: to listen on; 0: any free one; None: the vendor's usual one.
+        port: to listen on; 0: any free one.
         seed: everything that is left to chance follows from it.
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
@@ -61,10 +62,13 @@ class Emulator(ABC):
         rig: the instrument.
         faults: to ask at each point where something can go wrong.
         woken: register its `fileno` with whatever `serve` waits by; it becomes readable when `serve` is to return.
+        listening: to be told of a new address, and of none ("") before the old one is let go of, if it does not listen
+            at one address all along.
     """
 
     vendor: ClassVar[str]
-    usual_port: ClassVar[int] = 0
+    usual: ClassVar[Mapping[str, Any]] = {}
+    """Settings by which it is found where the vendor's own controller is: for `afspm emulate` alone, and on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
     """Every fault that can be had, with what it does."""
 
@@ -79,16 +83,17 @@ class Emulator(ABC):
     rig: Rig
     faults: Faults
     woken: WakeUp[None]
+    listening: Callable[[str], None]
 
     def __init__(
         self,
         *,
-        port: Annotated[int | None, Listens(usual="usual_port")] = None,
+        port: Annotated[int, Listens()] = 0,
         seed: int = 1,
         faults: Sequence[str | Mapping[str, Any] | Fault] = (),
         **world: Any,
     ) -> None:
-        self.port = self.usual_port if port is None else port
+        self.port = port
         self.seed = seed
         self._world_settings = world
         self._faults = [Fault.of(fault) for fault in faults]
@@ -144,12 +149,12 @@ class Emulator(ABC):
         """Be the controller until `stop`.
 
         Args:
-            listening: told the address, once there is one.
+            listening: told the address, once there is one; empty: none for now.
 
         Raises:
             Crashed: it was told to.
         """
-        self.clock, self.folder, self.log = clock, folder, log
+        self.clock, self.folder, self.log, self.listening = clock, folder, log, listening
         self.rig = Rig(self._world_settings, self.seed, clock)
         self.faults = Faults(self._faults, self.fault_kinds, clock.now_s())
         folder.mkdir(parents=True, exist_ok=True)
@@ -218,8 +223,14 @@ class Emulator(ABC):
         context.when_stopping(self.stop)
         threading.Thread(target=self._until_the_end_of, args=(context,), name="experiment", daemon=True).start()
 
+        launch = context.launch
+        notice = Notice(notice_file(launch.state_dir, launch.name), launch.run) if launch.state_dir else None
+
         def listening(address: str) -> None:
-            context.log.warning("SIMULATED: an emulated %s controller listens at %s", self.vendor, address)
+            if address:
+                context.log.warning("SIMULATED: an emulated %s controller listens at %s", self.vendor, address)
+            if notice is not None:
+                notice.tell(address)
 
         try:
             self.run(context.clock, Path(context.launch.run_dir or ".") / context.name, context.log, listening)

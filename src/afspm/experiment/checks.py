@@ -35,6 +35,8 @@ PUBLISHED: Final = (
 CONTINUED: Final = ("Scan2d", "Spec1d", "ProcessStates", "Progress")
 LIVE: Final = "ScanLines"
 """Published only where it is asked for."""
+ADDRESS: Final = "address"
+"""By convention the setting of a translator that says where its controller is."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
 
 
@@ -237,6 +239,22 @@ def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bo
     )
 
 
+def check_controller(resolved: Resolved) -> None:
+    """One emulated controller at most, and no other address for its translator."""
+    for name in resolved.emulators[1:]:
+        what = f"[{name}] is a second emulated controller beside [{resolved.emulators[0]}]"
+        resolved.findings.error(what, resolved.document.place(name), "one is enough")
+    names = [part.name for part in resolved.parts.components]
+    for part in resolved.with_role(Role.TRANSLATOR):
+        controller = resolved.controller_of(part.name, names)
+        if controller and ADDRESS in part.settings:
+            resolved.findings.warning(
+                f"[{part.name}] {ADDRESS} is not used: it talks to [{controller}], which is emulated",
+                resolved.document.place(part.name, ADDRESS),
+                f"[{controller}] component = false, for the controller at this address",
+            )
+
+
 def check_clock(resolved: Resolved) -> None:
     """Only a simulation's time may be other than real."""
     table = resolved.parts.sections.get("clock", {})
@@ -349,6 +367,7 @@ CHECKS: Final[tuple[Callable[[Resolved], None], ...]] = (
     check_listens_to,
     check_problems,
     check_envelopes,
+    check_controller,
     check_clock,
     check_names_of_people,
     check_likely_typos,

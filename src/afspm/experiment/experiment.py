@@ -120,6 +120,8 @@ class Experiment:
         only: Collection[str] = (),
         without: Collection[str] = (),
         clock: Mapping[str, Any] | None = None,
+        run: str = "",
+        simulated: bool = False,
         run_dir: str = "",
         state_dir: str = "",
         log_level: str = "INFO",
@@ -131,6 +133,7 @@ class Experiment:
             only: names of those to start here (empty: all); the addresses between them and the others must be in the
                 file, since nobody else would know one that is chosen here.
             without: names of those not to start here.
+            simulated: whether the microscope is known to be simulated even where its translator is not started here.
 
         Raises:
             ConfigError: the file has errors, a name is unknown, or an address is missing for a piecemeal start.
@@ -145,6 +148,8 @@ class Experiment:
                 launch=replace(
                     start.launch,
                     clock=dict(clock or {}),
+                    run=run,
+                    simulated=start.launch.simulated or (simulated and start.role is not Role.TRANSLATOR),
                     run_dir=run_dir,
                     state_dir=state_dir,
                     log_level=log_level,
@@ -152,6 +157,12 @@ class Experiment:
             )
             for start in starts
         ]
+
+    def simulated(self, only: Collection[str] = (), without: Collection[str] = ()) -> bool:
+        """True if the microscope is simulated for certain, where these parts are started on this computer."""
+        from afspm.experiment import starting
+
+        return starting.simulated(self, only, without)
 
     def asking(self, names: Collection[str]) -> Launch | None:
         """A launch line by which those of `names` ask the scheduler where it is started elsewhere; None: nobody can."""

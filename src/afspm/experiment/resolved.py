@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -88,18 +88,40 @@ class Resolved:
 
     @property
     def simulated(self) -> bool:
-        """Whether the microscope is a simulated one, as its class (a command: its table) says: simulated = True.
+        """True if the microscope is simulated for certain, where all of the file is started on this computer."""
+        return self.simulated_with([part.name for part in self.parts.components])
 
-        Also behind an emulator of its controller, which is then a process of the experiment.
+    def simulated_with(self, started: Collection[str]) -> bool:
+        """True if the microscope is simulated for certain, where these processes are started together.
+
+        Either the translator is the microscope itself, as its class (a command: its table) says, or it is wired to an
+        emulator that is started with it.
         """
         translators = self.with_role(Role.TRANSLATOR)
-        if any(getattr(self.classes.get(part.name), EMULATED, False) is True for part in self.parts.components):
-            return True
         return bool(translators) and all(
-            (part.own.get(SIMULATED) if part.command else getattr(self.classes.get(part.name), SIMULATED, False))
-            is True
-            for part in translators
+            self._is_the_microscope(part) or bool(self.controller_of(part.name, started)) for part in translators
         )
+
+    def controller_of(self, translator: str, started: Collection[str]) -> str:
+        """The name of the emulator that a translator is wired to; empty: none that is started with it.
+
+        A translator of another language can't be: nothing proves to whom it talks.
+        """
+        part = next(part for part in self.parts.components if part.name == translator)
+        if self._is_the_microscope(part) or part.command or translator not in started:
+            return ""
+        return next((name for name in self.emulators if name in started), "")
+
+    @property
+    def emulators(self) -> list[str]:
+        """The emulated controllers among the components."""
+        return [part.name for part in self.parts.components if self._says(part, EMULATED)]
+
+    def _is_the_microscope(self, part: Part) -> bool:
+        return part.own.get(SIMULATED) is True if part.command else self._says(part, SIMULATED)
+
+    def _says(self, part: Part, attribute: str) -> bool:
+        return getattr(self.classes.get(part.name), attribute, False) is True
 
 
 def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:

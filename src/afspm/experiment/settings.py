@@ -94,10 +94,7 @@ def listening(component: type, settings: Mapping[str, Any]) -> Iterator[tuple[st
         for mark in getattr(annotation, "__metadata__", ()):
             if not isinstance(mark, Listens):
                 continue
-            value = everything.get(name)
-            if value is None and mark.usual:
-                value = getattr(component, mark.usual, None)
-            if (address := mark.address(value, everything)) is not None:
+            if (address := mark.address(everything.get(name), everything)) is not None:
                 yield name, address, mark.keyed
 
 

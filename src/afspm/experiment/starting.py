@@ -42,7 +42,13 @@ def starts(
         (part for part in resolved.parts.components if part.name in chosen),
         key=lambda part: _ORDER.index(resolved.roles[part.name]),
     )
-    return [_start(part, experiment, links[part.name], addresses) for part in parts]
+    return [_start(part, experiment, links[part.name], addresses, chosen) for part in parts]
+
+
+def simulated(experiment: Experiment, only: Collection[str], without: Collection[str]) -> bool:
+    """True if the microscope is simulated for certain, where these parts are started on this computer."""
+    resolved = experiment.resolved
+    return resolved.simulated_with(_chosen(experiment.component_names, only, without))
 
 
 def _chosen(names: list[str], only: Collection[str], without: Collection[str]) -> set[str]:
@@ -102,7 +108,9 @@ def _require_addresses(
         )
 
 
-def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: Mapping[str, str]) -> Start:
+def _start(
+    part: Part, experiment: Experiment, links: wiring.Links, addresses: Mapping[str, str], chosen: Collection[str]
+) -> Start:
     resolved = experiment.resolved
     wires, role = resolved.wires[part.name], resolved.roles[part.name]
 
@@ -130,7 +138,8 @@ def _start(part: Part, experiment: Experiment, links: wiring.Links, addresses: M
         keys=_keys(resolved, links, addresses),
         messages=resolved.messages,
         beat_period_s=resolved.restart.beat_period,
-        simulated=resolved.simulated,
+        simulated=resolved.simulated_with(chosen),
+        controller=resolved.controller_of(part.name, chosen) if role is Role.TRANSLATOR else "",
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
         retracts=role is Role.TRANSLATOR and _retracts(resolved),
     )

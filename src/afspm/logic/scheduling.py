@@ -319,8 +319,9 @@ class SchedulerCore:
             self._arbiter.decide(ask_of(event.name, event.request), event, now_s, now_ns)
 
     def _tell_time(self, event: RequestIn, now_ns: int) -> None:
-        """What time it is, and how it passes: all parts of an experiment go by the scheduler's clock."""
-        told = json.dumps({**self._settings.clock, "now_ns": now_ns}).encode()
+        """What all parts of an experiment have in common: the run, what time it is, and how it passes."""
+        common = {"run": self._settings.run, "simulated": self._settings.simulated, "now_ns": now_ns}
+        told = json.dumps({**self._settings.clock, **common}).encode()
         response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
         self._effects.append(Reply(event.connection, event.name, response))
 

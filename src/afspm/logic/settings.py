@@ -28,6 +28,8 @@ class SchedulerSettings:
         catch_up_s: how long (real) a scheduler waits at its start for what the translator has published before.
         malfunction_after_s: how long (real) the microscope may be lost before that is flagged as a malfunction.
         clock: `ExperimentClock.as_dict()`, to be told to those who ask; empty: real time.
+        run: the identity of the run, which is told with it; empty: it has none.
+        simulated: whether the microscope is, which is told with it.
     """
 
     rules: Rules = field(default_factory=Rules)
@@ -45,3 +47,5 @@ class SchedulerSettings:
     catch_up_s: float = 1.0
     malfunction_after_s: float = 5.0
     clock: Mapping[str, float] = field(default_factory=dict)
+    run: str = ""
+    simulated: bool = False

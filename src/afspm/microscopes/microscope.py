@@ -61,6 +61,10 @@ def _nothing() -> None:
     raise NotImplementedError
 
 
+def _nothing_to_prove() -> None:
+    """A real controller is the one at its address."""
+
+
 _KNOWN = {
     action.name: action
     for action in (
@@ -101,7 +105,8 @@ class Microscope(ABC):
     """A microscope behind its controller. Write the abstract methods and an `@action` for each action::
 
         class Mine(Microscope):
-            def connect(self): self.link = Link(self.address)
+            def __init__(self, *, address: str = "127.0.0.1:1234"): super().__init__(); self.controller_at = address
+            def connect(self): self.link = Link(self.controller_at); self.prove()
             def status(self): return ScopeStatus(ScopeState.SCANNING if self.link.busy() else ScopeState.FREE)
             def get(self, vendor): return self.link.read(vendor)
             def set(self, values): self.link.write(values)
@@ -129,7 +134,11 @@ class Microscope(ABC):
         clock, log: of the experiment; given before `connect`.
         run_dir: the folder of this run.
         wake: call it, from any thread, to have the controller looked at now rather than at the next poll.
-        controller_at: where the controller is, so that one run at a time commands it; empty: nobody else can reach it.
+        controller_at: where the controller is: to be set by the constructor, and read by `connect`, since an experiment
+            with an emulator puts the emulator's address there. One run at a time commands it. Empty: there is none that
+            others can reach.
+        prove: to be called by `connect` once a connection stands, before anything is asked: it raises ControllerLost if
+            an emulated controller is not that of this run.
         lacking: actions that this controller turned out not to have, and why; set it when connecting.
         memory: a dict of JSON values, kept on disk: saved with every request and result, there after a restart.
     """
@@ -173,6 +182,7 @@ class Microscope(ABC):
         self.poll_period_s = poll_period_s
         self.result_timeout_s = result_timeout_s
         self.live_lines_s = live_lines_s
+        self.prove: Callable[[], None] = _nothing_to_prove
         self._told: dict[str, Value] = {}
 
     def patience_s(self, of_s: float) -> float:

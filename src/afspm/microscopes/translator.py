@@ -21,6 +21,7 @@ from afspm.exit_codes import ExitCode
 from afspm.logic.forwarding import NOT_SENT
 from afspm.logic.watchdog import feedback_of
 from afspm.microscopes import in_force
+from afspm.microscopes.emulated import EmulatedController, wired_to
 from afspm.microscopes.ledger import Ledger
 from afspm.microscopes.live import LiveLines
 from afspm.microscopes.microscope import LOST, MEASURING, ControllerLost, Microscope
@@ -59,6 +60,8 @@ class Translator:
         step: entered around everything that takes time, so that busy can be told from frozen.
         retracts: whether it retracts the tip when nobody is there any more to switch on the feedback that a request
             has switched off.
+        controller: the emulator of this run, in whose place nobody else is ever talked to; None: the microscope
+            knows where its controller is.
     """
 
     def __init__(
@@ -71,8 +74,10 @@ class Translator:
         step: Callable[[], AbstractContextManager[None]] = nullcontext,
         *,
         retracts: bool = False,
+        controller: EmulatedController | None = None,
     ) -> None:
         self.microscope = microscope
+        self._controller = controller
         self._port = port
         self._memory = memory
         self._log = log
@@ -185,7 +190,7 @@ class Translator:
     def _connect(self) -> bool:
         if self._clock.monotonic_s() < self._retry_at_s:
             return False
-        self.microscope.connect()
+        self._find_controller()
         self._connected = True
         if self._complaint:
             self._complaint = ""
@@ -198,6 +203,12 @@ class Translator:
         self._take_in(self._read())
         self._publish_all()
         return True
+
+    def _find_controller(self) -> None:
+        if self._controller is None:
+            self.microscope.connect()
+        else:
+            self._controller.reach(self.microscope)
 
     def _lose(self, error: Exception) -> None:
         now_s = self._clock.monotonic_s()
@@ -375,7 +386,7 @@ class Translator:
     def _reach(self) -> None:
         """For the way out, which must always be open: a controller that is there will do, whatever else it says."""
         if not self._connected:
-            self.microscope.connect()
+            self._find_controller()
 
     def _stop_measuring(self) -> None:
         """The tip does not go on scanning with nobody there."""
@@ -406,6 +417,7 @@ class Translator:
             self._trusting(partial(self._observe, answer.announce))
 
     def _about_to_act(self, request: Request) -> None:
+        self.microscope.prove()
         self._acting = request
         is_action = request.kind == ControlRequest.ACTION
         # whether the feedback was switched off is to be known by who comes after a kill
@@ -473,12 +485,14 @@ def _only_asks(request: Request) -> bool:
 def run_translator(microscope: Microscope, context: Context, make: Callable[..., Translator] = Translator) -> int:
     """What the host runs. While another run commands the controller, it is said which, and the process ends."""
     with contextlib.ExitStack() as stack:
+        controller = wired_to(context.launch, microscope)
+        address = "" if controller else microscope.controller_at  # a real controller of this address is left alone
         try:
-            stack.enter_context(commanding(microscope.controller_at, context.launch.run_dir or ""))
+            stack.enter_context(commanding(address, context.launch.run_dir or ""))
         except ControllerTaken as error:
             context.log.error("%s", error)
             return ExitCode.CRASHED  # to be tried again a few times: that run may be just ending
-        return _run_alone(microscope, context, make)
+        return _run_alone(microscope, context, partial(make, controller=controller))
 
 
 def _run_alone(microscope: Microscope, context: Context, make: Callable[..., Translator]) -> int:

@@ -75,14 +75,18 @@ def _is_left(folder: Path) -> bool:
     return True
 
 
-def lock(file: IO[bytes], *, shared: bool = False) -> None:
-    """Until it is closed. Raises OSError: another process has it."""
+def lock(file: IO[bytes], *, shared: bool = False, wait: bool = False) -> None:
+    """Until it is closed. Raises OSError: another process has it.
+
+    Args:
+        wait: for the process that has it (on Windows for ten seconds).
+    """
     if sys.platform == "win32":
         import msvcrt
 
         file.seek(0)
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)
     else:
         import fcntl
 
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))

@@ -65,7 +65,12 @@ class Launch:
     """CURVE key files and the servers' public keys; None: no encryption (loopback)."""
     messages: tuple[str, ...] = ()
     """Python modules, or .proto files, with message types of the user."""
+    run: str = ""
+    """The identity of the run, random; empty: it is not known."""
     simulated: bool = False
+    """True only where the microscope is simulated for certain: by its translator itself, or by `controller`."""
+    controller: str = ""
+    """Of a translator: the name of the emulator of this run that it talks to, and to nobody else; empty: none."""
     sample_coordinates: bool = False
     """Whether places are those of the sample, which the scheduler maps to those of the tip."""
     retracts: bool = False
@@ -98,7 +103,7 @@ class Launch:
         return cls(**values, sockets=Sockets(**_fields(Sockets, sockets, "launch line, sockets")))
 
 
-_STRINGS = {"name", "class_", "run_dir", "state_dir", "log_level"}
+_STRINGS = {"name", "class_", "run", "controller", "run_dir", "state_dir", "log_level"}
 _NUMBERS = {"beat_period_s", "request_timeout_s", "request_retries"}
 _TABLES = {"settings", "clock", "problems"}
 _LISTS = {"subscribe", "envelopes", "messages"}

@@ -31,6 +31,10 @@ class SchedulerLaunch(Launched, Protocol):
     @property
     def clock(self) -> Mapping[str, Any]: ...
     @property
+    def run(self) -> str: ...
+    @property
+    def simulated(self) -> bool: ...
+    @property
     def state_dir(self) -> str: ...
     @property
     def request_timeout_s(self) -> float: ...
@@ -120,7 +124,8 @@ class Scheduler:
         settings = scheduler_settings(
             self._control, self._limits, self._cache, context.problems, context.launch.request_timeout_s
         )
-        return replace(settings, clock=dict(context.launch.clock))
+        launch = context.launch
+        return replace(settings, clock=dict(launch.clock), run=launch.run, simulated=launch.simulated)
 
     def _core(self, context: SchedulerContext) -> Core:
         """The decisions."""

@@ -1,4 +1,4 @@
-"""The clock of an experiment of several parts: a part that is started without the scheduler asks that for the time."""
+"""What all parts of an experiment have in common: a part that is started without the scheduler asks that for it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
@@ -19,7 +20,26 @@ AGAIN_S = 1.0
 _SAME_S = 1e-3  # two processes of one computer agree on real time to that
 
 
-def of_scheduler(launch: Launch, tell: Callable[[str], None]) -> ExperimentClock:
+@dataclass(frozen=True)
+class Common:
+    """What is the same in all processes of a run, on all of its computers.
+
+    Attributes:
+        run: the identity of the run, random; empty: it is not known here.
+        simulated: True only if the microscope is simulated for certain.
+    """
+
+    clock: ExperimentClock
+    run: str
+    simulated: bool
+
+
+def new_identity() -> str:
+    """An identity that no other run has."""
+    return os.urandom(8).hex()
+
+
+def of_scheduler(launch: Launch, tell: Callable[[str], None]) -> Common:
     """Ask the scheduler that `launch` leads to, which is waited for.
 
     Raises:
@@ -39,20 +59,21 @@ def of_scheduler(launch: Launch, tell: Callable[[str], None]) -> ExperimentClock
             for incoming in found:
                 connected = connected or isinstance(incoming, ControlConnected)
                 if isinstance(incoming, ReplyReceived) and incoming.response.id == asked:
-                    return _clock(incoming.response, asked_s, wall.now_s(), str(launch.sockets.control))
+                    return _read(incoming.response, asked_s, wall.now_s(), str(launch.sockets.control))
             if not found and not waiting:
                 waiting = True
-                tell(f"waiting for the scheduler at {launch.sockets.control}, by whose clock the experiment goes")
+                tell(f"waiting for the scheduler at {launch.sockets.control}, whose run and clock this part joins")
     finally:
         port.close()
 
 
-def _clock(response: Response, asked_s: float, answered_s: float, where: str) -> ExperimentClock:
-    """The clock that was told between two moments of real time, as it is to be read on this computer."""
+def _read(response: Response, asked_s: float, answered_s: float, where: str) -> Common:
+    """What was told between two moments of real time, with the clock as it is to be read on this computer."""
     if not response.ok:
         raise ConfigError(f"the scheduler does not tell the time: {response.reason}", where=where)
     try:
         told = json.loads(response.payload)
+        run, simulated = str(told.pop("run", "")), told.pop("simulated", False) is True
         now_s = int(told.pop("now_ns")) / NS_PER_S
         clock = ExperimentClock.from_dict(told)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -60,5 +81,5 @@ def _clock(response: Response, asked_s: float, answered_s: float, where: str) ->
     real_s = (asked_s + answered_s) / 2
     shown_s = clock.start_s + (real_s - clock.origin_s) * clock.speed
     if abs(now_s - shown_s) <= ((answered_s - asked_s) / 2 + _SAME_S) * clock.speed:
-        return clock  # the same clock on the wall: exactly the same time
-    return ExperimentClock(real_s, now_s, clock.speed)
+        return Common(clock, run, simulated)  # the same clock on the wall: exactly the same time
+    return Common(ExperimentClock(real_s, now_s, clock.speed), run, simulated)

@@ -23,8 +23,9 @@ from afspm.record.whole import load
 from afspm.runtime.connect import find_run
 from afspm.supervisor import edited
 from afspm.supervisor import run as running
+from afspm.supervisor.common_clock import Common, new_identity
 from afspm.supervisor.ending import Why
-from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, WITHOUT, Options, Run
+from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, Options, Run
 
 _OVER = {Why.EXPERIMENT_ENDED.name.lower(), Why.ALL_DONE.name.lower()}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
@@ -99,15 +100,19 @@ def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -
     options = found.options(options)
     with locked(folder):
         _wait_until_gone(facts, folder)
-        clock = _clock(experiment, facts, folder)
+        common = _common(experiment, options, facts, folder)
         names = [*facts.get("processes", ()), *found.added]
-        return running.go(experiment, options, clock, folder, found.name, terminal, names)
+        return running.go(experiment, options, common, folder, found.name, terminal, names)
 
 
-def _clock(experiment: Experiment, facts: dict[str, Any], folder: Path) -> ExperimentClock:
-    """Real time, or the simulated time after the last that anybody has seen."""
-    if not experiment.resolved.simulated:
-        return experiment.clock()
+def _common(experiment: Experiment, options: Options, facts: dict[str, Any], folder: Path) -> Common:
+    """As before, with real time, or the simulated time after the last that anybody has seen."""
+    simulated = bool(facts.get("simulated")) or experiment.simulated(options.only, options.without)
+    clock = _clock_after(facts, folder) if simulated else experiment.clock()
+    return Common(clock, str(facts.get(RUN) or new_identity()), simulated)
+
+
+def _clock_after(facts: dict[str, Any], folder: Path) -> ExperimentClock:
     before = ExperimentClock.from_dict(facts["clock"])
     seen_ns = max(last_seen_ns(folder), round(before.start_s * NS_PER_S))
     return ExperimentClock.starting_now((seen_ns + STEP_NS) / NS_PER_S, before.speed)

@@ -21,12 +21,15 @@ from afspm.runtime.connect import GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor import aftermath, common_clock, reporting, run_folder, summary
 from afspm.supervisor.aftermath import Ended
+from afspm.supervisor.common_clock import Common
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.supervisor import Outcome, Supervisor
 from afspm.supervisor.task import from_start
 
-HOW, HOMES, FILES, ONLY, WITHOUT = "how", "homes", "files", "only", "without"
+TAKES_WHO_COMES = ""
+"""The identity of a run of a real microscope's translator alone, which obeys the scheduler that comes."""
+RUN, HOW, HOMES, FILES, ONLY, WITHOUT = "run", "how", "homes", "files", "only", "without"
 
 
 @dataclass(frozen=True)
@@ -65,21 +68,21 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
         FileError: there is no place for the run folder; nothing was started.
     """
     experiment.require_valid()
-    clock = _clock(experiment, options.speed)
+    own = _own(experiment, options)
     # whatever is wrong is told before a folder is made
-    first = _starts(experiment, options, clock, FreePorts())
+    first = _starts(experiment, options, own, FreePorts())
     names = [start.launch.name for start in first]
-    clock = _common_clock(experiment, first, clock, options, terminal)
+    common = _common(experiment, first, own, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, now())
     with locked(folder):
         run_folder.write_experiment(folder, experiment.expanded())
-        return go(experiment, options, clock, folder, experiment.name, terminal, names)
+        return go(experiment, options, common, folder, experiment.name, terminal, names)
 
 
 def go(
     experiment: Experiment,
     options: Options,
-    clock: ExperimentClock,
+    common: Common,
     folder: Path,
     name: str,
     terminal: TextIO | None,
@@ -90,11 +93,12 @@ def go(
     Args:
         name: of the experiment; names: of its processes.
     """
+    clock = common.clock
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:
-        starts = _starts(experiment, options, clock, FreePorts(), folder)
+        starts = _starts(experiment, options, common, FreePorts(), folder)
         files = known_facts(folder).get(FILES) or list(map(str, experiment.files))  # one that is resumed has it
-        facts = {**run_facts(name, starts, clock), **facts_to_resume(experiment, starts, options), FILES: files}
+        facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
             ahead.expect_record(folder / STATE_DIR)
@@ -110,7 +114,7 @@ def go(
             log.write(LOGGED_AS, logging.INFO, line)
         aftermath.follow(
             experiment,
-            Ended(name, folder, outcome, experiment.resolved.simulated),
+            Ended(name, folder, outcome, common.simulated),
             starts,
             clock,
             log,
@@ -138,14 +142,16 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[Start], options: Op
 def dry_run(experiment: Experiment, options: Options = Options()) -> list[Start]:
     """What `run` would start, and nothing else. Raises as `run` does."""
     experiment.require_valid()
-    return _starts(experiment, options, _clock(experiment, options.speed), FreePorts())
+    return _starts(experiment, options, _own(experiment, options), FreePorts())
 
 
-def run_facts(name: str, starts: Sequence[Start], clock: ExperimentClock) -> dict[str, object]:
+def run_facts(name: str, starts: Sequence[Start], common: Common) -> dict[str, object]:
     """What run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
     facts: dict[str, object] = {
         "name": name,
-        "clock": clock.as_dict(),
+        RUN: common.run,
+        "simulated": common.simulated,
+        "clock": common.clock.as_dict(),
         "processes": {
             start.launch.name: {
                 "role": start.role.value,
@@ -174,13 +180,15 @@ def _example_of_a_guest(starts: Sequence[Start]) -> Launch | None:
 
 
 def _starts(
-    experiment: Experiment, options: Options, clock: ExperimentClock, ports: FreePorts, folder: Path | None = None
+    experiment: Experiment, options: Options, common: Common, ports: FreePorts, folder: Path | None = None
 ) -> list[Start]:
     starts = experiment.launches(
         take_address=ports.address,
         only=options.only,
         without=options.without,
-        clock=clock.as_dict(),
+        clock=common.clock.as_dict(),
+        run=common.run,
+        simulated=common.simulated,
         run_dir=str(folder or ""),
         state_dir=str(folder / STATE_DIR) if folder else "",
         log_level=logging.getLevelName(options.log_level),
@@ -190,31 +198,51 @@ def _starts(
     return starts
 
 
-def _clock(experiment: Experiment, speed: float | None) -> ExperimentClock:
-    clock = experiment.clock()
-    if speed is None:
-        return clock
-    if not experiment.resolved.simulated:
+def _own(experiment: Experiment, options: Options) -> Common:
+    """What this part of the experiment would have by itself."""
+    simulated = experiment.simulated(options.only, options.without)
+    clock, speed = experiment.clock(), options.speed
+    if speed is not None and not experiment.resolved.simulated:
         raise ConfigError("a real microscope has real time", where="--speed", hint="leave --speed away")
-    return replace(clock, speed=speed)
+    if speed is not None:
+        clock = replace(clock, speed=speed)
+    return Common(clock, common_clock.new_identity(), simulated)
 
 
-def _common_clock(
-    experiment: Experiment, starts: Sequence[Start], own: ExperimentClock, options: Options, terminal: TextIO | None
-) -> ExperimentClock:
-    """The clock of the whole experiment, of which perhaps only a part is started here: it is the scheduler's."""
-    here = {start.launch.name: start.role for start in starts}
-    if Role.SCHEDULER in here.values() or not experiment.resolved.simulated:
-        return own  # real time is the same everywhere
-    launch = experiment.asking(list(here))
+def _common(
+    experiment: Experiment, starts: Sequence[Start], own: Common, options: Options, terminal: TextIO | None
+) -> Common:
+    """What the whole experiment has, of which perhaps only a part is started here: it is the scheduler's.
+
+    Raises:
+        ConfigError: the file's time is a simulation's, and here it is not certain that the microscope is simulated.
+    """
+    roles = {start.launch.name: start.role for start in starts}
+    launch = None if Role.SCHEDULER in roles.values() else experiment.asking(list(roles))
     if launch is None:
-        return own
-    clock = common_clock.of_scheduler(launch, lambda text: print(text, file=terminal, flush=True))
-    if options.speed is not None and clock.speed != options.speed:
+        if own.simulated:
+            return own
+        _require_real_time(own.clock, experiment)
+        return own if Role.SCHEDULER in roles.values() else replace(own, run=TAKES_WHO_COMES)
+    if Role.COMPONENT not in roles.values() and not experiment.resolved.simulated:
+        return replace(own, run=TAKES_WHO_COMES)
+    common = common_clock.of_scheduler(launch, lambda text: print(text, file=terminal, flush=True))
+    if options.speed is not None and common.clock.speed != options.speed:
         raise ConfigError(
-            f"the experiment goes at {clock.speed:g}", where="--speed", hint="it is set where the scheduler is started"
+            f"the experiment goes at {common.clock.speed:g}",
+            where="--speed",
+            hint="it is set where the scheduler is started",
         )
-    return clock
+    return replace(common, simulated=own.simulated or common.simulated)
+
+
+def _require_real_time(clock: ExperimentClock, experiment: Experiment) -> None:
+    if clock.speed != 1.0 or experiment.resolved.clock.start is not None:
+        raise ConfigError(
+            "the experiment has a simulation's time, and nothing here proves that its microscope is simulated",
+            where="[clock]",
+            hint="start the translator together with its emulator, or set the speed to 1",
+        )
 
 
 def now() -> datetime:

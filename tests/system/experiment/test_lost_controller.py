@@ -7,11 +7,10 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from experiment_lab import AFSPM, WITNESS, AfspmRun
-
-from afspm.supervisor.ports import FreePorts
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
@@ -24,9 +23,6 @@ speed = 30.0
 
 [control]
 malfunction_after = "0.2 s"
-
-[controller]
-port = {port}
 
 [microscope]
 address = "{address}"
@@ -46,12 +42,16 @@ history = {{ Scan2d = 20 }}
 
 
 @pytest.fixture(params=sorted(ADDRESSES))
-def run(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[AfspmRun]:
+def run(request: pytest.FixtureRequest, tmp_path: Path, stranger: Any) -> Iterator[AfspmRun]:
+    """The file names a controller that is not this run's emulator, and that must not hear of it."""
     (tmp_path / "witness.py").write_text(WITNESS, encoding="utf-8")
-    port = FreePorts().take()
-    address = ADDRESSES[request.param].format(port=port)
-    (tmp_path / "overlay.toml").write_text(OVERLAY.format(port=port, address=address), encoding="utf-8")
-    files = (str(FILES / "experiment.toml"), str(FILES / f"{request.param}.toml"), str(tmp_path / "overlay.toml"))
+    address = ADDRESSES[request.param].format(port=stranger.port)
+    (tmp_path / "overlay.toml").write_text(OVERLAY.format(address=address), encoding="utf-8")
+    files = (
+        str(FILES / "experiment.toml"),
+        str(FILES / f"emulated_{request.param}.toml"),
+        str(tmp_path / "overlay.toml"),
+    )
     options = ("--runs", str(tmp_path / "runs"), "--verbose", "--no-report", "--without", "metadata")
     command = (*AFSPM, "run", *files, *options)
     process = subprocess.Popen(

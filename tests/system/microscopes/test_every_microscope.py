@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from afspm.supervisor.ports import FreePorts
-
 ROOT = Path(__file__).parents[3]
 FILES = ROOT / "experiments" / "every_microscope"
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
@@ -27,10 +25,7 @@ OVERLAY = """
 component = true
 class = "keeper.Keeper"
 """
-PORTS = """
-[controller]
-port = {port}
-
+ELSEWHERE = """
 [microscope]
 address = "{address}"
 """
@@ -39,14 +34,13 @@ Kept = list[tuple[list[Any], NDArray[np.float64]]]
 """[x, y, width, height, angle] and the heights of each scan."""
 
 
-def scans_on(microscope: str, folder: Path) -> Kept:
-    """Run the experiment; the heights as they were published."""
+def scans_on(microscope: str, folder: Path, more: str = "") -> Kept:
+    """Run the experiment, with `more` in its file; the heights as they were published."""
     overlay = folder / "overlay.toml"
-    port = FreePorts().take()
-    ports = PORTS.format(port=port, address=ADDRESSES.get(microscope, "").format(port=port))
-    overlay.write_text(OVERLAY + (ports if microscope in ADDRESSES else ""), encoding="utf-8")
+    overlay.write_text(OVERLAY + more, encoding="utf-8")
     (folder / "keeper.py").write_text(Path(__file__).with_name("keeper.py").read_text(encoding="utf-8"))
-    files = [str(FILES / "experiment.toml"), str(FILES / f"{microscope}.toml"), str(overlay)]
+    second = f"emulated_{microscope}" if microscope in ADDRESSES else microscope
+    files = [str(FILES / "experiment.toml"), str(FILES / f"{second}.toml"), str(overlay)]
     done = subprocess.run(
         [*AFSPM, "run", *files, "--runs", str(folder / "runs"), "--no-report", "--without", "metadata,recorder"],
         capture_output=True,
@@ -55,6 +49,8 @@ def scans_on(microscope: str, folder: Path) -> Kept:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+    (facts,) = (folder / "runs").glob("*/run.json")
+    assert json.loads(facts.read_text(encoding="utf-8"))["simulated"] is True
     kept = []
     for file in sorted((folder / "runs").glob("*/kept-*.npz")):
         with np.load(file) as found:
@@ -80,8 +76,10 @@ def apart_m(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 @pytest.mark.xdist_group("every_microscope")
 @pytest.mark.parametrize("microscope", sorted(ADDRESSES))
-def test_the_same_scans_of_the_same_sample(microscope: str, simulated: Kept, tmp_path: Path) -> None:
-    found = scans_on(microscope, tmp_path)
+def test_the_same_scans_of_the_same_sample(microscope: str, simulated: Kept, tmp_path: Path, stranger: Any) -> None:
+    """And none of it is asked of the controller that the file names, which is not this run's emulator."""
+    address = ADDRESSES[microscope].format(port=stranger.port)
+    found = scans_on(microscope, tmp_path, ELSEWHERE.format(address=address))
     assert len(found) == len(simulated) == 3
     for (place, heights), (wanted_place, wanted) in zip(found, simulated, strict=True):
         assert place == pytest.approx(wanted_place, rel=1e-6, abs=1e-12)

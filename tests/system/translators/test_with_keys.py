@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from afspm.supervisor.ports import FreePorts
-
 DEADLINE_S = 60.0
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
 EXPERIMENT = """
@@ -20,12 +18,10 @@ speed = 60.0
 component = true
 class = "NanonisEmulator"
 surface = "particles"
-port = {port}
 
 [microscope]
 component = true
 class = "Nanonis"
-address = "127.0.0.1:{port}"
 
 [scheduler]
 component = true
@@ -34,7 +30,7 @@ class = "Scheduler"
 [details]
 component = true
 class = "ScanList"
-regions = [{{ center = ["0 nm", "0 nm"], size = ["500 nm", "500 nm"] }}]
+regions = [{ center = ["0 nm", "0 nm"], size = ["500 nm", "500 nm"] }]
 pixels = [32, 24]
 end_when_done = true
 
@@ -53,7 +49,7 @@ def afspm(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With the experiment file, and keys for each of its processes."""
     made = tmp_path_factory.mktemp("with_keys")
-    (made / "experiment.toml").write_text(EXPERIMENT.format(port=FreePorts().take()), encoding="utf-8")
+    (made / "experiment.toml").write_text(EXPERIMENT, encoding="utf-8")
     assert afspm("keys", "experiment.toml", cwd=made).returncode == 0
     return made
 

@@ -61,8 +61,8 @@ def test_a_port_that_is_taken_is_an_error_of_the_block(tmp_path: Path) -> None:
             pytest.fail("it listens on a taken port")
 
 
-def test_the_usual_port_is_the_vendors() -> None:
-    assert (Tiny().port, Tiny(port=0).port) == (45997, 0)
+def test_the_vendors_usual_port_is_taken_on_request_alone() -> None:
+    assert (Tiny().port, Tiny(**Tiny.usual).port) == (0, 45997)
 
 
 def test_settings_without_sense_are_refused_before_it_runs() -> None:

@@ -11,7 +11,7 @@ from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
 
 class Tiny(Emulator):
     vendor = "Tiny"
-    usual_port = 45997
+    usual: ClassVar = {"port": 45997}
     fault_kinds: ClassVar = {"crash": "it vanishes", "no-reply": "a line is not answered"}
 
     def __init__(self, *, release: int = 1, **settings: object) -> None:

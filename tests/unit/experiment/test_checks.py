@@ -18,6 +18,8 @@ PAGE = '[page]\ncomponent = true\nclass = "Dashboard"\n'
 CHOOSER = '[choose]\ncomponent = true\nclass = "parts.Chooser"\n'
 ANYTHING = '[any]\ncomponent = true\nclass = "parts.Anything"\n'
 REAL = FRAME.replace("simulated = true", "")
+WIRED = FRAME.partition("[microscope]")[0] + '[microscope]\ncomponent = true\nclass = "parts.Real"\n'
+"""A translator of ours, which can be wired to an emulator."""
 WITHOUT_SCHEDULER = FRAME[FRAME.index("[microscope]") :]
 WITHOUT_TRANSLATOR = FRAME[: FRAME.index("[microscope]")]
 
@@ -123,10 +125,10 @@ BROKEN = {
         FRAME,
         "both bind",
     ),
-    "an emulated controller where it usually is": (
-        '[controller]\ncomponent = true\nclass = "AsylumEmulator"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:5555"\n',
-        FRAME,
-        "both bind",
+    "two emulated controllers": (
+        '[one]\ncomponent = true\nclass = "parts.Emulated"\n[two]\ncomponent = true\nclass = "parts.Emulated"\n',
+        WIRED,
+        "[two] is a second emulated controller beside [one]",
     ),
     "a component of one's own where somebody publishes": (
         '[mine]\ncomponent = true\nclass = "parts.Listener"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9010"\n',
@@ -181,10 +183,40 @@ BROKEN = {
 }  # fmt: skip
 
 
+EMULATED = '[clock]\nspeed = 60\n[controller]\ncomponent = true\nclass = "parts.Emulated"\n'
+
+
 def test_time_may_be_made_faster_where_the_controller_is_an_emulated_one(write: Write) -> None:
-    emulated = '[controller]\ncomponent = true\nclass = "parts.Emulated"\nport = 6501\n'
-    assert errors(write("[clock]\nspeed = 60\n" + emulated, frame=REAL)) == []
-    assert write("[clock]\nspeed = 60\n" + emulated, frame=REAL).resolved.simulated
+    assert errors(write(EMULATED, frame=WIRED)) == []
+    assert write(EMULATED, frame=WIRED).resolved.simulated
+
+
+def test_an_emulator_in_the_file_proves_nothing_of_a_translator_that_is_not_wired_to_it(write: Write) -> None:
+    of_another_language = write(EMULATED, frame=REAL)
+    assert not of_another_language.resolved.simulated
+    assert any("not simulated" in error for error in map(str, errors(of_another_language)))
+
+
+def test_what_is_started_without_the_emulator_is_not_simulated(write: Write) -> None:
+    experiment = write(EMULATED, frame=WIRED)
+    assert experiment.simulated()
+    assert not experiment.simulated(without=["controller"])
+    assert not experiment.simulated(only=["scheduler"])
+    started = experiment.launches(take_address=lambda: "tcp://127.0.0.1:20000", without=["controller"])
+    launch = next(start.launch for start in started if start.launch.name == "microscope")
+    assert (launch.simulated, launch.controller) == (False, "")
+
+
+def test_a_translator_is_wired_to_the_emulator_that_is_started_with_it(write: Write) -> None:
+    experiment = write(EMULATED, frame=WIRED)
+    started = {s.launch.name: s.launch for s in experiment.launches(take_address=lambda: "tcp://127.0.0.1:20000")}
+    assert started["microscope"].controller == "controller"
+    assert all(launch.simulated for launch in started.values())
+
+
+def test_an_address_beside_an_emulator_is_said_to_be_of_no_use(write: Write) -> None:
+    found = write(EMULATED, frame=WIRED + 'address = "127.0.0.1:6501"\n').check()
+    assert sum("[microscope] address is not used" in finding.what for finding in found) == 1
 
 
 def test_what_listens_at_addresses_of_its_own_is_no_error(write: Write) -> None:

@@ -46,7 +46,7 @@ class AsylumEmulator(Emulator):
     """
 
     vendor = "Asylum"
-    usual_port = 5555
+    usual: ClassVar[dict[str, Any]] = {"port": 5555}
     fault_kinds: ClassVar[dict[str, str]] = {
         "no-reply": "a request is carried out and not answered",
         "late-reply": "a reply comes later, by the duration, when others may have come",
@@ -113,6 +113,10 @@ class AsylumEmulator(Emulator):
         self._idle_at_s = -math.inf
         self._locked_until_s = self._bound_again_at_s = -math.inf
         self._last_id: str | None = None
+        return self._address
+
+    @property
+    def _address(self) -> str:
         return f"tcp://{LOOPBACK}:{self._server.port}"
 
     def functions(self) -> dict[str, wire.Function]:
@@ -143,10 +147,12 @@ class AsylumEmulator(Emulator):
             self._server.send(delayed.client, delayed.payload)
         restart = self.faults.strikes("restart", now_s)
         if restart is not None:
+            self.listening("")
             self._server.unbind()
             self._bound_again_at_s = now_s + restart.duration_s
         if not self._server.listens and now_s >= self._bound_again_at_s:
             self._server.bind()
+            self.listening(self._address)
         times = [self.controller.advance(now_s), self._locked_until_s, self._bound_again_at_s]
         times += [self._delayed[0].at_s] if self._delayed else []
         return min((at_s for at_s in times if at_s is not None and at_s > now_s), default=None)

@@ -3,6 +3,7 @@ simulated physics behind them."""
 
 from __future__ import annotations
 
+import os
 import select
 from collections import deque
 from collections.abc import Mapping
@@ -19,8 +20,7 @@ from afspm.emulators.gxsm.program import Program
 from afspm.errors import ConfigError
 from afspm.units import Length
 
-BLOCK: Final = "gxsm4_py_shm_data_block"
-PROCESS: Final = "gxsm4"
+PROCESS: Final = "emulated-gxsm4"
 _TRANSPORTS: Final = ("bridge", "shm")
 
 
@@ -32,7 +32,7 @@ class GxsmEmulator(Emulator):
         card: what its hardware is: "SRanger", "RPSPMC" or GXSM's own "simulator".
         transport: "bridge": a script runs in its console; "shm": the shared memory of Gxsm4, on Linux.
         script: that runs in its console; left out: afspm's own.
-        block, process: what the shared memory and its process are called.
+        block, process: what the shared memory and its process are called; left out: memory of a name of its own.
         user_unit: of lengths on its panel: "Å", "nm" or "µm".
         decimal_comma: it runs where 12,5 is written.
         auto_save, probe_auto_save: what its panel has on.
@@ -45,7 +45,7 @@ class GxsmEmulator(Emulator):
     """
 
     vendor = "GXSM"
-    usual_port = 65431
+    usual: ClassVar[Mapping[str, Any]] = {"port": 65431, "block": "gxsm4_py_shm_data_block", "process": "gxsm4"}
     fault_kinds: ClassVar[Mapping[str, str]] = {
         "wedge": "nothing is answered for the duration",
         "crash": "GXSM vanishes",
@@ -63,7 +63,7 @@ class GxsmEmulator(Emulator):
         card: str = "SRanger",
         transport: str = "bridge",
         script: str = "",
-        block: str = BLOCK,
+        block: str = "",
         process: str = PROCESS,
         user_unit: str = "Å",
         decimal_comma: bool = False,
@@ -83,13 +83,14 @@ class GxsmEmulator(Emulator):
                 raise ConfigError(f"{value!r}", where=name, hint=f"there are {', '.join(map(str, known))}")
         self._version, self._card, self._transport = version, card, transport
         self._script = Path(script) if script else SCRIPT
-        self._block_name, self._process = block, process
+        self._block_name, self._process = block or f"emulated_gxsm4_{os.urandom(8).hex()}", process
         self._user_unit, self._decimal_comma = user_unit, decimal_comma
         self._auto_save, self._probe_auto_save = auto_save, probe_auto_save
         self._reach_m = reach_m
         self.unanswered: deque[Call] = deque()
         self.silent = False
         self._console: Console | None = None
+        self._listens = False
         self._block: Block | None = None
 
     def open(self) -> str:
@@ -117,13 +118,17 @@ class GxsmEmulator(Emulator):
 
     def run_script(self) -> str:
         """Run the script in the console, as a user does. Returns where it listens."""
-        if self._console is not None:
-            self._console.end()
+        before = self._console
+        if before is not None:
+            before.end()
             self.unanswered.clear()
-        self._console = Console(self._script, self.port, self._post)
+        self._console = Console(self._script, self.port, self._post, self.woken.post)
         while (address := self._console.poll()) is None:
             self.serve(1.0)
         self.port = int(address.rpartition(":")[2])
+        self._listens = True
+        if before is not None:
+            self.listening(address)
         return address
 
     def serve(self, timeout_s: float) -> None:
@@ -143,6 +148,9 @@ class GxsmEmulator(Emulator):
             self._block.end(remains=True)
             self._block = None
             raise Crashed("its shared memory stays")
+        if self._console is not None and self._listens and not self._console.runs:
+            self._listens = False
+            self.listening("")
         if self.faults.strikes("script-stopped", now_s):
             self.program.entries.put("script-control", 0.0)
         next_s = self.program.advance(now_s)

@@ -69,12 +69,16 @@ class Console:
     Args:
         script: that listens at a port, and says so.
         post: takes its calls, from its own thread.
+        ended: called from that thread when the script has ended.
     """
 
-    def __init__(self, script: Path, port: int, post: Callable[[Call], None]) -> None:
+    def __init__(
+        self, script: Path, port: int, post: Callable[[Call], None], ended: Callable[[], None] = lambda: None
+    ) -> None:
         self._module = Module(post)
         self._said: Future[str] = Future()
-        self._script, self._port = script, port
+        self._script, self._port, self._ended = script, port, ended
+        self._runs = True
         self._thread = threading.Thread(target=self._run, daemon=True, name="GXSM's console")
         self._thread.start()
 
@@ -89,7 +93,7 @@ class Console:
     @property
     def runs(self) -> bool:
         """Whether the script has not ended."""
-        return self._thread.is_alive()
+        return self._runs
 
     def end(self) -> None:
         """GXSM is closed."""
@@ -110,3 +114,6 @@ class Console:
         except BaseException as error:
             if not self._said.done():
                 self._said.set_exception(error)
+        finally:
+            self._runs = False
+            self._ended()

@@ -18,7 +18,6 @@ from afspm.units import Length
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
 """By the year of the software: the first that has what the protocol has from then on."""
-_PORTS: Final = 4
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
 _ANSWERING: Final = (on_curves, on_scans, on_signals, on_tip)
 """What answers to the functions, by having been imported."""
@@ -47,7 +46,7 @@ class NanonisEmulator(Emulator):
     Args:
         release: of its software: a year of `RELEASES`, or the number itself.
         port: the first that it listens on; 0: any free.
-        ports: how many; left out: four, as the real one, beginning with its usual one; one anywhere else.
+        ports: how many, one after the other; where any is free, each is any.
         one_each: whether a port serves one client at a time, as the real one's do.
         session_path: what it calls its session folder, e.g. "D:\\\\Data"; left out: what the folder is called here.
         range_m: of its scanner in x and y.
@@ -57,7 +56,7 @@ class NanonisEmulator(Emulator):
     """
 
     vendor = "Nanonis"
-    usual_port = 6501
+    usual: ClassVar[Mapping[str, Any]] = {"port": 6501, "ports": 4}
     fault_kinds: ClassVar[Mapping[str, str]] = {
         "no-reply": "a request is not answered",
         "slow": "a reply comes later, by the duration",
@@ -80,7 +79,7 @@ class NanonisEmulator(Emulator):
         self,
         *,
         release: str | int = "2025",
-        ports: int | None = None,
+        ports: int = 1,
         one_each: bool = False,
         session_path: str = "",
         range_m: Length = 100e-6,
@@ -90,7 +89,7 @@ class NanonisEmulator(Emulator):
     ) -> None:
         super().__init__(**settings)
         self.release = _release(release)
-        self._ports = ports or (_PORTS if self.port == self.usual_port else 1)
+        self._ports = ports
         self._one_each = one_each
         self._session_path = session_path
         self._range_m = range_m

@@ -69,7 +69,6 @@ class Asylum(Microscope):
             poll_period_s=poll_period_s,
             result_timeout_s=result_timeout_s,
         )
-        self._address = address
         self.controller_at = address
         self._folders = dict(folders or {})
         self._base_name = _checked_name(base_name)
@@ -90,7 +89,9 @@ class Asylum(Microscope):
     def connect(self) -> None:
         """A new connection, and what must be there for it to be of use."""
         self.close()
-        self._session = session = Session(Link(self._address, self._reply_timeout_s, self.clock.monotonic_s))
+        link = Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
+        self._session = session = Session(link)
+        self.prove()
         self._kept: dict[str, Any] = self.memory.setdefault("kept", dict(_AT_FIRST))
         self._harvest = Harvest(self.memory, self.log)
         self._activity = Activity(
@@ -116,7 +117,7 @@ class Asylum(Microscope):
     @property
     def _igor(self) -> Session:
         if self._session is None:
-            raise ControllerLost("Igor is not connected", where=self._address)
+            raise ControllerLost("Igor is not connected", where=self.controller_at)
         return self._session
 
     def status(self) -> ScopeStatus:

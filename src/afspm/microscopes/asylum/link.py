@@ -8,11 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from afspm.errors import ConfigError
 from afspm.microscopes.asylum import xop
 from afspm.microscopes.microscope import ControllerLost
 
+_NEVER = -1
+_OUTCOMES = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED
 _SILENT = "Igor is silent while a dialog waits on its screen, and dumb about texts that are not UTF-8"
 
 
@@ -20,12 +23,16 @@ class Link:
     """A connection. For one thread.
 
     A DEALER, since a REQ socket is of no use any more after one lost reply. Whatever goes wrong but an error of
-    Igor's own, it is closed: a late reply must never be taken for that to the next request.
+    Igor's own, it is closed: a late reply must never be taken for that to the next request. It never connects a second
+    time: there may be somebody else by then.
 
     Args:
         address: e.g. "tcp://127.0.0.1:5555".
         timeout_s: how long a reply may take, in real time.
         monotonic_s: real time.
+
+    Raises:
+        ControllerLost: nobody listens there. ConfigError: it is no address.
     """
 
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
@@ -38,7 +45,7 @@ class Link:
         self._socket.setsockopt(zmq.LINGER, 0)
         # nothing waits for a peer that is not there, and is then done when nobody expects it any more
         self._socket.setsockopt(zmq.IMMEDIATE, 1)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, _NEVER)
         self._socket.setsockopt(zmq.SNDTIMEO, max(1, round(timeout_s * 1000)))
         try:
             self._socket.connect(address)
@@ -46,6 +53,18 @@ class Link:
             self.close()
             hint = '"tcp://host:port", as given to zeromq_server_bind'
             raise ConfigError(f"{address!r} is no address: {error}", where="address", hint=hint) from error
+        self._await_connection()
+
+    def _await_connection(self) -> None:
+        """Return once the connection stands. Raises ControllerLost."""
+        monitor = self._socket.get_monitor_socket(_OUTCOMES)
+        came = monitor.poll(max(1, round(self._timeout_s * 1000)))
+        stands = bool(came) and recv_monitor_message(monitor)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED
+        self._socket.disable_monitor()
+        if not stands:
+            self.close()
+            hint = "is Igor running, with zeromq_server_bind on this address?"
+            raise ControllerLost("nobody listens", where=self._address, hint=hint)
 
     def ask(self, name: str, *parameters: xop.Parameter) -> xop.Result:
         """Call a function of Igor's that has one result. Raises: as `call`."""
@@ -84,8 +103,7 @@ class Link:
         try:
             self._socket.send_multipart([b"", message])
         except zmq.Again as error:
-            hint = "is Igor running, with zeromq_server_bind on this address?"
-            raise ControllerLost("nobody listens", where=self._address, hint=hint) from error
+            raise ControllerLost(f"the connection was lost before {name}", where=self._address) from error
         while True:
             left_s = until_s - self._monotonic_s()
             if left_s <= 0.0 or not self._socket.poll(math.ceil(left_s * 1000.0)):

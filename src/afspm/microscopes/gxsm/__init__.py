@@ -78,8 +78,8 @@ class Gxsm(Microscope):
             raise ConfigError(f"there is no {hardware!r}", where="hardware", hint=f"there are {', '.join(kinds)}")
         if saving not in _SAVERS:
             raise ConfigError(f"{saving!r} saves nothing", where="saving", hint=f"{' or '.join(_SAVERS)}")
-        self._address = Address.parse(address)
         self.controller_at = address
+        Address.parse(address)
         self._saves = saving == "afspm"
         self._given_hardware = hardware
         self._scan_dir, self._probe_dir = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
@@ -91,7 +91,9 @@ class Gxsm(Microscope):
     def connect(self) -> None:
         """The link; what this GXSM has, in which unit it has it, and how it saves."""
         self.close()
-        ask = self._asking = Asking(open_link(self._address, self._reply_timeout_s, self.clock.monotonic_s))
+        address = Address.parse(self.controller_at)
+        ask = self._asking = Asking(open_link(address, self._reply_timeout_s, self.clock.monotonic_s))
+        self.prove()
         self._refnames, self._actions = ask.names("list_refnames"), ask.names("list_actions")
         missing = [ref for ref in REFNAMES if ref not in self._refnames]
         if missing:

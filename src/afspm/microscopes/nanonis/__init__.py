@@ -76,8 +76,8 @@ class Nanonis(Microscope):
             result_timeout_s=result_timeout_s,
             live_lines_s=live_lines_s,
         )
-        self._addresses = _addresses(address)
         self.controller_at = address
+        _addresses(address)
         self._session_dir = None if session_dir is None else Path(session_dir)
         self._release = release
         self._reply_timeout_s = reply_timeout_s
@@ -91,9 +91,10 @@ class Nanonis(Microscope):
         """Both connections, the release, and the modules that only answer once they are open."""
         self.close()
         session = self._session = Session(
-            self._addresses,
+            _addresses(self.controller_at),
             self._reply_timeout_s,
             self._release,
+            prove=self.prove,
             monotonic_s=self.clock.monotonic_s,
             wake=self.wake,
             log=self.log,

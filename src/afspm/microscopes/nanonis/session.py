@@ -24,6 +24,7 @@ class Session:
         addresses: of both; the same one only where a port serves several clients.
         timeout_s: for an answer, in real time.
         release: None: Nanonis is asked for it.
+        prove: called once each connection stands, before anything is asked.
         wake: called, from another thread, when `listener` has heard something.
 
     Attributes:
@@ -40,6 +41,7 @@ class Session:
         timeout_s: float,
         release: int | None,
         *,
+        prove: Callable[[], None],
         monotonic_s: Callable[[], float],
         wake: Callable[[], None],
         log: logging.Logger,
@@ -48,11 +50,13 @@ class Session:
         self._link = Link(addresses[0], timeout_s, monotonic_s)
         self._listener: Listener | None = None
         try:
+            prove()
             self.controller = f"Nanonis, release {release}"
             self._link.release = release or self._found_release()
             self.opened = {module for module in (*MODULES.values(), APPROACH) if self._open(module)}
             second = Link(addresses[-1], timeout_s, monotonic_s, self._link.release)
             self._listener = self.listener = Listener(second, wake)
+            prove()
         except AfspmError:
             self.close()
             raise

@@ -17,7 +17,6 @@ from afspm.addresses import connectable
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
-from afspm.experiment.parts import EMULATED
 from afspm.logic.telling import LOGGED_AS
 from afspm.model import Frame
 from afspm.record.facts import STATE_DIR
@@ -25,6 +24,7 @@ from afspm.runtime.component import Component
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
 from afspm.supervisor import common_clock, run_folder
+from afspm.supervisor.common_clock import Common
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators.bench import Bench
@@ -128,14 +128,14 @@ def opened(options: Options) -> Iterator[Session]:
     resolved = experiment.resolved
     (translator,) = resolved.with_role(Role.TRANSLATOR)
     with ExitStack() as stack:
-        bench, folder = _bench(experiment, options, stack)
+        bench, folder, simulated = _bench(experiment, options, stack)
         stack.callback(bench.end)
         stack.enter_context(_interrupting(bench))
         abilities = resolved.abilities(translator)
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
         support = find_out(bench, sorted(actions), sorted(parameters))
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
-        yield Session(bench, support, named, resolved.simulated, folder, options)
+        yield Session(bench, support, named, simulated, folder, options)
 
 
 @contextmanager
@@ -151,11 +151,12 @@ def _interrupting(bench: Bench) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _bench(experiment: Experiment, options: Options, stack: ExitStack) -> tuple[Bench, Path]:
-    """Start what is to be started; in control, and the run's folder. `stack` ends it all."""
-    clock = _clock(experiment, options)
+def _bench(experiment: Experiment, options: Options, stack: ExitStack) -> tuple[Bench, Path, bool]:
+    """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
+    common = _common(experiment, options)
+    clock = common.clock
     folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
-    own, starts = _starts(experiment, options, clock, folder)
+    own, starts = _starts(experiment, options, common, folder)
     log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
     stack.callback(log.close)
     run_folder.write_experiment(folder, experiment.expanded())
@@ -180,29 +181,34 @@ def _bench(experiment: Experiment, options: Options, stack: ExitStack) -> tuple[
         bench.begin()
     except Lost as lost:
         raise Lost("; ".join(filter(None, (str(lost), processes.errors)))) from lost
-    return bench, folder
+    return bench, folder, common.simulated
 
 
 _NOTHING = logging.CRITICAL + 1
 
 
-def _starts(
-    experiment: Experiment, options: Options, clock: ExperimentClock, folder: Path
-) -> tuple[Launch, list[Start]]:
+def _starts(experiment: Experiment, options: Options, common: Common, folder: Path) -> tuple[Launch, list[Start]]:
     """The tester's own launch line, and what is to be started."""
-    resolved = experiment.resolved
-    wanted = {part.name for role in (Role.TRANSLATOR, Role.SCHEDULER) for part in resolved.with_role(role)}
-    wanted |= {name for name, found in resolved.classes.items() if getattr(found, EMULATED, False) is True}
     starts = experiment.launches(
         take_address=FreePorts().address,
-        without=[name for name in experiment.component_names if name not in {*wanted, NAME} or name in options.without],
-        clock=clock.as_dict(),
+        without=_left_out(experiment, options),
+        clock=common.clock.as_dict(),
+        run=common.run,
+        simulated=common.simulated,
         run_dir=str(folder),
         state_dir=str(folder / STATE_DIR),
         log_level="DEBUG",
     )
     own = next(start.launch for start in starts if start.launch.name == NAME)
     return own, [start for start in starts if start.launch.name != NAME]
+
+
+def _left_out(experiment: Experiment, options: Options) -> list[str]:
+    """What is not started: all but translator, scheduler and emulated controller, and what runs already."""
+    resolved = experiment.resolved
+    wanted = {part.name for role in (Role.TRANSLATOR, Role.SCHEDULER) for part in resolved.with_role(role)}
+    wanted |= {*resolved.emulators, NAME}
+    return [name for name in experiment.component_names if name not in wanted or name in options.without]
 
 
 def _translator_address(experiment: Experiment, starts: Sequence[Start]) -> str | None:
@@ -233,16 +239,21 @@ def _link(port: Port, own: Launch, log: logging.Logger) -> Link:
     )
 
 
-def _clock(experiment: Experiment, options: Options) -> ExperimentClock:
+def is_simulated(experiment: Experiment, options: Options) -> bool:
+    """True if what is started here is simulated for certain."""
+    return experiment.simulated(without=_left_out(experiment, options))
+
+
+def _common(experiment: Experiment, options: Options) -> Common:
     """The scheduler's, where that runs already; else our own."""
-    if not experiment.resolved.simulated:
-        return ExperimentClock.real()
+    simulated = is_simulated(experiment, options)
     schedulers = {part.name for part in experiment.resolved.with_role(Role.SCHEDULER)}
-    if schedulers <= set(options.without):
-        launch = experiment.asking([NAME])
-        if launch is not None:
-            return common_clock.of_scheduler(launch, logging.getLogger(__name__).warning)
-    return replace(experiment.clock(), speed=options.speed)
+    launch = experiment.asking([NAME]) if schedulers <= set(options.without) else None
+    if launch is not None:
+        common = common_clock.of_scheduler(launch, logging.getLogger(__name__).warning)
+        return replace(common, simulated=simulated or common.simulated)
+    clock = replace(experiment.clock(), speed=options.speed) if simulated else ExperimentClock.real()
+    return Common(clock, common_clock.new_identity(), simulated)
 
 
 def _now() -> datetime:
