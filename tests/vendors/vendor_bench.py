@@ -165,7 +165,6 @@ class TranslatorProcess:
             clock=clock.as_dict(),
             run_dir=str(folder),
             state_dir=str(folder / "state"),
-            simulated=clock.real_s(1.0) != 1.0,
             retracts=retracts,
         )
         # where the lock on the controller lies, which one that is killed leaves behind

@@ -7,7 +7,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -223,9 +223,13 @@ class Emulator(ABC):
         context.when_stopping(self.stop)
         threading.Thread(target=self._until_the_end_of, args=(context,), name="experiment", daemon=True).start()
 
-        launch = context.launch
-        notice = Notice(notice_file(launch.state_dir, launch.name), launch.run) if launch.state_dir else None
+        with ExitStack() as stack:
+            launch, notice = context.launch, None
+            if launch.state_dir:
+                notice = stack.enter_context(closing(Notice(notice_file(launch.state_dir, launch.name), launch.run)))
+            return self._run_telling(context, notice)
 
+    def _run_telling(self, context: Context, notice: Notice | None) -> int:
         def listening(address: str) -> None:
             if address:
                 context.log.warning("SIMULATED: an emulated %s controller listens at %s", self.vendor, address)

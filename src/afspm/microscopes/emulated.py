@@ -60,6 +60,10 @@ class Notice:
         self._file.write(b" " * _LOCKED_BYTES + text.encode())
         self._file.flush()
 
+    def close(self) -> None:
+        """The controller is gone."""
+        self._file.close()
+
 
 class EmulatedController:
     """The emulator that a translator is wired to, as its notice tells it.
