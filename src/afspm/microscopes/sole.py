@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
+import stat
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from afspm.errors import AfspmError
 from afspm.record.going_on import lock
@@ -24,7 +27,7 @@ class ControllerTaken(AfspmError):
 
 @contextlib.contextmanager
 def commanding(address: str, run: str) -> Iterator[None]:
-    """This process alone, of all of this user on this computer, commands the controller while in the block.
+    """This process alone, of all on this computer, whoever's, commands the controller while in the block.
 
     Args:
         address: where the controller is; empty: nobody else can command it (a simulated one).
@@ -38,27 +41,34 @@ def commanding(address: str, run: str) -> Iterator[None]:
         return
     path = _file(address)
     with _locked(path, address) as file:
-        with contextlib.suppress(OSError):  # a full disk: who holds it can't be told, and it is held all the same
+        # a full disk, or the file is another user's: who holds it can't be told, and it is held all the same
+        with contextlib.suppress(OSError):
             file.truncate(0)
             file.write(b" " * _LOCKED_BYTES + f"{run or 'another run'}, process {os.getpid()}".encode())
             file.flush()
         try:
             yield
         finally:
-            with contextlib.suppress(OSError):  # Windows keeps it while it is open
+            with contextlib.suppress(OSError):  # Windows keeps it while it is open, a folder for all that of others
                 path.unlink()
 
 
 def _locked(path: Path, address: str) -> BinaryIO:
     """The file, open, and locked by us. Raises ControllerTaken."""
     while True:
-        file = path.open("a+b")
+        try:
+            file = _opened(path)
+        except FileNotFoundError:
+            continue  # whoever had it has just taken it away
+        except OSError as error:
+            told = f"the lock of this controller can't be had: {error.strerror or error}"
+            raise ControllerTaken(told, where=str(path), hint="delete it, and look who put it there") from error
         try:
             lock(file)
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
         except FileNotFoundError:
-            pass  # whoever had it has just taken it away
+            pass
         except OSError as error:
             file.close()
             told = f"this controller is commanded by {_holder(path)}"
@@ -66,15 +76,47 @@ def _locked(path: Path, address: str) -> BinaryIO:
         file.close()
 
 
+def _opened(path: Path) -> BinaryIO:
+    """The file, of whichever user; a link is not followed. What is another user's can be locked, and not written."""
+    flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+    try:
+        descriptor, mode = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o644), "r+b"
+    except PermissionError:
+        descriptor, mode = os.open(path, os.O_RDONLY | flags), "rb"
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "it is no file")
+    return cast("BinaryIO", os.fdopen(descriptor, mode))
+
+
 def _file(address: str) -> Path:
-    """The same for all processes of this user, however they write this computer."""
+    """The same for all processes of this computer, however they write its name."""
     plain = address.lower().replace("localhost", "127.0.0.1")
-    user = getattr(os, "getuid", lambda: "")()  # on Windows the folder is the user's own
-    return Path(tempfile.gettempdir()) / f"afspm-controller-{user}-{hashlib.sha256(plain.encode()).hexdigest()[:16]}"
+    return _folder() / hashlib.sha256(plain.encode()).hexdigest()[:16]
+
+
+def _folder() -> Path:
+    """A folder of ours that all users have in common: each may put files there, and take away only the own ones.
+
+    Raises:
+        ControllerTaken: it can't be had, or is a link, which leads where somebody else wants.
+    """
+    in_common = {"win32": os.environ.get("PROGRAMDATA"), "darwin": "/tmp"}  # where the usual one is each user's own
+    folder = Path(in_common.get(sys.platform) or tempfile.gettempdir()) / "afspm-controllers"
+    try:
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            folder.chmod(0o1777)
+        if not stat.S_ISDIR(folder.lstat().st_mode):
+            raise NotADirectoryError(errno.ENOTDIR, "it is no folder")
+    except OSError as error:
+        told = f"the folder of controllers' locks can't be had: {error.strerror or error}"
+        raise ControllerTaken(told, where=str(folder), hint="delete it, and look who put it there") from error
+    return folder
 
 
 def _holder(path: Path) -> str:
-    with contextlib.suppress(OSError), path.open("rb") as file:
+    with contextlib.suppress(OSError), _opened(path) as file:
         file.seek(_LOCKED_BYTES)
         return file.read().decode(errors="replace") or "another run"
     return "another run"
