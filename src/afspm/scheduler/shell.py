@@ -11,6 +11,7 @@ from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
 from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, Response
+from afspm.transport.fair_queue import FairQueue
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
@@ -19,6 +20,7 @@ from afspm.wire.frames import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
+    from afspm.logic.arbitration import Control
     from afspm.scheduler.journal import Journal
     from afspm.scheduler.state_file import StateFile
     from afspm.transport.complaints import Complaints
@@ -28,6 +30,9 @@ _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
+_MOST_A_TURN = 20
+"""Requests that are handled before everything else is looked at again: the component in control waits no longer."""
+_TOO_MANY = "too many requests of this client wait to be answered: ask again once others are"
 _TELL = bytes([TELL_REQUEST])
 
 
@@ -41,6 +46,8 @@ class Core(Protocol):
     def restore(self, state: dict[str, Any]) -> None: ...
     def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None: ...
     def cached(self) -> Iterable[tuple[Packet, int | None]]: ...
+    @property
+    def control(self) -> Control: ...
     @property
     def newest_source_ns(self) -> int: ...
     @property
@@ -67,6 +74,7 @@ class Shell:
         self._journal = journal
         self._complaints = complaints
         self._log = log
+        self._requests = FairQueue()
         self._replay: tuple[Packet, ...] = ()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
@@ -78,6 +86,8 @@ class Shell:
 
     def wait(self) -> list[Source]:
         """Wait for whatever comes first, a message or a deadline."""
+        if self._requests:
+            return self._sockets.wait(0)
         timeout_s = (self._core.leave_at_s if self.ended else self._look_at_s) - self._clock.monotonic_s()
         return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
 
@@ -94,7 +104,7 @@ class Shell:
         sockets = self._sockets
         for source in ready:
             if source is sockets.router:
-                self._requests(sockets.router.receive())
+                self._admit(sockets.router.receive())
             elif source is sockets.link:
                 if (reply := sockets.link.receive()) is not None:
                     self._take(events.TranslatorReply(reply.number, _response(reply)))
@@ -103,12 +113,13 @@ class Shell:
             elif source is sockets.publisher:
                 sockets.publisher.serve()
             elif source is sockets.router.monitor:
-                self._requests(sockets.router.follow())
+                self._admit(sockets.router.follow())
             elif source is sockets.subscriber.monitor:
                 sockets.subscriber.follow()
             else:
                 for change in sockets.link.follow():
                     self._take(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
+        self._handle_requests()
         now_s = self._clock.monotonic_s()
         if now_s >= self._look_at_s:
             self._deadlines(now_s)
@@ -122,10 +133,10 @@ class Shell:
             if source is sockets.publisher:
                 if sockets.publisher.serve():
                     sockets.publisher.kill()
-            elif source is sockets.router or source is sockets.router.monitor:
-                for event in sockets.router.receive() if source is sockets.router else sockets.router.follow():
-                    if isinstance(event, PeerAsked) and event.frames:
-                        self._asked_late(event)
+            elif source is sockets.router:
+                self._admit(sockets.router.receive())
+            elif source is sockets.router.monitor:
+                self._admit(sockets.router.follow())
             elif source is sockets.link:
                 sockets.link.receive()
             elif source is sockets.link.monitor:
@@ -135,6 +146,7 @@ class Shell:
                 sockets.subscriber.receive()
             else:
                 sockets.subscriber.follow()
+        self._handle_requests()
 
     def _let_translator_go(self) -> None:
         """It subscribes to nobody.
@@ -144,8 +156,10 @@ class Shell:
         if self._tip_is_safe:
             self._sockets.link.send(0, [wire.CLOSE])
 
-    def _asked_late(self, asked: PeerAsked) -> None:
+    def _asked_late(self, asked: RouterEvent) -> None:
         """A supervisor says its last words, or who is still at work; all others hear that it is over."""
+        if not isinstance(asked, PeerAsked) or not asked.frames:
+            return
         if asked.frames[0] == _TELL:
             self._request(asked)
             return
@@ -168,9 +182,17 @@ class Shell:
     def _take(self, event: events.Input) -> None:
         self._carry_out(self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns()))
 
-    def _requests(self, received: list[RouterEvent]) -> None:
-        for event in received:
-            if isinstance(event, PeerAsked):
+    def _admit(self, received: list[RouterEvent]) -> None:
+        for asked in self._requests.put(received):
+            self._complaints.say(f"refused a request of {asked.name or 'a nameless peer'}: {_TOO_MANY}")
+            response = Response(ControlResponse.FAILURE, reason=_TOO_MANY, id=_id_of(asked))
+            self._sockets.router.reply(asked.connection, wire.encode_response(response))
+
+    def _handle_requests(self) -> None:
+        for event in self._requests.take(_MOST_A_TURN, self._core.control.holder):
+            if self.ended:
+                self._asked_late(event)
+            elif isinstance(event, PeerAsked):
                 self._request(event)
             elif isinstance(event, PeerConnected):
                 self._take(events.Connected(event.connection))

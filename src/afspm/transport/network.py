@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import zmq
 
 from afspm.errors import ConfigError, TransportError
+from afspm.transport.connections import Connections
 
 if TYPE_CHECKING:
     from afspm.transport.keys import Keys
@@ -23,12 +24,33 @@ QUEUE_LENGTH = 4000
 _LINGER_MS = 200
 # A peer that is frozen or cut off is found within seconds and not when the system gives up on it after hours.
 _ALIVE_CHECK_MS, _ALIVE_TIMEOUT_MS = 2_000, 8_000
-# That is asked behind what waits for the peer, so one that takes nothing more is never asked. It is disconnected after
-# this time, and what waited for it is dropped. Back again it asks for what it missed. (Linux and Windows; how much may
-# wait until then, see `laggards`.)
+# libzmq 4.3.5 aborts the process (`Assertion failed: !_io_error`) if it sends or answers a heartbeat of ZMTP on a
+# connection that was lost while its receive queue was full. So the queues of these kinds have no length in messages, and
+# `connections` bounds them in bytes; all others send no heartbeats, and rely on those of TCP.
+_ENDLESS = frozenset({zmq.ROUTER, zmq.DEALER, zmq.XPUB, zmq.SUB})
+_WITH_HEARTBEATS = frozenset({zmq.ROUTER, zmq.DEALER})
+_KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3
+# A peer that takes nothing is disconnected after this time, and what waited for it is dropped. Connected again it asks
+# for what it missed. (Linux and Windows; how much may wait until then, see `connections`.)
 _STALLED_MS = 5_000
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
 _HANDSHAKE_MS = 5_000
+_OPTIONS = (
+    (zmq.LINGER, _LINGER_MS),
+    (zmq.SNDHWM, QUEUE_LENGTH),
+    (zmq.TCP_KEEPALIVE, 1),
+    (zmq.TCP_KEEPALIVE_IDLE, _KEEPALIVE_S),
+    (zmq.TCP_KEEPALIVE_INTVL, _KEEPALIVE_S),
+    (zmq.TCP_KEEPALIVE_CNT, _KEEPALIVE_TRIES),
+    (zmq.RECONNECT_IVL, _RECONNECT_MS),
+    (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
+    (zmq.HANDSHAKE_IVL, _HANDSHAKE_MS),
+)
+_HEARTBEATS = (
+    (zmq.HEARTBEAT_IVL, _ALIVE_CHECK_MS),
+    (zmq.HEARTBEAT_TIMEOUT, _ALIVE_TIMEOUT_MS),
+    (zmq.HEARTBEAT_TTL, _ALIVE_TIMEOUT_MS),
+)
 
 
 class Network:
@@ -44,6 +66,7 @@ class Network:
         self._insecure = insecure
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._sockets: list[zmq.Socket[bytes]] = []
+        self.connections = Connections()
         self._authenticator = None
         if keys is not None:
             from afspm.transport.zap import Authenticator
@@ -68,18 +91,12 @@ class Network:
         """A socket with the house's limits; frames over `max_bytes` end the connection that they come by."""
         socket = self._context.socket(kind)
         self._sockets.append(socket)  # else one that its owner forgets is closed at some time or other
+        options = _OPTIONS + (_HEARTBEATS if kind in _WITH_HEARTBEATS else ())
         for option, value in (
-            (zmq.LINGER, _LINGER_MS),
-            (zmq.SNDHWM, QUEUE_LENGTH),
-            (zmq.RCVHWM, QUEUE_LENGTH),
+            *options,
+            (zmq.RCVHWM, 0 if kind in _ENDLESS else QUEUE_LENGTH),
             (zmq.MAXMSGSIZE, max_bytes),
-            (zmq.HEARTBEAT_IVL, _ALIVE_CHECK_MS),
-            (zmq.HEARTBEAT_TIMEOUT, _ALIVE_TIMEOUT_MS),
-            (zmq.HEARTBEAT_TTL, _ALIVE_TIMEOUT_MS),
             (zmq.TCP_MAXRT, _STALLED_MS),
-            (zmq.RECONNECT_IVL, _RECONNECT_MS),
-            (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
-            (zmq.HANDSHAKE_IVL, _HANDSHAKE_MS),
         ):
             socket.setsockopt(option, value)
         return socket
@@ -102,7 +119,10 @@ class Network:
             raise TransportError(
                 f"can't bind: {zmq.strerror(error.errno or 0)}", where=address, hint=_bind_hint(error)
             ) from error
-        return socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
+        bound = socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
+        if socket.type in _ENDLESS:
+            self.connections.guard(bound)
+        return bound
 
     def connect(self, socket: zmq.Socket[bytes], address: str) -> None:
         """Connect, and again whenever the connection is lost.
@@ -125,6 +145,7 @@ class Network:
         """Close all sockets, once what was sent has gone out or a fraction of a second has passed."""
         if self._context.closed:
             return
+        self.connections.close()
         if self._authenticator is not None:
             self._authenticator.close()
         self._context.destroy(linger=_LINGER_MS)

@@ -13,6 +13,7 @@ from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import QUEUE_LENGTH, Network
 
 _MOST_ROUNDS = 100
+_BATCH = 100
 
 
 class PeerConnected(NamedTuple):
@@ -62,6 +63,8 @@ class Router:
     def __init__(self, network: Network, address: str, complaints: Complaints) -> None:
         self._complaints = complaints
         self._with_keys = network.keys is not None
+        self._guard = network.connections
+        self._heard: set[int] = set()
         self._connections = 0
         self.touched = True
         self._by_descriptor: dict[int, _Peer] = {}
@@ -73,15 +76,29 @@ class Router:
         self.address = network.bind(self.socket, address)
 
     def receive(self) -> list[RouterEvent]:
-        """The next request; if it has to do with a change of connections, that change too and all that came with it."""
+        """The next requests, a batch at most; the changes of connections that they have to do with; and all that came
+        with those."""
+        told: list[RouterEvent] = []
+        for _ in range(_BATCH):
+            first, frames = self._receive()
+            if first is None:
+                return told
+            peer = self._by_descriptor.get(descriptor_of(first) or -1)
+            if peer is None or peer.identity != frames[0] or self.monitor.has_news():
+                self.touched = True
+                return told + self._settle([(first, frames)])
+            told += self._interpret(peer, frames)
         self.touched = True
+        return told
+
+    def _receive(self) -> tuple[zmq.Frame | None, list[bytes]]:
         first, frames = receive_small(self.socket)
         if first is None:
-            return []
-        peer = self._by_descriptor.get(descriptor_of(first) or -1)
-        if peer is not None and peer.identity == frames[0] and not self.monitor.has_news():
-            return self._interpret(peer, frames)
-        return self._settle([(first, frames)])
+            self._guard.settled(self._heard)
+            self._heard.clear()
+        elif (descriptor := descriptor_of(first)) is not None:
+            self._heard.add(descriptor)
+        return first, frames
 
     def follow(self) -> list[RouterEvent]:
         """Connections that came and went, and what came with them."""
@@ -92,7 +109,7 @@ class Router:
         changes: list[tuple[_Peer, bool]] = []
         for _ in range(_MOST_ROUNDS):
             while len(messages) < QUEUE_LENGTH and readable(self.socket):
-                first, frames = receive_small(self.socket)
+                first, frames = self._receive()
                 if first is not None:
                     messages.append((first, frames))
             # The monitor tells everything in order: it knows of every connection that these came by, and once it has
