@@ -30,6 +30,8 @@ BATCH = 2_000
 GROWTH_MB = 32.0
 """How much a process may grow from the first tenth to the end. In a short run the tables of what was answered are still
 filling up by then (20 MB in the scheduler); in a run of a million nothing is left but what is just queued (4 MB)."""
+BURSTS = 0.05
+"""So many batches are followed by a burst."""
 MOST_UNFINISHED = 300
 """Connections held open at a time that never finish to greet."""
 GREETING = b"\xff" + bytes(8) + b"\x7f\3\0NULL".ljust(55, b"\0")
@@ -133,6 +135,8 @@ class Soak:
                 delimiter = [b""] if self._random.random() < 0.9 else []
                 targets[n % 3].send_multipart(delimiter + self.malice.request())
         self._strangers()
+        if self._random.random() < BURSTS:
+            self._burst()
         self.check()
         for dealer in targets:
             dealer.close(linger=10_000)
@@ -160,6 +164,17 @@ class Soak:
             subscriber.send(self._random.randbytes(10) or b"\1")
         large.close(linger=100)
         subscriber.close(linger=100)
+
+    def _burst(self) -> None:
+        """A peer that says more than any queue holds, with heartbeats in between, and hangs up in the middle."""
+        for target in (self._scheduler, self._translator):
+            peer = self._context.socket(zmq.DEALER)
+            peer.setsockopt(zmq.SNDHWM, 0)
+            peer.setsockopt(zmq.HEARTBEAT_IVL, 1)
+            peer.connect(target)
+            for _ in range(20_000):
+                peer.send_multipart([b"", bytes([ControlRequest.ACTION_SUPPORT]), b"start-scan"])
+            peer.close(linger=50)
 
     def _close_unfinished(self) -> None:
         for connection in self._unfinished:

@@ -30,6 +30,8 @@ LONGER_THAN_THE_SCHEDULER = 1.2
 """By so much we wait longer than the scheduler does for the microscope: what it says then is an answer, and who asks
 again instead makes the connection anew, as if the scheduler were gone."""
 CAUGHT_UP_WITHIN_S = 2.0  # a scheduler of version 1 replays without saying when it is done
+MOST_UNANSWERED = 4
+"""Of what is told without waiting for the answer."""
 Listener = Callable[[Packet, bool], None]
 
 
@@ -72,6 +74,8 @@ class Link:
         self._asked = ""
         self._answer: Response | None = None
         self._ids_are_echoed: bool | None = None
+        self._told: dict[str, float] = {}  # ids of what was told and not answered yet, with the monotonic time
+        self._untold: dict[str, Told] = {}
         self._caught_up: set[str] = set()
         self._listeners: dict[int, Listener] = {}
         self._listened = 0
@@ -219,10 +223,23 @@ class Link:
         self.port.send(wire.encode_request(Request(kind, subject, id=self.next_id())))
 
     def tell(self, thing: Any) -> None:
-        """Have the scheduler publish something of ours, and don't wait for it."""
-        if self._ids_are_echoed:  # else its answer could be taken for that to the next request
-            told = Told(*wire.encode(thing))
-            self.port.send(wire.encode_request(Request(TELL_REQUEST, told, id=self.next_id())))
+        """Have the scheduler publish something of ours, and don't wait for it.
+
+        While some of it is not answered, only the newest of each kind is kept to be sent later.
+        """
+        if not self._ids_are_echoed:
+            return  # its answer could be taken for that to the next request
+        told, since_s = Told(*wire.encode(thing)), self.clock.monotonic_s() - self.request_timeout_s
+        self._told = {told_id: at_s for told_id, at_s in self._told.items() if at_s > since_s}
+        if len(self._told) < MOST_UNANSWERED:
+            self._send_told(told)
+        else:
+            self._untold[told.message] = told
+
+    def _send_told(self, told: Told) -> None:
+        request = Request(TELL_REQUEST, told, id=self.next_id())
+        self._told[request.id] = self.clock.monotonic_s()
+        self.port.send(wire.encode_request(request))
 
     def until(self, timeout_s: float | None) -> float | None:
         """A timeout as the moment, in monotonic time, when it is over."""
@@ -260,6 +277,7 @@ class Link:
             case ControlConnected():
                 self.connections += 1
                 self.connected = True
+                self._told.clear()  # what was on its way then may be lost, and its answer with it
             case ControlDisconnected():
                 self.connected = False
             case Killed():
@@ -268,6 +286,11 @@ class Link:
                 self.stopping = True
 
     def _take_reply(self, response: Response) -> None:
+        if response.id in self._told:
+            del self._told[response.id]
+            if self._untold:
+                self._send_told(self._untold.pop(next(iter(self._untold))))
+            return
         if not self._asked:
             return  # late: it was given up on
         if response.id in ("", self._asked):

@@ -30,6 +30,7 @@ _TELLS = sys.platform == "linux"
 _INFO_BYTES = 160
 _UNACKED, _COUNTS, _NOT_SENT = struct.Struct("=I"), struct.Struct("=QQ"), struct.Struct("=I")
 _UNACKED_AT, _COUNTS_AT, _NOT_SENT_AT = 24, 120, 144  # in Linux's `struct tcp_info`
+_AT_ONCE = struct.pack("ii", 1, 0)
 _log = logging.getLogger("afspm.transport")
 
 
@@ -47,7 +48,7 @@ class TcpInfo(NamedTuple):
     all_sent: bool
 
 
-class _Incoming:
+class Unread:
     """The bytes of one peer of a bound socket: `base` of them are accounted for."""
 
     __slots__ = ("base", "began_s", "since_s")
@@ -74,7 +75,7 @@ class Connections:
 
     def __init__(self) -> None:
         self._bound: frozenset[int] = frozenset()
-        self._peers: dict[tuple[int, str], _Incoming | None] = {}  # None: not of a bound socket
+        self._peers: dict[tuple[int, str], Unread | None] = {}  # None: not of a bound socket
         self._settled: set[int] = set()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -111,7 +112,7 @@ class Connections:
         for key in _sockets():
             descriptor, name = key
             if key not in former:
-                former[key] = _Incoming(now_s) if self._is_ours(descriptor) else None
+                former[key] = Unread(now_s) if self._is_ours(descriptor) else None
             peer = self._peers[key] = former[key]
             info = tcp_info(descriptor) if peer is not None else None
             if peer and info and peer.is_too_much(info.received, now_s, settled=descriptor in settled):
@@ -129,7 +130,7 @@ class Connections:
 def name_of(descriptor: int) -> str:
     """The system's name of the connection that has this descriptor, which no other ever has; "": there is none."""
     with contextlib.suppress(OSError):
-        return os.readlink(f"/proc/self/fd/{descriptor}")
+        return os.readlink(f"/proc/self/fd/{descriptor}")  # noqa: PTH115 (a Path costs more than the call)
     return ""
 
 
@@ -153,13 +154,14 @@ def disconnect(descriptor: int, name: str) -> None:
     """End a connection as if the peer had hung up, if it is still the one of that name."""
     with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
         if name and name_of(descriptor) == name:  # else the descriptor was given to somebody else since
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)  # what is on its way is dropped
             connection.shutdown(socket.SHUT_RDWR)
 
 
 def _sockets() -> Iterator[tuple[int, str]]:
     """Descriptor and name of every open socket of this process."""
     with contextlib.suppress(OSError):
-        for entry in os.listdir("/proc/self/fd"):
+        for entry in os.listdir("/proc/self/fd"):  # noqa: PTH208
             name = name_of(int(entry))
             if name.startswith("socket:"):
                 yield int(entry), name

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import zmq
 
-from afspm.transport.frames import readable
+from afspm.transport.frames import descriptor_of, readable, receive_small
 from afspm.transport.network import Network
 from afspm.transport.wakeup import WakeUp
 from afspm.wire import BEAT, CLOSING
@@ -124,7 +124,9 @@ class HeartbeatListener:
         for ready, _ in self._poller.poll(timeout_ms):
             name = None if isinstance(ready, int) else self._names.get(ready)
             while name is not None and readable(ready):
-                beat = read_beat(name, ready.recv_multipart(zmq.NOBLOCK))
+                first, frames = receive_small(ready)
+                self._network.connections.settled({(first and descriptor_of(first)) or -1})
+                beat = read_beat(name, frames)
                 if beat is not None:
                     found.append(beat)
         return found

@@ -7,12 +7,14 @@ from typing import NamedTuple
 import zmq
 
 from afspm.clock import Clock
-from afspm.transport.frames import readable
+from afspm.transport.frames import descriptor_of, receive_small
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
 from afspm.transport.polling import milliseconds
 
 LONGEST_LINE_BYTES = 64 * 1024
+MOST_LINES = 1000
+"""That are taken in at once."""
 
 
 class LogLine(NamedTuple):
@@ -64,11 +66,16 @@ class LogReceiver:
         self.address = network.bind(self._socket, address)
 
     def take(self) -> list[LogLine]:
-        """What has come; does not wait."""
-        lines = []
-        while readable(self._socket):
-            line = read_line(self._socket.recv_multipart(zmq.NOBLOCK))
-            if line is not None:
+        """The next of what has come, a batch at most; does not wait."""
+        lines: list[LogLine] = []
+        heard: set[int] = set()
+        for _ in range(MOST_LINES):
+            first, frames = receive_small(self._socket)
+            if first is None:
+                self._network.connections.settled(heard)
+                break
+            heard.add(descriptor_of(first) or -1)
+            if (line := read_line(frames)) is not None:
                 lines.append(line)
         return lines
 
@@ -82,7 +89,9 @@ class LogReceiver:
         while self._count() > staying and (left_s := until_s - clock.monotonic_s()) > 0.0:
             poller.poll(milliseconds(left_s))
             lines += self.take()
-        return lines + self.take()
+        while more := self.take():
+            lines += more
+        return lines
 
     def _count(self) -> int:
         """How many senders there are."""

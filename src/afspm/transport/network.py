@@ -25,8 +25,8 @@ _LINGER_MS = 200
 # A peer that is frozen or cut off is found within seconds and not when the system gives up on it after hours.
 _ALIVE_CHECK_MS, _ALIVE_TIMEOUT_MS = 2_000, 8_000
 # libzmq 4.3.5 aborts the process (`Assertion failed: !_io_error`) if it sends or answers a heartbeat of ZMTP on a
-# connection that was lost while its receive queue was full. So the queues of these kinds have no length in messages, and
-# `connections` bounds them in bytes; all others send no heartbeats, and rely on those of TCP.
+# connection that was lost while its receive queue was full. So the queues of these kinds have no length in messages:
+# `connections` bounds them in bytes. All others send no heartbeats, and rely on those of TCP.
 _ENDLESS = frozenset({zmq.ROUTER, zmq.DEALER, zmq.XPUB, zmq.SUB})
 _WITH_HEARTBEATS = frozenset({zmq.ROUTER, zmq.DEALER})
 _KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3

@@ -9,9 +9,13 @@ import zmq
 from afspm import wire
 from afspm.model import Packet
 from afspm.transport.frames import descriptor_of, property_of, readable, send_packet
-from afspm.transport.laggards import MOST_WAITING_BYTES, Laggards
 from afspm.transport.network import Network
-from afspm.transport.replay import Marker, is_reserved, spelled_out
+from afspm.transport.replay import LONGEST, Marker, is_reserved, spelled_out
+from afspm.transport.subscribers import MOST_WAITING_BYTES, Subscribers
+
+_BATCH, _MOST_REPLAYS = 100, 5
+"""Messages that are taken in, and replays that are made, before everything else is looked at again."""
+_OVERHEAD_BYTES = 24
 
 History = Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
 """(who, prefixes, since_ns) -> what was published under these and is newer, oldest first."""
@@ -24,8 +28,8 @@ class Publisher:
     it again, and from then on everything, without a gap. A subscriber of version 1 is sent what was kept as ordinary
     packets, which all of that version see.
 
-    Nobody is waited for. A subscriber of ours for which too much waits is disconnected: once it takes something again,
-    it connects anew and asks for what it missed.
+    Nobody is waited for. A subscriber for which too much waits is disconnected: once it takes something again, it
+    connects anew and gets what it missed.
 
     Args:
         history: what was published before; asked when somebody subscribes.
@@ -37,10 +41,11 @@ class Publisher:
     ) -> None:
         self.history = history
         self.touched = True
-        self.socket = network.socket(zmq.XPUB)
+        self.socket = network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
-        self._laggards = Laggards(self.socket, most_waiting_bytes)
+        self._guard = network.connections
+        self._subscribers = Subscribers(most_waiting_bytes)
         self.address = network.bind(self.socket, address)
 
     def publish(self, packet: Packet) -> None:
@@ -48,7 +53,7 @@ class Publisher:
         tail = None if packet.time_ns is None else wire.encode_time(packet.time_ns)
         self.touched = True
         send_packet(self.socket, [packet.envelope.encode()], packet.payload, tail)
-        self._laggards.published(len(packet.payload))
+        self._subscribers.published(packet.envelope, _size(packet))
 
     def kill(self) -> None:
         """The experiment has ended: tell everyone to close."""
@@ -58,37 +63,58 @@ class Publisher:
         """Take in who subscribed and who left; returns how many joined."""
         self.touched = True  # perhaps: what was kept
         joined = 0
-        plain: dict[object, list[bytes]] = {}
-        while readable(self.socket):
+        heard: set[int] = set()
+        plain: dict[int | None, list[bytes]] = {}
+        for _ in range(_BATCH):
+            if joined == _MOST_REPLAYS:
+                break
+            if not readable(self.socket):
+                self._guard.settled(heard)
+                break
             frame = self.socket.recv(zmq.NOBLOCK, copy=False)
-            subscription = frame.bytes
+            descriptor, subscription = descriptor_of(frame), frame.bytes
+            if descriptor is not None:
+                heard.add(descriptor)
             if subscription[:1] == b"\1":
-                joined += self._subscribed(subscription[1:], frame, plain)
-            elif subscription[:1] == b"\0" and not is_reserved(subscription[1:]):
-                for prefix in spelled_out([subscription[1:]]):
-                    self.socket.setsockopt(zmq.UNSUBSCRIBE, prefix)
+                joined += self._subscribed(subscription[1:], frame, descriptor, plain)
+            elif subscription[:1] == b"\0":
+                self._unsubscribed(subscription[1:], descriptor)
             # anything else is no subscription: nobody has a reason to send that here
-        for prefixes in plain.values():
+        for descriptor, prefixes in plain.items():
             # all of one peer's prefixes together: peers of version 1 lose what comes out of order
+            if not self._subscribers.may_replay(descriptor):
+                continue
             for packet in self.history(None, tuple(str(p, "utf-8", "replace") for p in prefixes), -1):
                 self.publish(packet)
         return joined + len(plain)
 
-    def _subscribed(self, subscription: bytes, frame: zmq.Frame, plain: dict[object, list[bytes]]) -> int:
+    def _subscribed(
+        self, subscription: bytes, frame: zmq.Frame, descriptor: int | None, plain: dict[int | None, list[bytes]]
+    ) -> int:
         marker = Marker.decode(subscription)
+        prefixes = marker.prefixes if marker is not None else (subscription.decode("utf-8", "replace"),)
+        ours = is_reserved(subscription) or property_of(frame, "Socket-Type") == "XSUB"
+        if not self._subscribers.subscribed(descriptor, prefixes, len(subscription)):
+            return 0
         if marker is not None:
-            self._laggards.joined(marker.name, frame)
-            self._replay(marker)
-            return 1
+            if self._subscribers.may_replay(descriptor):
+                self._replay(marker, descriptor)
+                return 1
         # our own subscribers repeat their prefixes by themselves when a connection is made again, before they can say
         # what they have: they are subscribed by the marker, and only by it, so that they miss nothing
-        if not is_reserved(subscription) and property_of(frame, "Socket-Type") != "XSUB":
+        elif not ours:
             for prefix in spelled_out([subscription]):
                 self.socket.setsockopt(zmq.SUBSCRIBE, prefix)
-            plain.setdefault(descriptor_of(frame), []).append(subscription)
+            plain.setdefault(descriptor, []).append(subscription)
         return 0
 
-    def _replay(self, marker: Marker) -> None:
+    def _unsubscribed(self, subscription: bytes, descriptor: int | None) -> None:
+        self._subscribers.unsubscribed(descriptor, len(subscription))
+        if not is_reserved(subscription):
+            for prefix in spelled_out([subscription]):
+                self.socket.setsockopt(zmq.UNSUBSCRIBE, prefix)
+
+    def _replay(self, marker: Marker, descriptor: int | None) -> None:
         socket, topic = self.socket, marker.topic
         # in this mode a subscription is for the one peer whose message was received last
         socket.setsockopt(zmq.SUBSCRIBE, topic)
@@ -97,5 +123,11 @@ class Publisher:
         for packet in self.history(topic, marker.prefixes, marker.since_ns):
             tail = b"" if packet.time_ns is None else wire.encode_time(packet.time_ns)
             send_packet(socket, [topic, packet.envelope.encode()], packet.payload, tail)
+            self._subscribers.sent(descriptor, len(topic) + _size(packet))
         socket.send(topic)
         socket.setsockopt(zmq.UNSUBSCRIBE, topic)
+
+
+def _size(packet: Packet) -> int:
+    """About as many bytes as a packet takes on its way."""
+    return len(packet.envelope) + len(packet.payload) + _OVERHEAD_BYTES

@@ -15,7 +15,8 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 _BEGIN = b"\0replay/"
-_LONGEST = 64 * 1024
+LONGEST = 8 << 10
+"""Bytes of a marker."""
 _MOST_PREFIXES = 1000
 
 # An envelope is text: it begins with one of these. The empty prefix, "everything", is written as all of them, since as
@@ -47,7 +48,7 @@ class Marker(NamedTuple):
     @classmethod
     def decode(cls, subscription: bytes) -> Marker | None:
         """None if the subscription is an ordinary prefix, or no proper marker."""
-        if not subscription.startswith(_BEGIN) or len(subscription) > _LONGEST:
+        if not subscription.startswith(_BEGIN) or len(subscription) > LONGEST:
             return None
         parts = subscription[1:].split(b"\0")
         if not 3 <= len(parts) <= _MOST_PREFIXES + 2:

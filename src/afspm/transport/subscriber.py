@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import zmq
 
 from afspm import wire
-from afspm.errors import WireError
+from afspm.errors import ConfigError, WireError
 from afspm.transport.complaints import Complaints
 from afspm.transport.frames import readable, receive
 from afspm.transport.monitor import CONNECTED, Monitor
 from afspm.transport.network import MAX_PACKET_BYTES, Network
 from afspm.transport.port import CaughtUp, Incoming, Killed, PacketReceived
-from afspm.transport.replay import Marker, topic
+from afspm.transport.replay import LONGEST, Marker, topic
 from afspm.wire import decode_packet
 
 _MOST_ENVELOPES = 10_000
@@ -31,6 +31,9 @@ class Subscriber:
         since_ns: what is not newer is known already.
         filtered: drop what is not newer than the newest of its envelope, as is right where times always increase. A
             translator's may not, if its clock is set back: then the one who listens has to tell doubles.
+
+    Raises:
+        ConfigError: these are too many prefixes.
     """
 
     def __init__(
@@ -48,6 +51,7 @@ class Subscriber:
         self._name = name
         self.address = address
         self._prefixes = _with_kill(prefixes)
+        _check(self._prefixes, name)
         self._complaints = complaints
         self._newest_ns = since_ns
         self._newest_of: dict[str, int] = {}
@@ -139,6 +143,15 @@ class Subscriber:
     def close(self) -> None:
         self.monitor.close()
         self.socket.close()
+
+
+def _check(prefixes: tuple[str, ...], name: str) -> None:
+    if len(Marker(topic(name, 10**9), 10**18, prefixes).encode()) > LONGEST:
+        raise ConfigError(
+            f"{len(prefixes)} prefixes are more than a publisher takes: {LONGEST} bytes",
+            where=name,
+            hint="subscribe to what the envelopes have in common, or to all of them",
+        )
 
 
 def _with_kill(prefixes: Sequence[str] | None) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import zmq
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
-from afspm.transport.frames import receive_small, send, user_of
+from afspm.transport.frames import descriptor_of, receive_small, send, user_of
 from afspm.transport.history import Published
 from afspm.transport.network import Network
 from afspm.transport.polling import milliseconds, poller
@@ -39,6 +39,7 @@ class ZmqServerPort:
         self._clock = clock
         self._allowed = allowed
         self._asker: list[bytes] | None = None
+        self._heard: set[int] = set()
         self._closed = False
         self.touched = True
         self._wake_up: WakeUp[Served] = WakeUp()
@@ -79,7 +80,10 @@ class ZmqServerPort:
         while self._asker is None:
             first, parts = receive_small(self._socket)
             if first is None:
+                self._network.connections.settled(self._heard)
+                self._heard.clear()
                 break
+            self._heard.add(descriptor_of(first) or -1)
             try:
                 start = parts.index(b"", 1) + 1
             except ValueError:

@@ -16,7 +16,7 @@ import pytest
 from afspm import wire
 from afspm.logic.envelopes import DEFAULT_HISTORY
 from afspm.model import Region, Scan
-from afspm.transport.laggards import MOST_WAITING_BYTES
+from afspm.transport.subscribers import MOST_WAITING_BYTES
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="a process is stopped by a signal, and its peak memory is read from /proc"

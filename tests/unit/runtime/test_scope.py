@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from runtime_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
 
-from afspm import model
+from afspm import model, wire
 from afspm.errors import ControlLost, ExperimentEnded, InvalidValue, NoResponse, Refused, UnitError
 from afspm.model import (
     ControlMode,
@@ -676,3 +676,14 @@ def test_a_scan_that_is_seen_to_begin_needs_no_answer(lab: Lab, scope: Scope) ->
     lab.intercept = lost
     assert scope.scan(REGION).region == REGION
     assert lab.begun_scans == 1
+
+
+def test_of_progress_told_in_a_tight_loop_a_few_wait_and_the_newest_arrives(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    for done in range(10_000):
+        scope.progress(done, 10_000)
+    assert lab.count(model.TELL_REQUEST) == 4
+    scope.sleep(1.0)
+    told = [request.subject for request in lab.requests if request.kind == model.TELL_REQUEST]
+    assert len(told) == 5
+    assert wire.decode(told[-1].message, told[-1].payload).done == 9_999

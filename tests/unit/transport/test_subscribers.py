@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sys
 from typing import Any
 
@@ -14,9 +15,10 @@ from afspm.transport.monitor import DISCONNECTED, Monitor
 from afspm.transport.network import Network
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.publisher import Publisher
+from afspm.transport.subscribers import MOST_REPLAYS, Subscribers
 from afspm.transport.zmq_port import ZmqPort
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there only the time for which one stands still counts")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only there the system tells what waits")
 ANY = "tcp://127.0.0.1:0"
 CLOCK = ExperimentClock.real()
 MB = 2**20
@@ -122,3 +124,33 @@ def test_much_over_time_disconnects_nobody_who_takes_it(lab: Any, open_: Any, un
             (healthy, got),
         )
     assert lab.events == []
+
+
+def test_no_more_waits_for_a_plain_subscriber_that_takes_nothing_than_may(lab: Any, plain: Any, until: Any) -> None:
+    slow = plain(zmq.SUB)
+    slow.setsockopt(zmq.RCVHWM, 1)
+    slow.subscribe(b"Scan")
+    slow.connect(lab.publisher.address)
+    lab.publish()
+    until(lambda: slow.poll(0), (lab, lab.events))
+    most = 0
+    for _ in range(MOST_WAITING // SCAN + 10):
+        lab.publish()
+        most = max(most, lab.waiting_bytes())
+    until(lambda: DISCONNECTED in lab.events, (lab, lab.events), timeout_s=SOON_S)
+    assert most <= MOST_WAITING + 2 * SCAN + 8 * MB
+
+
+def test_a_connection_may_ask_for_a_replay_a_second_and_some_at_once(open_: Any, plain: Any) -> None:
+    now_s = [100.0]
+    network = open_(Network())
+    address = network.bind(network.socket(zmq.XPUB), ANY)
+    host, port = address.removeprefix("tcp://").split(":")
+    with socket.create_connection((host, int(port))) as peer:
+        subscribers = Subscribers(monotonic_s=lambda: now_s[0])
+        assert all(subscribers.may_replay(peer.fileno()) for _ in range(MOST_REPLAYS))
+        now_s[0] += 1.0
+        assert subscribers.may_replay(peer.fileno())
+        assert not subscribers.may_replay(peer.fileno())
+        with pytest.raises(OSError, match=r"Broken pipe|reset"):
+            peer.send(b"anything")
