@@ -6,10 +6,13 @@ from typing import Any, ClassVar
 
 from afspm import wire
 from afspm.components.channels import Expected
+from afspm.components.feedback_metrics import FeedbackError, Following, FollowingLimits
 from afspm.components.feedback_signal import FeedbackSignal
+from afspm.components.tip_scans import HeightPair, Pairing
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import ControlState, Feedback, Problem, Scan
 from afspm.runtime.component import Component
+from afspm.units import Length
 
 MESSAGE = "FeedbackAnalysis"
 
@@ -17,13 +20,20 @@ MESSAGE = "FeedbackAnalysis"
 class FeedbackAnalysis(Component):
     """Publishes after each scan the shares of its pixels whose error is too large, as a `FeedbackAnalysis` message.
 
-    Flags `feedback-non-optimal` when the shares together exceed `limit` in several scans in a row, and removes the flag
-    when they do not any more.
+    Flags `feedback-non-optimal` when several scans in a row leave too much in the error, and removes the flag when
+    scans leave less than half of that, unless a component has control to solve it, which then decides. Where the flag
+    was removed although nothing is better, it is not set again until the feedback has followed in between. Scans with
+    the feedback off are not judged.
 
     Args:
         channel: what the feedback holds at the setpoint, in a unit of the same kind.
-        threshold: of the error, as a share of the setpoint.
+        height: the channel of the heights; empty if not recorded: a feedback that is a little slow is not seen then.
+        threshold: of the error, as a share of the setpoint, or, of a current, of its logarithm; by default 0.1, and 0.5
+            of a current.
         limit: of the pixels that may lie beyond it.
+        relief_limit: of the relief that may be in the error instead of the height.
+        sensitivity: height for 1 V of the channel, or, of a current, for a factor of 2.7; by default 50 nm, and 50 pm.
+            Negative where the signal falls as the tip withdraws, as a deflection does. A channel in metres needs none.
         flag_after: bad scans in a row until the problem is flagged.
         clear_after: good scans in a row until it is cleared.
     """
@@ -35,55 +45,68 @@ class FeedbackAnalysis(Component):
     def __init__(
         self,
         channel: str = "Amplitude",
-        threshold: float = 0.1,
-        limit: float = 0.1,
+        height: str = "Height",
+        threshold: float | None = None,
+        limit: float = FollowingLimits.pixels,
+        relief_limit: float = FollowingLimits.relief,
+        sensitivity: Length | None = None,
         flag_after: int = 2,
         clear_after: int = 1,
     ) -> None:
-        if not (threshold > 0.0 and 0.0 < limit < 1.0 and flag_after >= 1 and clear_after >= 1):
-            raise ConfigError("`threshold` must be above zero, `limit` between 0 and 1, the counts one at least")
-        self.channel, self.threshold, self.limit = channel, threshold, limit
+        if not (0.0 < limit < 1.0 and relief_limit > 0.0 and flag_after >= 1 and clear_after >= 1):
+            raise ConfigError("`limit` must be between 0 and 1, `relief_limit` above zero, the counts one at least")
+        self.limits = FollowingLimits(limit, relief_limit)
         self.flag_after, self.clear_after = flag_after, clear_after
-        self._setpoint: float | None = None
-        self._is_flagged = False
-        self._signal = FeedbackSignal()
+        self._pairing = Pairing(channel, height)
+        self._signal = FeedbackSignal(threshold, sensitivity)
+        self._feedback = Feedback()
+        self._is_flagged = self._is_being_solved = False
 
     def on_start(self) -> None:
-        self.expected = Expected([self.channel], self.log)
+        self.expected = Expected(self._pairing.channels, self.log)
 
     def on_feedback(self, feedback: Feedback) -> None:
-        self._setpoint = feedback.setpoint
+        self._feedback = feedback
 
     def on_control(self, control_state: ControlState) -> None:
         self._is_flagged = Problem.FEEDBACK_NON_OPTIMAL in control_state.problems
+        self._is_being_solved = self._is_flagged and bool(control_state.holder)
 
     def on_scan(self, scan: Scan) -> None:
         self.expected.see(scan)
-        if scan.channel != self.channel or not scan.values.size:
+        pair = self._pairing.add(scan)
+        if pair is None or self._feedback.on is False:
             return
-        if scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1):
+        time_ns = pair.trace.time_ns
+        if time_ns is not None and time_ns <= self.memory.get("newest_ns", -1):
             return  # replayed after a restart
         try:
-            shares = self._signal.error_shares(scan, self._setpoint, self.threshold, self.scope)
-        except InvalidValue as error:
-            self.log.warning("%s: %s", scan.channel, error)
+            error = self._error(pair)
+        except InvalidValue as wrong:
+            self.log.warning("%s: %s", pair.trace.channel, wrong)
             return
         message: Any = wire.message_type(MESSAGE)(
-            proportionOverThreshold=shares.over, proportionUnderThreshold=shares.under
+            proportionOverThreshold=error.over, proportionUnderThreshold=error.under
         )
         self.publish(message)
-        self._count(shares.total)
-        self.memory["newest_ns"] = -1 if scan.time_ns is None else scan.time_ns
+        self._count(error)
+        self.memory["newest_ns"] = -1 if time_ns is None else time_ns
         self.memory.save()
 
-    def _count(self, share: float) -> None:
-        is_bad = share > self.limit
+    def _error(self, pair: HeightPair) -> FeedbackError:
+        return self._signal.error(pair.trace, pair.retrace, self._feedback.setpoint, self.scope)
+
+    def _count(self, error: FeedbackError) -> None:
+        following = self.limits.judge(error)
         row = self.memory.get("row", 0)  # bad scans in a row as a positive number, good ones as a negative
-        row = max(row, 0) + 1 if is_bad else min(row, 0) - 1
+        row = min(row, 0) - 1 if following is Following.WELL else 0 if following.is_good else max(row, 0) + 1
         self.memory["row"] = row
-        if row >= self.flag_after and not self._is_flagged:
-            self.log.warning("the feedback does not follow: error beyond the threshold in %.0f %%", share * 100)
+        if row <= 0:
+            self.memory["is_told"] = False
+        if row >= self.flag_after and not self._is_flagged and not self.memory.get("is_told"):
+            self.log.warning("the feedback %s: %s", following.value, error)
+            self.memory["is_told"] = True
             self.scope.flag(Problem.FEEDBACK_NON_OPTIMAL)
-        elif -row >= self.clear_after and self._is_flagged:
-            self.log.info("the feedback follows: error beyond the threshold in %.0f %%", share * 100)
+        elif -row >= self.clear_after and self._is_flagged and not self._is_being_solved:
+            self.log.info("the feedback %s: %s", following.value, error)
             self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)

@@ -1,9 +1,11 @@
-"""How well the z feedback follows, from its error signal; and where better gains may be found."""
+"""How well the z feedback follows, from its error signal and the height; and where better gains may be found."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,31 +14,76 @@ from afspm.errors import InvalidValue
 
 Array = NDArray[np.float64]
 
+_SMALLEST_CURRENT = 0.01  # of the setpoint: what lies below is noise, and has no logarithm
+_SIGNIFICANT = 4.0  # standard deviations above what white noise would show
+_CLOSE = 1.1  # of two gains, between which none is looked for
+_SWING = 0.2  # of the error, that the height has to share for an oscillation
+
+
+class Following(Enum):
+    """How the feedback follows the sample."""
+
+    WELL = "follows"
+    BARELY = "barely follows"
+    TOO_SLOW = "is too slow"
+    OSCILLATES = "oscillates"
+
+    @property
+    def is_good(self) -> bool:
+        return self in (Following.WELL, Following.BARELY)
+
 
 @dataclass(frozen=True)
-class ErrorShares:
-    """Shares of a scan's pixels, 0 to 1, where the error signal is too large.
+class FeedbackError:
+    """The error signal of one scan.
 
     Attributes:
-        over: the signal lies above the setpoint by more than the threshold: in tapping, the tip is off the sample.
-        under: below it by more: it presses too hard.
+        over: share of the pixels, 0 to 1, where the signal lies above the setpoint by more than the threshold: in
+            tapping, the tip is off the sample.
+        under: the same below it: in tapping, the tip presses too hard.
+        missed: share of the relief that is in the error instead of the height.
+        swing: how the height moves with the error: one or more if the tip swings above the sample by itself, zero or
+            less if it comes late.
     """
 
     over: float
     under: float
+    missed: float = 0.0
+    swing: float = 0.0
 
     @property
-    def total(self) -> float:
+    def share(self) -> float:
+        """Of the pixels, beyond the threshold."""
         return self.over + self.under
 
+    def __str__(self) -> str:
+        return f"{self.share:.0%} of the pixels beyond the threshold, {self.missed:.0%} of the relief in the error"
 
-def error_shares(signal: Array, setpoint: float | None, threshold: float) -> ErrorShares:
-    """The shares of one scan.
+
+@dataclass(frozen=True)
+class FollowingLimits:
+    """What a feedback that follows may leave: a share of pixels beyond the threshold, and one of the relief."""
+
+    pixels: float = 0.1
+    relief: float = 0.2
+
+    def judge(self, error: FeedbackError) -> Following:
+        """Return what the error of one scan says. Half the limits are left as a margin where it follows well."""
+        worst = max(error.share / self.pixels, error.missed / self.relief)
+        if worst <= 1.0:
+            return Following.WELL if worst <= 0.5 else Following.BARELY
+        is_swinging = error.swing > _SWING and error.share > self.pixels
+        return Following.OSCILLATES if is_swinging else Following.TOO_SLOW
+
+
+def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> Array:
+    """Return by how much of the setpoint the signal is off.
 
     Args:
         signal: what the feedback holds at the setpoint, the amplitude, say; NaN where nothing was measured.
         setpoint: in the same unit; None: the signal's median, which it is at unless the feedback is far off.
-        threshold: of the error, as a share of the setpoint.
+        exponential: the signal falls exponentially with the distance, as a tunnelling current does, of either sign: its
+            logarithm is compared.
 
     Raises:
         InvalidValue: nothing was measured, or the setpoint is zero.
@@ -47,32 +94,80 @@ def error_shares(signal: Array, setpoint: float | None, threshold: float) -> Err
     centre = float(np.median(there)) if setpoint is None else setpoint
     if centre == 0.0:
         raise InvalidValue("a setpoint of zero has no relative error")
-    error = (there - centre) / abs(centre)
-    return ErrorShares(float(np.mean(error > threshold)), float(np.mean(error < -threshold)))
+    if exponential:
+        return np.asarray(np.log(np.maximum(np.abs(signal / centre), _SMALLEST_CURRENT)))
+    return np.asarray((signal - centre) / abs(centre))
+
+
+def feedback_error(error: Array, threshold: float, height_m: Array | None = None, gap_m: float = 0.0) -> FeedbackError:
+    """Return what one scan says.
+
+    A loop that comes late leaves of the relief in the error what is missing in the height. Compared in metres that is
+    the same for every sample, speed and noise, since noise that is white says nothing from one pixel to the next. A
+    loop that oscillates moves height and error together; one that comes late moves the height by the error's sum.
+
+    Args:
+        error: as of `relative_error`, [y, x].
+        threshold: of it.
+        height_m: of the same pixels; None: nothing is known of the relief.
+        gap_m: by how much an error of one is too high.
+    """
+    there = error[np.isfinite(error)]
+    over, under = float(np.mean(there > threshold)), float(np.mean(there < -threshold))
+    if height_m is None or gap_m == 0.0:
+        return FeedbackError(over, under)
+    complete = np.isfinite(error).all(axis=1) & np.isfinite(height_m).all(axis=1)
+    gap, height = error[complete] * gap_m, height_m[complete]
+    if gap.shape[0] < 1 or gap.shape[1] < 4:
+        return FeedbackError(over, under)
+    missed = math.sqrt(_smooth_variance(gap) / max(_smooth_variance(height), np.finfo(float).tiny))
+    moves, of_error = np.diff(height, axis=1), np.diff(gap, axis=1)
+    swing = float((moves * of_error).sum() / max((of_error**2).sum(), np.finfo(float).tiny))
+    return FeedbackError(over, under, missed, swing)
+
+
+def _smooth_variance(values: Array) -> float:
+    """Return the variance along lines, less tilt and white noise: the covariance of neighbours where significant."""
+    x = np.linspace(-1.0, 1.0, values.shape[1])
+    level = values - values.mean(axis=1, keepdims=True)
+    level = level - np.outer(level @ x / (x @ x), x)
+    shared = float(np.mean(level[:, 1:] * level[:, :-1]))
+    return shared if shared > _SIGNIFICANT * float(np.mean(level**2)) / math.sqrt(level.size) else 0.0
 
 
 def gain_search(
     start: float, factor: float, lowest: float, highest: float, most_tries: int
-) -> Generator[float, float, float]:
-    """Look for the gain of the smallest score by multiplying: up as long as it gets better, else down.
+) -> Generator[float, Following | None, float | None]:
+    """Look for a gain at which the feedback follows well: higher while it is too slow, lower while it oscillates.
 
-    Yields gains to try (the start first), is sent the score of each, and returns the best.
+    Yields gains to try, the start first, and is sent how the feedback follows; None if the gain was refused. Returns
+    the gain to keep, or None if no gain was good.
 
     Args:
-        factor: of one step, above 1.
+        start: within the bounds.
+        factor: of one step, above 1. Between a gain that is too low and one that is too high the steps get smaller.
         lowest, highest: never left.
-        most_tries: how many may be tried in all.
+        most_tries: how many gains are tried in all.
     """
-    best, best_score = start, (yield start)
-    tried = 1
-    for step in (factor, 1.0 / factor):
-        began = best
-        while tried < most_tries and lowest <= best * step <= highest:
-            score = yield best * step
-            tried += 1
-            if score >= best_score:
+    gain, slow, fast = start, 0.0, math.inf  # known as too low and too high
+    well = barely = None
+    comes_from_above = False
+    for _ in range(most_tries):
+        following = yield gain
+        if following is None or following is Following.OSCILLATES:
+            fast, wanted = gain, gain / factor
+            comes_from_above = following is Following.OSCILLATES and well is None
+        elif following is Following.TOO_SLOW:
+            slow, wanted, comes_from_above = gain, gain * factor, False
+        elif following is Following.BARELY:
+            barely, wanted = gain, gain * factor
+        elif comes_from_above:  # one step more, for a margin below the oscillation
+            well, wanted, comes_from_above = gain, gain / factor, False
+        else:
+            return gain
+        at, gain = gain, min(max(wanted, lowest), highest)
+        if gain == at or not slow < gain < fast:
+            if well or barely or not _CLOSE * slow < fast < math.inf or slow == 0.0:
                 break
-            best, best_score = best * step, score
-        if best != began:
-            break  # the other way lies what was left for it
-    return best
+            gain = math.sqrt(slow * fast)
+    return well or barely

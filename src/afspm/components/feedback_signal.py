@@ -1,34 +1,75 @@
-"""What the feedback holds at its setpoint, as a channel of a scan: how much of it is off."""
+"""The error of the feedback from two channels of a scan: what it holds at the setpoint, and the height."""
 
 from __future__ import annotations
 
-from afspm.components.feedback_metrics import ErrorShares, error_shares
-from afspm.errors import InvalidValue, Refused, RequestError, UnitError
+import numpy as np
+
+from afspm.components.feedback_metrics import FeedbackError, feedback_error, relative_error
+from afspm.errors import ConfigError, InvalidValue, Refused, RequestError, UnitError
 from afspm.model import Scan, names
 from afspm.runtime.scope import Scope
+from afspm.units import convert, same_kind
 
 ASKED_WITHIN_S = 5.0
 
+_THRESHOLD = 0.1
+_CURRENT_THRESHOLD = 0.5  # of the logarithm: 25 pm
+_M_PER_V = 50e-9  # usual for the light lever of a cantilever
+_CURRENT_DECAY_M = 0.05e-9  # a tenth of the current for 0.1 nm: work functions of some eV
+
 
 class FeedbackSignal:
-    """Compares channels with the setpoint, which is told without a unit: whether it is of their kind is asked once for
-    each unit."""
+    """Compares a channel with the setpoint, which is told without a unit: whether it is of its kind is asked once for
+    each unit.
 
-    def __init__(self) -> None:
+    Args:
+        threshold: of the error, as a share of the setpoint (of a current, of its logarithm); None: 0.1, and 0.5 of a
+            current.
+        sensitivity: height in m for 1 V of the channel, or, of a current, for a factor e; None: 50 nm, and 0.05 nm.
+    """
+
+    def __init__(self, threshold: float | None, sensitivity: float | None) -> None:
+        if threshold is not None and not threshold > 0.0:
+            raise ConfigError(f"{threshold!r} is not above zero", where="threshold")
+        if sensitivity == 0.0:
+            raise ConfigError("a sensitivity of zero", where="sensitivity")
+        self._threshold, self._sensitivity = threshold, sensitivity
         self._reasons: dict[str, str] = {}
 
-    def error_shares(self, scan: Scan, setpoint: float | None, threshold: float, scope: Scope) -> ErrorShares:
-        """See `feedback_metrics.error_shares`. Raises, besides,
+    def error(self, signal: Scan, height: Scan | None, setpoint: float | None, scope: Scope) -> FeedbackError:
+        """Return the error of one scan.
 
-        InvalidValue: the channel is of another kind than the setpoint: an amplitude in m, say, where that is in V; or
-            nobody answers just now.
+        Raises:
+            InvalidValue: the channel is of another kind than the setpoint: an amplitude in m, say, where that is in V;
+                or nobody answers just now; or it has no value, or the setpoint is zero.
         """
         if setpoint is not None:
-            if scan.unit not in self._reasons:
-                self._reasons[scan.unit] = self._reason(scan, scope)
-            if reason := self._reasons[scan.unit]:
-                raise InvalidValue(f"{scan.channel} can't be compared with the setpoint: {reason}")
-        return error_shares(scan.values, setpoint, threshold)
+            if signal.unit not in self._reasons:
+                self._reasons[signal.unit] = self._reason(signal, scope)
+            if reason := self._reasons[signal.unit]:
+                raise InvalidValue(f"{signal.channel} can't be compared with the setpoint: {reason}")
+        is_current = same_kind(signal.unit, "A")
+        error = relative_error(signal.values, setpoint, is_current)
+        threshold = self._threshold or (_CURRENT_THRESHOLD if is_current else _THRESHOLD)
+        if height is None:
+            return feedback_error(error, threshold)
+        try:
+            height_m = height.values * convert(1.0, height.unit, "m")
+        except UnitError as wrong:
+            raise InvalidValue(f"{height.channel} is no height: {wrong.what}") from wrong
+        if height_m.shape != error.shape:
+            raise InvalidValue(f"{height.channel} has not the pixels of {signal.channel}")
+        return feedback_error(error, threshold, height_m, self._gap_m(signal, setpoint))
+
+    def _gap_m(self, signal: Scan, setpoint: float | None) -> float:
+        """By how much the tip is too high where the relative error is one; 0 where that is not known."""
+        if same_kind(signal.unit, "A"):
+            return -(self._sensitivity or _CURRENT_DECAY_M)
+        unit, metres = ("m", 1.0) if same_kind(signal.unit, "m") else ("V", self._sensitivity or _M_PER_V)
+        if not same_kind(signal.unit, unit):
+            return 0.0
+        held = setpoint if setpoint is not None else float(np.nanmedian(signal.values))
+        return abs(held) * convert(1.0, signal.unit, unit) * metres
 
     def _reason(self, scan: Scan, scope: Scope) -> str:
         try:

@@ -2,31 +2,41 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import ClassVar
 
-from afspm.components.feedback_metrics import gain_search
+from afspm.components.feedback_metrics import Following, FollowingLimits, gain_search
 from afspm.components.feedback_signal import FeedbackSignal
 from afspm.errors import ConfigError, ControlLost, InvalidValue, Refused
 from afspm.model import Problem, names
 from afspm.runtime.component import Component
+from afspm.units import Length
+
+BACK_WITHIN_S = 60.0
 
 
 class FeedbackTuner(Component):
-    """Solves `feedback-non-optimal`: multiplies the integral gain up and down, with a test scan of the region set after
-    each, and keeps the one of the smallest error. If that is good it clears the flag; if not it flags
-    `device-malfunction` and leaves the rest to a person.
+    """Solves `feedback-non-optimal`: scans the region set, raises the integral gain while the feedback is too slow and
+    lowers it while it oscillates, until it follows well, or as well as it can.
+
+    Where no gain is good it sets the one that was there, says so in the log, and removes the flag, so that the
+    experiment goes on as it was. The gain that was there is also set again after control was lost, or a kill.
 
     Args:
         lowest_gain, highest_gain: of the integral gain; never left.
         factor: of one step.
         most_tries: test scans of one search.
         channel: what the feedback holds at the setpoint, in a unit of the same kind.
-        threshold: of the error, as a share of the setpoint.
-        limit: of the pixels that may lie beyond it for the flag to be cleared.
+        height: the channel of the heights.
+        threshold: of the error, as a share of the setpoint, or, of a current, of its logarithm; by default 0.1, and 0.5
+            of a current.
+        limit: of the pixels that may lie beyond it.
+        relief_limit: of the relief that may be in the error instead of the height.
+        sensitivity: height for 1 V of the channel, or, of a current, for a factor of 2.7; by default 50 nm, and 50 pm.
+            Negative where the signal falls as the tip withdraws, as a deflection does. A channel in metres needs none.
     """
 
     solves: ClassVar = ("feedback-non-optimal",)
-    flags: ClassVar = ("device-malfunction",)
     needs_actions = (names.START_SCAN,)
     needs_parameters = (names.ZCTRL_IGAIN,)
 
@@ -34,21 +44,29 @@ class FeedbackTuner(Component):
         self,
         lowest_gain: float,
         highest_gain: float,
-        factor: float = 1.5,
-        most_tries: int = 8,
+        factor: float = 2.0,
+        most_tries: int = 14,
         channel: str = "Amplitude",
-        threshold: float = 0.1,
-        limit: float = 0.1,
+        height: str = "Height",
+        threshold: float | None = None,
+        limit: float = FollowingLimits.pixels,
+        relief_limit: float = FollowingLimits.relief,
+        sensitivity: Length | None = None,
     ) -> None:
         if not (0.0 < lowest_gain < highest_gain and factor > 1.0 and most_tries >= 2):
             raise ConfigError("needs 0 < lowest_gain < highest_gain, factor > 1, most_tries >= 2")
+        if not (0.0 < limit < 1.0 and relief_limit > 0.0):
+            raise ConfigError("`limit` must be between 0 and 1, `relief_limit` above zero")
         self.lowest, self.highest, self.factor, self.most_tries = lowest_gain, highest_gain, factor, most_tries
-        self.channel, self.threshold, self.limit = channel, threshold, limit
-        self._signal = FeedbackSignal()
+        self.channel, self.height = channel, height
+        self.limits = FollowingLimits(limit, relief_limit)
+        self._signal = FeedbackSignal(threshold, sensitivity)
 
     def run(self) -> None:
         while True:
-            self.scope.wait_until(self._is_wanted)
+            self._leave_behind()
+            if not self.scope.wait_until(self._is_wanted, timeout_s=BACK_WITHIN_S if "gain" in self.memory else None):
+                continue
             try:
                 with self.scope.control(solving=Problem.FEEDBACK_NON_OPTIMAL):
                     self._tune()
@@ -61,48 +79,82 @@ class FeedbackTuner(Component):
 
     def _tune(self) -> None:
         feedback = self.scope.feedback
-        gain = feedback.integral_gain if feedback else None
-        if gain is None or not self.lowest <= gain <= self.highest:
-            self._give_up(f"the integral gain in force is {gain}, not within what is allowed")
+        if feedback is None or feedback.integral_gain is None or feedback.on is False:
+            self._finish(f"the feedback in force is {feedback}")
             return
-        search = gain_search(gain, self.factor, self.lowest, self.highest, self.most_tries)
-        shares: dict[float, float] = {}
-        wanted = next(search)
+        self.memory.setdefault("gain", feedback.integral_gain)
+        self.memory.save()
+        try:
+            found = self._search(min(max(feedback.integral_gain, self.lowest), self.highest))
+        except InvalidValue as error:
+            self._finish(error.what)
+            return
+        if found is not None:
+            self._keep(found)
+        self._finish("" if found is not None else "no gain is good")
+
+    def _search(self, start: float) -> float | None:
+        """Return the gain to keep, if there is one. One that is good is noted, whatever happens afterwards."""
+        search = gain_search(start, self.factor, self.lowest, self.highest, self.most_tries)
+        gain = next(search)
         try:
             while True:
-                shares[wanted] = self._share_at(wanted)
-                wanted = search.send(shares[wanted])
+                following = self._try(gain)
+                if following is not None and following.is_good:
+                    self._keep(gain)
+                gain = search.send(following)
         except StopIteration as done:
-            best: float = done.value
-        self.scope.set_feedback(integral_gain=best)
-        if shares[best] > self.limit:
-            self._give_up(f"the best integral gain, {best:g}, leaves {shares[best]:.0%} beyond the threshold")
-            return
-        self.log.info("integral gain %g: %.0f %% beyond the threshold", best, shares[best] * 100)
-        self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
+            found: float | None = done.value
+        return found
 
-    def _share_at(self, gain: float) -> float:
-        """Of the pixels beyond the threshold; all of them where the gain is refused, or the scan says nothing."""
+    def _try(self, gain: float) -> Following | None:
+        """Return how the feedback follows with a gain; None if that was refused.
+
+        Raises:
+            InvalidValue: the scan says nothing.
+        """
         try:
             self.scope.set_feedback(integral_gain=gain)
         except Refused as refused:
             self.log.warning("integral gain %g was refused: %s", gain, refused.reason)
-            return 1.0
+            return None
         scans = self.scope.scan()
-        if self.channel not in scans:
-            raise ConfigError(
-                f"the scans have no channel {self.channel!r}", where=self.name, hint=f"there are {', '.join(scans)}"
-            )
+        for name in (self.channel, self.height):
+            if name not in scans:
+                raise InvalidValue(f"the scans have no channel {name!r}, there are {', '.join(scans)}")
         setpoint = self.scope.feedback.setpoint if self.scope.feedback else None
-        try:
-            share = self._signal.error_shares(scans[self.channel], setpoint, self.threshold, self.scope).total
-        except InvalidValue as error:
-            self.log.warning("integral gain %g can't be judged: %s", gain, error.what)
-            return 1.0
-        self.log.info("integral gain %g: %.0f %% beyond the threshold", gain, share * 100)
-        return share
+        error = self._signal.error(scans[self.channel], scans[self.height], setpoint, self.scope)
+        following = self.limits.judge(error)
+        self.log.info("integral gain %g: the feedback %s: %s", gain, following.value, error)
+        return following
 
-    def _give_up(self, why: str) -> None:
-        self.log.error("the feedback can't be made better: %s. A person has to look", why)
-        self.scope.flag(Problem.DEVICE_MALFUNCTION)
-        self.scope.wait_until(lambda: not self._is_wanted(), timeout_s=10.0)
+    def _keep(self, gain: float) -> None:
+        """Note the gain to leave behind, also for one that is started after a kill."""
+        self.memory["gain"] = gain
+        self.memory.save()
+
+    def _finish(self, why: str) -> None:
+        """Set the gain that is to be left behind, and let the experiment go on."""
+        self._set_back()
+        if why:
+            self.log.error("the feedback can't be made better: %s. It goes on as before; a person should look", why)
+        self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
+
+    def _leave_behind(self) -> None:
+        """The same where control was lost before that, or this process killed."""
+        if "gain" in self.memory:
+            with suppress(ControlLost), self.scope.control(timeout_s=BACK_WITHIN_S):
+                self._set_back()
+
+    def _set_back(self) -> None:
+        gain = self.memory.get("gain")
+        if gain is None:
+            return
+        try:
+            self.scope.set_feedback(integral_gain=gain)
+        except Refused as refused:
+            self.log.warning("integral gain %g could not be set again: %s", gain, refused.reason)
+        else:
+            self.log.info("integral gain %g", gain)
+        del self.memory["gain"]
+        self.memory.save()

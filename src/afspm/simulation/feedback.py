@@ -21,6 +21,7 @@ from afspm.simulation.settings import check, one_of
 
 MODES = ("amplitude", "current")
 _GENTLE = 0.3  # share of the free amplitude that a gentle setpoint takes away
+_GROWN = 10.0  # e-foldings in one step, after which nothing is left but the saturated oscillation
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,9 @@ class Loop:
         too_high, too_low = self.error_limits_m
         rate = self.integral_gain + self.proportional_gain / self.settings.lag_s
         down, up = np.float64(rate * too_high), np.float64(rate * too_low)
-        z, v = height_m[0].copy(), start_v.copy()
+        v = start_v.copy()
+        # The swing of an oscillating loop begins anywhere: half of what it has, besides its speed, is in z.
+        z = height_m[0] + (np.roll(start_v, 1) / self._omega if self.oscillates else 0.0)
         result = np.empty_like(height_m)
         result[0] = z
         for n in range(1, len(height_m)):
@@ -156,6 +159,12 @@ class Loop:
     def _inertia(self) -> float:
         return self.settings.lag_s - self.proportional_gain * self.settings.delay_s
 
+    @property
+    def _omega(self) -> float:
+        """Of the oscillation, in 1/s: a quarter of its period is no shorter than the loop's delay."""
+        linear = math.sqrt(max(self.integral_gain, 1.0) / max(self._inertia, 0.1 * self.settings.lag_s))
+        return min(linear, math.pi / (2.0 * self.settings.delay_s))
+
     def _splits(self, step_s: float) -> int:
         """Parts of a step: one is exact as long as nothing saturates, ringing is better seen with a few."""
         ringing = self._damping**2 < 2.0 * max(self._inertia, 0.1 * self.settings.lag_s) * self.integral_gain
@@ -168,9 +177,8 @@ class Loop:
         """
         excess = self.integral_gain * self.settings.delay_s / (1.0 + self.proportional_gain)
         most_m = min(self.error_limits_m) * 4.0 / math.pi * max(excess, 1.0)
-        omega = math.sqrt(max(self.integral_gain, 1.0) / max(self._inertia, 0.1 * self.settings.lag_s))
         y = z - h
-        share = np.minimum(1.0, most_m / np.maximum(np.hypot(y, v / omega), 1e-15))
+        share = np.minimum(1.0, most_m / np.maximum(np.hypot(y, v / self._omega), 1e-15))
         return h + share * y, share * v
 
     def _propagator(self, dt: float) -> NDArray[np.float64]:
@@ -180,6 +188,10 @@ class Loop:
         damping = self._damping if inertia > limit else min(self._damping, -0.5)  # a P gain alone may be too high
         inertia = max(inertia, limit)
         ki, drive = self.integral_gain, self.proportional_gain - self.integral_gain * self.settings.delay_s
+        growth = -damping * dt / (2.0 * inertia)
+        # Past the second bound the equation runs away without turning, which no loop with a delay does.
+        if growth > _GROWN or (growth > 0.0 and damping**2 >= 4.0 * inertia * ki):
+            return self._turned(dt, min(growth, _GROWN))
         # state (z - h0, v, h - h0, h'), with time in units of dt
         a = np.zeros((4, 4))
         a[0, 1] = 1.0
@@ -188,6 +200,12 @@ class Loop:
         e = _exponential(a)
         # columns: y = z - h0, v in m/s, rise of h over dt
         return np.array([[e[0, 0] - 1.0, e[0, 1] * dt, e[0, 3]], [e[1, 0] / dt, e[1, 1], e[1, 3] / dt]])
+
+    def _turned(self, dt: float, growth: float) -> NDArray[np.float64]:
+        """The same of an oscillation that soon saturates, whatever the surface: its phase goes on, and it grows."""
+        omega, grown = self._omega, math.exp(growth)
+        sine, cosine = grown * math.sin(omega * dt), grown * math.cos(omega * dt)
+        return np.array([[cosine - 1.0, sine / omega, 0.0], [-omega * sine, cosine, 0.0]])
 
 
 def _exponential(a: NDArray[np.float64]) -> NDArray[np.float64]:

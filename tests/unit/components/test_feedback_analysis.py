@@ -9,28 +9,37 @@ from runtime_lab import Lab, run
 from afspm import wire
 from afspm.components.feedback_analysis import MESSAGE, FeedbackAnalysis
 from afspm.exit_codes import ExitCode
+from afspm.logic import arbitration as a
 from afspm.model import Feedback, Problem, Region, Scan, names
 
 SETPOINT = 0.5
 HERE = Region((0.0, 0.0), (1e-6, 1e-6))
-BAD, GOOD = 0.3, 0.02
+BAD, BARELY, GOOD = 0.3, 0.08, 0.02
+HEIGHT = 1e-6 * np.random.default_rng(1).normal(size=(10, 10)).cumsum(axis=1)
 
 
-def night(shares: list[float], unit: str = "V", **settings: float) -> Lab:
+def night(
+    shares: list[float], unit: str = "V", on: bool = True, cleared_s: float | None = None, solver: str = ""
+) -> Lab:
     """Scans with these shares of pixels half above the setpoint, one every 100 s; the setpoint is in V."""
     lab = Lab("feedback_analysis")
     lab.values[names.ZCTRL_SETPOINT] = str(SETPOINT)
-    lab.publish(Feedback(on=True, setpoint=SETPOINT))
+    lab.publish(Feedback(on=on, setpoint=SETPOINT))
+    if solver:
+        lab.at(250.0, lambda: lab.does(a.Event.REQUEST_CONTROL, solver, Problem.FEEDBACK_NON_OPTIMAL))
+    if cleared_s is not None:
+        lab.at(cleared_s, lambda: lab.clear(Problem.FEEDBACK_NON_OPTIMAL))
 
     def publish(share: float) -> None:
         values = np.full((10, 10), SETPOINT)
         values.flat[: round(100 * share)] = 1.5 * SETPOINT
         lab.publish(Scan(HERE, "Amplitude", unit, values, lab.clock.now_ns()))
+        lab.publish(Scan(HERE, "Height", "m", HEIGHT, lab.clock.now_ns()))
 
     for number, share in enumerate(shares):
         lab.at(100.0 * (number + 1), lambda share=share: publish(share))
     lab.at(100.0 * (len(shares) + 1), lab.kill)
-    assert run(FeedbackAnalysis(**settings), lab) == ExitCode.ENDED  # type: ignore[arg-type]
+    assert run(FeedbackAnalysis(), lab) == ExitCode.ENDED
     return lab
 
 
@@ -46,7 +55,14 @@ def test_the_shares_of_each_scan_are_told() -> None:
 
 @pytest.mark.parametrize(
     ("shares", "flagged"),
-    [([BAD], False), ([BAD, GOOD, BAD], False), ([GOOD, BAD, BAD], True), ([BAD, BAD, BAD, GOOD], False)],
+    [
+        ([BAD], False),
+        ([BAD, GOOD, BAD], False),
+        ([GOOD, BAD, BAD], True),
+        ([BAD, BAD, BAD, GOOD], False),
+        ([BAD, BAD, BARELY], True),
+        ([BAD, BARELY, BAD], False),
+    ],
 )
 def test_several_bad_scans_in_a_row_are_flagged_and_a_good_one_clears_it(shares: list[float], flagged: bool) -> None:
     lab = night(shares)
@@ -59,3 +75,22 @@ def test_a_channel_of_another_kind_than_the_setpoint_is_not_compared(caplog: pyt
     assert told(lab) == []
     assert not lab.control.published().problems
     assert "Amplitude can't be compared with the setpoint" in caplog.text
+
+
+def test_what_was_cleared_and_is_no_better_is_flagged_again_only_after_a_good_scan() -> None:
+    """A tuner that found nothing lets the experiment go on: the two must not go round in circles."""
+    assert not night([BAD] * 6, cleared_s=250.0).control.published().problems
+    again = night([BAD] * 3 + [GOOD] + [BAD] * 2, cleared_s=250.0).control.published().problems
+    assert again == (Problem.FEEDBACK_NON_OPTIMAL,)
+
+
+def test_with_the_feedback_off_nothing_is_judged() -> None:
+    lab = night([BAD] * 3, on=False)
+    assert told(lab) == []
+    assert not lab.control.published().problems
+
+
+def test_who_solves_it_decides_when_it_is_solved() -> None:
+    """The first gain that is good is not yet the one that is kept."""
+    lab = night([BAD, BAD, GOOD, GOOD], solver="tuner")
+    assert lab.control.published().problems == (Problem.FEEDBACK_NON_OPTIMAL,)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,20 +13,34 @@ from runtime_lab import Lab, run
 
 from afspm.components.feedback_tuner import FeedbackTuner
 from afspm.exit_codes import ExitCode
-from afspm.model import ControlRequest, Feedback, Packet, Problem, Region, Scan, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Packet,
+    Problem,
+    Region,
+    Request,
+    Response,
+    Scan,
+    names,
+)
 
 SETPOINT = 0.5
+BEFORE = 1.0
+HEIGHT = 1e-6 * np.random.default_rng(1).normal(size=(10, 10)).cumsum(axis=1)
 
 
 class Rig(Lab):
     """Its amplitude is as `amplitude` says of the integral gain in force."""
 
-    def __init__(self, amplitude: Callable[[float], np.ndarray], setpoint: float = SETPOINT) -> None:
+    def __init__(self, amplitude: Callable[[float], np.ndarray], setpoint: float = SETPOINT, on: bool = True) -> None:
         super().__init__("tuner")
         self.amplitude, self.setpoint = amplitude, setpoint
         self.values[names.ZCTRL_SETPOINT] = str(setpoint)
-        self.publish(Feedback(on=True, integral_gain=1.0))
+        self.publish(Feedback(on=on, integral_gain=BEFORE))
         self.flag(Problem.FEEDBACK_NON_OPTIMAL)
+        self.scanned = 0
 
     @property
     def gains(self) -> list[float]:
@@ -33,19 +48,28 @@ class Rig(Lab):
         asked = [r.subject for r in self.requests if r.kind == ControlRequest.SET_ZCTRL_PARAMS]
         return [feedback.integral_gain for feedback in asked]
 
+    @property
+    def problems(self) -> tuple[int, ...]:
+        return self.control.published().problems
+
     def publish(self, thing: Any, envelope: str | None = None) -> Packet:
         return super().publish(
             replace(thing, setpoint=self.setpoint) if isinstance(thing, Feedback) else thing, envelope
         )
 
     def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
-        values = self.amplitude(self.gains[-1])
-        self.publish(Scan(region, "Amplitude", "V", values, self.clock.now_ns()))
+        self.scanned += 1
+        self.publish(Scan(region, "Amplitude", "V", self.amplitude(self.gains[-1]), self.clock.now_ns()))
+        self.publish(Scan(region, "Height", "m", HEIGHT, self.clock.now_ns()))
+
+
+def tuner() -> FeedbackTuner:
+    return FeedbackTuner(lowest_gain=0.1, highest_gain=10.0)
 
 
 def tuned(lab: Rig) -> Rig:
     lab.at(5000.0, lab.kill)
-    assert run(FeedbackTuner(lowest_gain=0.1, highest_gain=10.0, factor=2.0), lab) == ExitCode.ENDED
+    assert run(tuner(), lab) == ExitCode.ENDED
     return lab
 
 
@@ -56,19 +80,64 @@ def off_by(share: float) -> np.ndarray:
     return values
 
 
-def test_the_gain_of_the_smallest_error_is_kept_and_the_flag_removed() -> None:
-    lab = tuned(Rig(lambda gain: off_by({1.0: 0.4, 2.0: 0.2, 4.0: 0.05, 8.0: 0.3}[gain])))
-    assert lab.gains == [1.0, 2.0, 4.0, 8.0, 4.0]
-    assert lab.control.published().problems == ()
+def test_the_gain_is_raised_until_the_feedback_follows_well_and_the_flag_removed() -> None:
+    lab = tuned(Rig(lambda gain: off_by(0.4 / gain**2)))
+    assert lab.gains == [1.0, 2.0, 4.0, 4.0]
+    assert lab.problems == ()
 
 
-def test_where_no_gain_is_good_a_person_is_asked_for() -> None:
+def test_where_no_gain_is_good_the_first_is_set_again_and_the_experiment_goes_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     lab = tuned(Rig(lambda gain: off_by(0.5)))
-    assert lab.gains[-1] == 1.0
-    assert Problem.DEVICE_MALFUNCTION in lab.control.published().problems
+    assert max(lab.gains) == 10.0
+    assert lab.gains[-1] == BEFORE
+    assert lab.problems == ()
+    assert "can't be made better: no gain is good" in caplog.text
 
 
 @pytest.mark.parametrize(("values", "setpoint"), [(np.full((10, 10), np.nan), SETPOINT), (off_by(0.0), 0.0)])
-def test_a_scan_that_says_nothing_of_the_error_ends_in_a_word_to_a_person(values: np.ndarray, setpoint: float) -> None:
+def test_a_scan_that_says_nothing_of_the_error_changes_nothing(values: np.ndarray, setpoint: float) -> None:
     lab = tuned(Rig(lambda gain: values, setpoint))
-    assert Problem.DEVICE_MALFUNCTION in lab.control.published().problems
+    assert lab.gains == [BEFORE, BEFORE]
+    assert (lab.scanned, lab.problems) == (1, ())
+
+
+def test_with_the_feedback_off_nothing_is_tried() -> None:
+    lab = tuned(Rig(lambda gain: off_by(0.5), on=False))
+    assert (lab.gains, lab.scanned, lab.problems) == ([], 0, ())
+
+
+def test_a_gain_that_is_refused_ends_the_search_there() -> None:
+    lab = Rig(lambda gain: off_by(0.5))
+
+    def refuse(request: Request) -> Response | str:
+        if request.kind == ControlRequest.SET_ZCTRL_PARAMS and request.subject.integral_gain > 3.0:
+            return Response(ControlResponse.PARAM_ERROR, reason="out of [limits]")
+        return "go on"
+
+    lab.intercept = refuse
+    tuned(lab)
+    assert 2.0 in lab.gains
+    assert 10.0 not in lab.gains
+    assert lab.gains[-1] == BEFORE
+
+
+@pytest.mark.parametrize("good", [False, True])
+def test_after_control_was_lost_the_gain_that_was_there_or_a_good_one_is_left_behind(good: bool) -> None:
+    lab = Rig(lambda gain: off_by(0.06 if good and gain == 4.0 else 0.5))
+    lab.at(350.0, lambda: lab.clear(Problem.FEEDBACK_NON_OPTIMAL))  # a person says that it is well
+    tuned(lab)
+    assert lab.gains[-2:] == ([8.0, 4.0] if good else [8.0, BEFORE])
+
+
+def test_one_that_is_started_after_a_kill_sets_the_gain_again_that_was_there(tmp_path: Path) -> None:
+    killed = Rig(lambda gain: off_by(0.5))
+    killed.at(250.0, killed.kill)
+    run(tuner(), killed, tmp_path)
+    assert killed.gains[-1] != BEFORE
+    later = Rig(lambda gain: off_by(0.5))
+    later.clear(Problem.FEEDBACK_NON_OPTIMAL)
+    later.at(250.0, later.kill)
+    run(tuner(), later, tmp_path)
+    assert later.gains == [BEFORE]

@@ -125,3 +125,14 @@ def test_amplitude_phase_and_current_answer_to_the_setpoint() -> None:
 def test_feedback_without_sense_is_refused(said: dict[str, float]) -> None:
     with pytest.raises(InvalidValue):
         loop(**said)
+
+
+@pytest.mark.parametrize("gain", [9_500.0, 20_000.0, 100_000.0, 500_000.0])
+@pytest.mark.parametrize("line_s", [0.5, 4.0])
+def test_beyond_stability_the_signal_swings_from_pixel_to_pixel_however_high_the_gain(
+    gain: float, line_s: float
+) -> None:
+    world = World.from_settings({"surface": "flat"}, seed=3, start_s=0.0)
+    scan = world.scan(REGION, (16, 64), line_s, 0.0, Feedback(integral_gain=gain)).channels()
+    amplitude = scan["Amplitude"][1]
+    assert amplitude.std(axis=1).min() > 0.1  # in every line, and not only from line to line
