@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from afspm.model import Region, Scan, ScanLines
 
 MEMORY_BYTES = 192 << 20
+MOST_CHANNELS = 64
 Key = tuple[int, str]
 """Time in ns and channel."""
 
@@ -49,7 +50,7 @@ class FrameStore:
     """What pictures are made of. Not for several threads at once.
 
     Args:
-        memory_bytes: of finished frames that are kept, beside the newest of each channel.
+        memory_bytes: of finished frames that are kept, beside the newest of each channel; of growing ones, too.
     """
 
     def __init__(self, memory_bytes: int = MEMORY_BYTES) -> None:
@@ -88,7 +89,7 @@ class FrameStore:
             self._next(), scan.channel, scan.unit, scan.region, scan.values, time_ns, began_ns, scan.filename,
             scan.shape[0],
         )  # fmt: skip
-        self._newest[scan.channel] = frame
+        self._put(frame)
         self._keep(frame)
 
     def take_lines(self, lines: ScanLines) -> None:
@@ -102,16 +103,18 @@ class FrameStore:
             and before.began_ns == lines.began_ns
             and before.values.shape == lines.shape
         )
+        if not grows and not self._has_room(lines):
+            return
         picture = lines.into(before.values if grows and before is not None else None)
         came = self._came[lines.channel] if grows else np.zeros(lines.shape[0], np.bool_)
         last = lines.first_row + len(lines.values)
         downwards = last < len(came) and bool(came[last])
         came[lines.first_row : last] = True
         self._came[lines.channel] = came
-        self._newest[lines.channel] = Frame(
+        self._put(Frame(
             self._next(), lines.channel, lines.unit, lines.region, picture, None, lines.began_ns,
             rows=int(came.sum()), newest_row=lines.first_row if downwards else last - 1,
-        )  # fmt: skip
+        ))  # fmt: skip
 
     def newest(self, channel: str | None = None) -> Frame | None:
         """The newest frame of a channel; None: of the channel seen first. A growing one is a copy as it is now."""
@@ -130,6 +133,19 @@ class FrameStore:
     def kept(self, time_ns: int, channel: str) -> Frame | None:
         """A finished frame from before; None if it is not kept here any more."""
         return self._kept.get((time_ns, channel))
+
+    def _has_room(self, lines: ScanLines) -> bool:
+        """Whether the whole scan that these lines announce fits: a few lines may be said to be of millions."""
+        rows, columns = lines.shape
+        others = (one for one in self._newest.values() if not one.complete and one.channel != lines.channel)
+        return 8 * rows * columns + sum(one.values.nbytes for one in others) <= self._memory_bytes
+
+    def _put(self, frame: Frame) -> None:
+        self._newest[frame.channel] = frame
+        if len(self._newest) > MOST_CHANNELS:
+            oldest = min(self._newest.values(), key=lambda one: one.number).channel
+            del self._newest[oldest]
+            self._came.pop(oldest, None)
 
     def _is_over(self, before: Frame, lines: ScanLines) -> bool:
         if not before.complete or lines.began_ns is None:

@@ -13,8 +13,17 @@ if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
 
 
-def to_toml(experiment: Experiment) -> str:
-    """Variables, sections and components as they are in force. Reads back as the same experiment."""
+SECRET = "webhook"
+"""The name of settings and keys whose value is a secret, where it is not the "$NAME" of an environment variable."""
+_NAMED_INSTEAD = "$AFSPM_WEBHOOK"
+
+
+def to_toml(experiment: Experiment, *, secrets: bool = True) -> str:
+    """Variables, sections and components as they are in force. Reads back as the same experiment.
+
+    Args:
+        secrets: else an environment variable is named in place of each, which has to be set where it is read back.
+    """
     parts = experiment.parts
     tables: dict[str, Any] = dict(parts.variables)
     tables.update(parts.sections)
@@ -22,7 +31,29 @@ def to_toml(experiment: Experiment) -> str:
         what: dict[str, Any] = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
         own = {k: v for k, v in part.own.items() if k not in {"class", "command", "component"}}
         tables[part.name] = {"component": True, **what, **own, **part.settings}
-    return dumps(tables)
+    return dumps(tables if secrets else _without(_secrets_in(tables), tables))
+
+
+def _secrets_in(value: Any) -> list[str]:
+    """The secrets in a document, each once, wherever they are."""
+    if isinstance(value, list | tuple):
+        return list(dict.fromkeys(secret for one in value for secret in _secrets_in(one)))
+    if not isinstance(value, Mapping):
+        return []
+    own = value.get(SECRET)
+    here = [own] if isinstance(own, str) and own and not own.startswith("$") else []
+    return list(dict.fromkeys([*here, *_secrets_in(list(value.values()))]))
+
+
+def _without(secrets: list[str], value: Any) -> Any:
+    """A document with names of environment variables instead of secrets, which a variable may hold, too."""
+    if isinstance(value, Mapping):
+        return {key: _without(secrets, one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without(secrets, one) for one in value]
+    if isinstance(value, str) and value in secrets:
+        return _NAMED_INSTEAD + (f"_{secrets.index(value) + 1}" if secrets.index(value) else "")
+    return value
 
 
 def dumps(document: Mapping[str, Any]) -> str:

@@ -33,6 +33,7 @@ class Start:
         folder: to start commands in: that of the experiment file.
         beats: whether it sends heartbeats; a command that does not (`heartbeats = false`) is only known by its exit.
         python_path: to be put before PYTHONPATH, so that modules beside the file are found.
+        hidden: environment variables that hold secrets of others.
     """
 
     launch: Launch
@@ -41,6 +42,7 @@ class Start:
     folder: Path
     python_path: tuple[str, ...]
     beats: bool = True
+    hidden: tuple[str, ...] = ()
 
 
 class Experiment:
@@ -187,11 +189,11 @@ class Experiment:
         settings = self.resolved.clock
         return ExperimentClock.starting_now(settings.start.timestamp() if settings.start else None, settings.speed)
 
-    def expanded(self) -> str:
-        """The whole experiment as one TOML text: references replaced, defaults filled in."""
+    def expanded(self, *, secrets: bool = True) -> str:
+        """The whole experiment as one TOML text: references replaced, defaults filled in; see `expanded.to_toml`."""
         from afspm.experiment.expanded import to_toml
 
-        return to_toml(self)
+        return to_toml(self, secrets=secrets)
 
 
 def load_expanded(path: Path, homes: Sequence[Path], *overlays: Path) -> Experiment:

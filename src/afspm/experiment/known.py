@@ -104,6 +104,8 @@ COMPONENT_ALIASES: Final[dict[str, str]] = {
 
 DASHBOARD: Final = "dashboard"
 """The name under which `afspm dashboard` joins a run."""
+DASHBOARD_PASSWORD: Final = "AFSPM_DASHBOARD_PASSWORD"
+"""The environment variable that only dashboards get."""
 
 # Where a class named without a module is looked for, in this order.
 SHORT_NAME_PACKAGES: Final[tuple[str, ...]] = (

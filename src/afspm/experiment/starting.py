@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 from afspm.addresses import connectable, reaches
 from afspm.errors import ConfigError
 from afspm.experiment import limits, wiring
+from afspm.experiment.expanded import SECRET
 from afspm.experiment.experiment import Start
 from afspm.experiment.findings import nearest
-from afspm.experiment.known import DASHBOARD
+from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
 from afspm.experiment.parts import Part, Role
 from afspm.logic.danger import FEEDBACK_OFF
 from afspm.logic.watchdog import WatchdogSettings
@@ -144,7 +145,23 @@ def _start(
         retracts=role is Role.TRANSLATOR and _retracts(resolved),
     )
     folders = tuple(str(folder) for folder in resolved.document.folders)
-    return Start(launch, role, _command(part), experiment.folder, folders, part.own.get("heartbeats") is not False)
+    beats = part.own.get("heartbeats") is not False
+    return Start(launch, role, _command(part), experiment.folder, folders, beats, _hidden(resolved, part.name))
+
+
+def _hidden(resolved: Resolved, name: str) -> tuple[str, ...]:
+    """Environment variables that hold secrets, but for those of the component `name`."""
+    webhook = str(resolved.notify.webhook)
+    every = {DASHBOARD_PASSWORD, *([webhook[1:]] if webhook.startswith("$") else [])}
+    every.update(*(_secrets(resolved, part.name) for part in resolved.parts.components))
+    return tuple(sorted(every - _secrets(resolved, name)))
+
+
+def _secrets(resolved: Resolved, name: str) -> set[str]:
+    """Environment variables of which a component has to know the value."""
+    webhook = str(resolved.settings[name].get(SECRET, ""))
+    operates = getattr(resolved.classes.get(name), "operates", False) is True
+    return {*([webhook[1:]] if webhook.startswith("$") else []), *([DASHBOARD_PASSWORD] if operates else [])}
 
 
 def _command(part: Part) -> tuple[str, ...]:

@@ -36,7 +36,7 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
 def _whole(experiment: Experiment) -> dict[str, Any]:
     """What is in force, defaults too, whoever wrote it down."""
     experiment.resolved  # noqa: B018  (adds what the file leaves open)
-    return tomllib.loads(experiment.expanded())
+    return tomllib.loads(experiment.expanded(secrets=False))
 
 
 def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal
@@ -16,6 +16,7 @@ from typing import IO, Literal
 from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
 from afspm.exit_codes import ExitCode
+from afspm.supervisor.jobs import Job
 from afspm.supervisor.thinning import PAUSE_S, Thinning
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
@@ -62,6 +63,10 @@ class ChildProcess:
     takes what the child itself has started along. Its stdin stays open until `close_stdin`: the end of it means to the
     child that its parent wants it to stop, or is dead (then the system closes it).
 
+    Args:
+        environment: what it gets besides our own; hidden: what it does not get of that.
+        has_tip: it may have a tip to see to when we are killed.
+
     Raises:
         AfspmError: the program can't be started.
     """
@@ -74,16 +79,21 @@ class ChildProcess:
         tell: Callable[[ChildEvent], None],
         environment: Mapping[str, str],
         folder: Path | None = None,
+        hidden: Collection[str] = (),
+        *,
+        has_tip: bool = False,
     ) -> None:
         self.name = name
         self._tell = tell
+        ours = {key: value for key, value in os.environ.items() if key not in hidden}
         try:
-            self._popen = _start(command, environment, folder)
+            self._popen = _start(command, {**ours, **environment}, folder)
         except (OSError, ValueError) as error:
             raise AfspmError(
                 f"{command[0]} can't be started: {error}", where=name, hint="is it installed and executable?"
             ) from error
         self.pid = self._popen.pid
+        self._job = Job(self._popen, has_tip=has_tip)
         self._fed = threading.Event()
         readers = [self._reader("stdout", self._popen.stdout), self._reader("stderr", self._popen.stderr)]
         threading.Thread(
@@ -103,6 +113,7 @@ class ChildProcess:
         if sys.platform == "win32":
             with contextlib.suppress(OSError):
                 self._popen.kill()
+            self._job.kill()
         else:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
@@ -116,6 +127,7 @@ class ChildProcess:
         self._fed.set()
         code = self._popen.wait()
         self.kill()  # what the child started and left behind must not live on beside its successor
+        self._job.close()
         for reader in readers:
             reader.join(LAST_WORDS_S)
         self.close_stdin()
@@ -204,7 +216,7 @@ def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path 
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         cwd=folder,
-        env={**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", **environment},
+        env={"PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", **environment},
         start_new_session=sys.platform != "win32",
         creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
     )

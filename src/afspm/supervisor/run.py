@@ -75,7 +75,7 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     common = _common(experiment, first, own, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, now())
     with locked(folder):
-        run_folder.write_experiment(folder, experiment.expanded())
+        run_folder.write_experiment(folder, experiment.expanded(secrets=False))
         return go(experiment, options, common, folder, experiment.name, terminal, names)
 
 

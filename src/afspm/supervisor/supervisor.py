@@ -22,6 +22,7 @@ from afspm.supervisor import signals
 from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed, describe_exit
+from afspm.supervisor.reaper import Reaper
 from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter
 from afspm.supervisor.standing import Standing
 from afspm.supervisor.task import Task
@@ -158,6 +159,7 @@ class Supervisor:
         self._policy = policy
         self._wakeup: WakeUp[ChildEvent | signals.Signalled | News] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
+        self._reaper = Reaper()
         self._children = {
             task.name: _Child(
                 task, self._beats.listen(task.name), supervision.ChildWatch(replace(policy, beats=task.beats))
@@ -170,6 +172,7 @@ class Supervisor:
     def run(self) -> Outcome:
         """Start everything; returns when nothing of it runs any more."""
         began_s = self._clock.monotonic_s()
+        self._reaper.begin()
         if self._reporter is not None:
             self._reporter.post = self._wakeup.post
             self._log.listener = self._reporter.line
@@ -190,6 +193,7 @@ class Supervisor:
                 self._reporter.close()
             self._beats.close()
             self._wakeup.close()
+            self._reaper.close()
         reports = tuple(
             Report(child.name, child.starts, child.given_up, child.last_exit, child.ordered)
             for child in self._children.values()
@@ -252,6 +256,7 @@ class Supervisor:
         if child.process is None or child.process.pid != exited.pid:
             return
         child.process = None
+        self._reaper.forget(exited.pid)
         how = describe_exit(exited.code)
         child.last_exit = f"{how}: {child.last_error}" if exited.code == ExitCode.CRASHED and child.last_error else how
         if self._ending is not None:
@@ -333,8 +338,16 @@ class Supervisor:
         child.started_s = self._clock.monotonic_s()
         try:
             child.process = ChildProcess(
-                task.name, task.command, launch.to_json(), self._wakeup.post, task.environment, task.folder
+                task.name,
+                task.command,
+                launch.to_json(),
+                self._wakeup.post,
+                task.environment,
+                task.folder,
+                task.hidden,
+                has_tip=task.role is Role.TRANSLATOR,
             )
+            self._reaper.watch(child.process.pid, has_tip=task.role is Role.TRANSLATOR)
             self._log.write(child.name, logging.DEBUG, f"started, process {child.process.pid}")
         except AfspmError as error:
             child.last_exit = f"could not be started: {error}"

@@ -25,6 +25,7 @@ class Task:
         role: what it is in the experiment; without scheduler or translator nothing can go on.
         folder: where to start it; None: where we are.
         environment: what it gets besides our own environment.
+        hidden: what it does not get of that.
         beats: whether it sends heartbeats; what doesn't is only known by its exit.
     """
 
@@ -34,6 +35,7 @@ class Task:
     folder: Path | None = None
     environment: Mapping[str, str] = field(default_factory=dict)
     beats: bool = True
+    hidden: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -58,4 +60,5 @@ def from_start(start: Start) -> Task:
         folder=start.folder if start.command else None,
         environment={"PYTHONPATH": os.pathsep.join(before)} if before else {},
         beats=start.beats,
+        hidden=start.hidden,
     )

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import zmq
 
 from afspm.clock import Clock
-from afspm.transport.frames import descriptor_of, receive_small
+from afspm.model import component_of
+from afspm.transport.frames import descriptor_of, receive_small, user_of
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
 from afspm.transport.polling import milliseconds
@@ -75,7 +76,7 @@ class LogReceiver:
                 self._network.connections.settled(heard)
                 break
             heard.add(descriptor_of(first) or -1)
-            if (line := read_line(frames)) is not None:
+            if (line := read_line(frames)) is not None and self._is_own(line.name, first):
                 lines.append(line)
         return lines
 
@@ -92,6 +93,10 @@ class LogReceiver:
         while more := self.take():
             lines += more
         return lines
+
+    def _is_own(self, name: str, first: zmq.Frame) -> bool:
+        """Whether the name is the sender's, as far as there are keys to tell."""
+        return self._network.keys is None or user_of(first) == component_of(name)
 
     def _count(self) -> int:
         """How many senders there are."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from queue import Queue
@@ -130,3 +132,48 @@ def test_a_child_that_prints_without_end_is_not_kept_in_memory(start: Start, eve
     assert {"waiting 199999", "no stage"} <= set(printed)
     assert len(printed) < 10_000
     assert left_out + len(printed) == 200_001
+
+
+def test_a_secret_of_others_is_not_in_its_environment(
+    start: Start, events: Queue[ChildEvent], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NIGHT_HOOK", "secret")
+    monkeypatch.setenv("NIGHT_LAMP", "on")
+    code = "import os; print(os.environ.get('NIGHT_HOOK'), os.environ.get('NIGHT_LAMP'))"
+    child = ChildProcess("child", [sys.executable, "-c", code], "{}", events.put, {}, hidden=("NIGHT_HOOK",))
+    assert events.get(timeout=DEADLINE_S) == Printed("child", child.pid, "stdout", "None on")
+
+
+KILLED_SUPERVISOR = """
+import signal, sys
+from afspm.supervisor.process import ChildProcess
+from afspm.supervisor.reaper import Reaper
+port, holds_lock = int(sys.argv[1]), "import ctypes; ctypes.PyDLL(None).pause()"
+call = f"import socket; s = socket.create_connection(('127.0.0.1', {port})); s.sendall(b'x'); "
+child = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', sys.argv[1] + 's.recv(1)']); " + call
+reaper = Reaper()
+reaper.begin()
+code = child + (holds_lock if sys.argv[2] == "holds" else "sys.stdin.read()")
+child = ChildProcess("child", [sys.executable, "-c", code, call], "{}", print, {})
+reaper.watch(child.pid, has_tip=False)
+signal.pause()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="job objects, and no signals")
+@pytest.mark.parametrize("what", ["holds", "leaves"])
+def test_nothing_outlives_a_supervisor_that_was_killed(what: str) -> None:
+    """One that holds Python's lock does not see it; one that sees it leaves a child behind."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(DEADLINE_S)
+        port = str(server.getsockname()[1])
+        supervisor = subprocess.Popen([sys.executable, "-c", KILLED_SUPERVISOR, port, what])
+        connections = [server.accept()[0] for _ in range(2)]
+        for connection in connections:
+            connection.settimeout(DEADLINE_S)
+            assert connection.recv(1) == b"x"
+        supervisor.kill()
+        supervisor.wait()
+        for connection in connections:
+            with connection, contextlib.suppress(ConnectionResetError):
+                assert connection.recv(1) == b""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from afspm.dashboard.drawing import Drawer, Look
-from afspm.dashboard.frames import FrameStore
+from afspm.dashboard.frames import MEMORY_BYTES, MOST_CHANNELS, FrameStore
 from afspm.dashboard.levelling import Levelling
 from afspm.model import Region, Scan, ScanLines
 
@@ -149,3 +149,25 @@ def test_what_is_not_finite_can_be_drawn(value: float) -> None:
     frame = store.newest()
     assert frame is not None
     assert Drawer().draw(frame, Look()).png.startswith(b"\x89PNG")
+
+
+def test_lines_that_are_said_to_be_of_millions_of_rows_take_no_memory() -> None:
+    store = FrameStore()
+    store.take_lines(lines(0, 1.0))
+    announced = ScanLines(REGION, (3_000_000, 1000), "Phase", "V", 0, np.ones((1, 1000)), 20 * S)
+    store.take_lines(announced)
+    assert store.channels == ("Height",)
+    wide = [ScanLines(REGION, (1000, 1000), f"c{i}", "V", 0, np.ones((1, 1000)), 20 * S) for i in range(40)]
+    for one in wide:
+        store.take_lines(one)
+    frames = [store.newest(channel) for channel in store.channels]
+    assert 20 < len(frames) < 30
+    assert sum(frame.values.nbytes for frame in frames if frame is not None) <= MEMORY_BYTES
+
+
+def test_channels_without_end_push_out_the_oldest() -> None:
+    store = FrameStore()
+    for i in range(3 * MOST_CHANNELS):
+        store.take_scan(scan(1.0, i + 1, f"channel {i}"), i + 1)
+    assert len(store.channels) == MOST_CHANNELS
+    assert store.newest(f"channel {3 * MOST_CHANNELS - 1}") is not None

@@ -6,7 +6,9 @@ import sys
 
 import pytest
 
+from afspm.dashboard.access import PASSWORD
 from afspm.experiment import Experiment
+from afspm.experiment.known import DASHBOARD_PASSWORD
 
 from .conftest import Write, errors, only_error
 
@@ -78,3 +80,39 @@ def test_what_it_expands_to_reads_back_as_the_same(write: Write, more: str) -> N
     again = write(experiment.expanded(), frame="")
     assert notifier(again) == settings
     assert [name for name in again.component_names if name.startswith("notifier")] == ["notifier"]
+
+
+@pytest.mark.parametrize("text", [
+    HOOK,
+    'hook = "https://chat.example.org/hooks/1"\n[notify]\nwebhook = "hook"\n',
+    '[caller]\ncomponent = true\nclass = "Notifier"\nwebhook = "https://chat.example.org/hooks/1"\n',
+])  # fmt: skip
+def test_what_a_run_keeps_of_the_file_holds_no_secret(write: Write, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    experiment = write(text)
+    kept = experiment.expanded(secrets=False)
+    assert "hooks/1" in experiment.expanded()
+    assert "hooks/1" not in kept
+    again = write(kept, frame="")
+    assert any("AFSPM_WEBHOOK" in finding.what for finding in again.check()) or "caller" in text
+    monkeypatch.setenv("AFSPM_WEBHOOK", "https://chat.example.org/hooks/1")
+    assert not [finding for finding in write(kept, frame="").check() if finding.is_error]
+
+
+def test_two_secrets_are_two_variables(write: Write) -> None:
+    other = '[caller]\ncomponent = true\nclass = "Notifier"\nwebhook = "https://chat.example.org/hooks/2"\n'
+    kept = write(HOOK + other).expanded(secrets=False)
+    assert '"$AFSPM_WEBHOOK"' in kept
+    assert '"$AFSPM_WEBHOOK_2"' in kept
+
+
+def test_secrets_in_the_environment_are_for_those_who_need_them(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOOK", "https://chat.example.org/hooks/1")
+    pages = '[page]\ncomponent = true\nclass = "Dashboard"\n'
+    addresses = (f"tcp://127.0.0.1:{port}" for port in range(21_000, 22_000))
+    experiment = write(HOOK.replace("https://chat.example.org/hooks/1", "$HOOK") + pages)
+    starts = experiment.launches(take_address=addresses.__next__)
+    hidden = {start.launch.name: start.hidden for start in starts}
+    assert hidden.pop("page") == ("HOOK",)
+    assert hidden.pop("notifier") == (PASSWORD,)
+    assert set(hidden.values()) == {(PASSWORD, "HOOK")}
+    assert DASHBOARD_PASSWORD == PASSWORD

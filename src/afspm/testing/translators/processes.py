@@ -43,7 +43,7 @@ class Processes:
         for start in starts:
             task = from_start(start)
             self._running[task.name] = ChildProcess(
-                task.name, task.command, task.launch.to_json(), self._tell, task.environment, task.folder
+                task.name, task.command, task.launch.to_json(), self._tell, task.environment, task.folder, task.hidden
             )
 
     @property

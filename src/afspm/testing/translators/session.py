@@ -159,7 +159,7 @@ def _bench(experiment: Experiment, options: Options, stack: ExitStack) -> tuple[
     own, starts = _starts(experiment, options, common, folder)
     log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
     stack.callback(log.close)
-    run_folder.write_experiment(folder, experiment.expanded())
+    run_folder.write_experiment(folder, experiment.expanded(secrets=False))
     launches = [own]
     address = _translator_address(experiment, starts)
     if address is not None and not own.keys:  # with keys a translator obeys the scheduler alone

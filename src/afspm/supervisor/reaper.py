@@ -1,0 +1,88 @@
+"""Ends what a supervisor leaves behind when it is killed: a process of its own, which waits for the supervisor's end.
+
+A process that the supervisor has started sees the end of its standard input and ends by itself. One that can't see it
+(a library holds Python's lock), or that has started others, is ended from here, some seconds later.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+if __name__ != "__main__":  # else it is run by itself, without the packages that would have to be loaded first
+    from afspm.runtime.parent import END_WITHIN_S, TIP_WITHIN_S
+
+GRACE_S = 1.0
+"""Beyond the time that a process has to end by itself."""
+
+
+CLOSED_WITHIN_S = 1.0
+
+
+class Reaper:
+    """Knows the processes of one supervisor that live. On Windows a job object does this, see `jobs`."""
+
+    def __init__(self) -> None:
+        self._popen: subprocess.Popen[bytes] | None = None
+
+    def begin(self) -> None:
+        """Start it; without it (too many processes, say) all else goes on."""
+        if sys.platform == "win32":
+            return
+        with contextlib.suppress(OSError):
+            self._popen = subprocess.Popen(
+                (sys.executable, "-I", "-S", str(Path(__file__))),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # what ends the whole terminal must not end this first
+            )
+
+    def watch(self, pid: int, *, has_tip: bool) -> None:
+        """Name a process group that is to end with the supervisor; one with a tip to see to has longer for that."""
+        self._tell(f"{pid} {(TIP_WITHIN_S if has_tip else END_WITHIN_S) + GRACE_S}")
+
+    def forget(self, pid: int) -> None:
+        """Strike out a process that is gone: its number may be given to another."""
+        self._tell(f"{pid} 0")
+
+    def close(self) -> None:
+        """What is left now, the supervisor leaves behind."""
+        if self._popen is not None and self._popen.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._popen.stdin.close()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # something can't be killed
+                self._popen.wait(CLOSED_WITHIN_S)
+
+    def _tell(self, line: str) -> None:
+        if self._popen is not None and self._popen.stdin is not None:
+            with contextlib.suppress(OSError, ValueError):
+                self._popen.stdin.write(line.encode() + b"\n")
+                self._popen.stdin.flush()
+
+
+def main() -> None:
+    """Wait for the end of standard input, then for each process group that is left until its time is up."""
+    assert sys.platform != "win32"
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    left_s: dict[int, float] = {}
+    for line in sys.stdin.buffer:
+        pid, within_s = line.split()
+        left_s[int(pid)] = float(within_s)
+    passed_s = 0.0
+    for within_s, pid in sorted((within_s, pid) for pid, within_s in left_s.items() if within_s):
+        signal.setitimer(signal.ITIMER_REAL, max(within_s - passed_s, 1e-3))
+        signal.sigwait({signal.SIGALRM})
+        passed_s = within_s
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(pid, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    main()
