@@ -156,13 +156,13 @@ class Desk:
         if event.connection not in self._refused:
             self._refused.add(event.connection)
             self._log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
-        self._tell(event, Response(int(ControlResponse.FAILURE), b"", why, event.request.id))
+        self._tell(event, Response(int(ControlResponse.FAILURE), b"", why, event.request.id), tells_why=True)
 
     def _repeated(self, event: RequestIn, outcome: Fate | Response, now_s: float) -> bool:
         """A request comes again with its id: answer it without doing it again. False: it may be done."""
         name, request = event.name, event.request
         if isinstance(outcome, Response):
-            self.effects.append(Reply(event.connection, name, outcome))
+            self.effects.append(Reply(event.connection, name, outcome, request.kind))
             return True
         if outcome is Fate.PENDING:
             return True  # its answer will go to the newest connection
@@ -184,8 +184,9 @@ class Desk:
         self._once.note(event.name, event.request, response)
         self._tell(event, response)
 
-    def _tell(self, event: RequestIn, response: Response) -> None:
-        self.effects.append(Reply(event.connection, event.name, response))
+    def _tell(self, event: RequestIn, response: Response, *, tells_why: bool = False) -> None:
+        kind = event.request.kind
+        self.effects.append(Reply(event.connection, event.name, response, kind, tells_why=tells_why))
         self._chronicle.answered(event.name, event.request, response, event.heard_s)
 
     def call_back(self, former: str | None, cause: Cause | None) -> None:
@@ -466,7 +467,7 @@ class Desk:
         self._chronicle.answered(job.client, job.request, response, job.heard_s)
         connection = self.sessions.connection_of(job.client)
         if connection is not None and (job.request.id or connection == job.connection):
-            self.effects.append(Reply(connection, job.client, response))
+            self.effects.append(Reply(connection, job.client, response, job.request.kind))
 
     def _learn(self, job: Job, response: Response, now_ns: int) -> None:
         """What a success changed, or told."""

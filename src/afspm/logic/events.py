@@ -166,11 +166,18 @@ Input = (
 
 @dataclass(slots=True)
 class Reply:
-    """Answer the peer `name`, over `connection` (which is open, and the newest of that name)."""
+    """Answer the peer `name`, over `connection` (which is open, and the newest of that name).
+
+    Attributes:
+        asked: the number of the request that is answered.
+        tells_why: the reason is told to a peer of version 1, too.
+    """
 
     connection: int
     name: str
     response: Response
+    asked: int = 0
+    tells_why: bool = False
 
 
 @dataclass(slots=True)

@@ -323,7 +323,7 @@ class SchedulerCore:
         common = {"run": self._settings.run, "simulated": self._settings.simulated, "now_ns": now_ns}
         told = json.dumps({**self._settings.clock, **common}).encode()
         response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
-        self._effects.append(Reply(event.connection, event.name, response))
+        self._effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
 
     def _on_unreadable(self, event: Unreadable, now_s: float, now_ns: int) -> None:
         self._chronicle.unreadable(event.name, event.response)

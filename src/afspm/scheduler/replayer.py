@@ -129,7 +129,8 @@ class Replayer:
     def _answer(self) -> list[Any]:
         for event in self._router.receive():
             if isinstance(event, PeerAsked) and event.frames:
-                self._router.reply(event.connection, wire.encode_response(self._response(event)))
+                number = int.from_bytes(event.frames[0][:1])
+                self._router.reply(event.connection, wire.encode_answer(self._response(event), number))
         return []
 
     def _response(self, asked: PeerAsked) -> Response:

@@ -12,6 +12,7 @@ from afspm.errors import WireError
 from afspm.logic import events
 from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, Response
 from afspm.transport.fair_queue import FairQueue
+from afspm.transport.hold_back import STATE, HoldBack
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
@@ -76,6 +77,7 @@ class Shell:
         self._log = log
         self._requests = FairQueue()
         self._replay: tuple[Packet, ...] = ()
+        self._hold_back = HoldBack()
         self._look_at_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
@@ -106,8 +108,11 @@ class Shell:
             if source is sockets.router:
                 self._admit(sockets.router.receive())
             elif source is sockets.link:
-                if (reply := sockets.link.receive()) is not None:
-                    self._take(events.TranslatorReply(reply.number, _response(reply)))
+                heard = sockets.link.receive()
+                if isinstance(heard, LinkUp):
+                    self._take(events.TranslatorUp())
+                elif heard is not None:
+                    self._take(events.TranslatorReply(heard.number, _response(heard)))
             elif source is sockets.subscriber:
                 self._packets()
             elif source is sockets.publisher:
@@ -117,8 +122,8 @@ class Shell:
             elif source is sockets.subscriber.monitor:
                 sockets.subscriber.follow()
             else:
-                for change in sockets.link.follow():
-                    self._take(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
+                for _ in sockets.link.follow():
+                    self._take(events.TranslatorDown())
         self._handle_requests()
         now_s = self._clock.monotonic_s()
         if now_s >= self._look_at_s:
@@ -138,10 +143,10 @@ class Shell:
             elif source is sockets.router.monitor:
                 self._admit(sockets.router.follow())
             elif source is sockets.link:
-                sockets.link.receive()
-            elif source is sockets.link.monitor:
-                if any(isinstance(change, LinkUp) for change in sockets.link.follow()):
+                if isinstance(sockets.link.receive(), LinkUp):
                     self._let_translator_go()
+            elif source is sockets.link.monitor:
+                sockets.link.follow()
             elif source is sockets.subscriber:
                 sockets.subscriber.receive()
             else:
@@ -163,8 +168,7 @@ class Shell:
         if asked.frames[0] == _TELL:
             self._request(asked)
             return
-        response = Response(ControlResponse.FAILURE, reason=HAS_ENDED, id=_id_of(asked))
-        self._sockets.router.reply(asked.connection, wire.encode_response(response))
+        self._answer(asked, Response(ControlResponse.FAILURE, reason=HAS_ENDED, id=_id_of(asked)))
 
     def stop(self) -> None:
         """See to what must be known to whoever resumes the run, unless the experiment is over."""
@@ -185,8 +189,7 @@ class Shell:
     def _admit(self, received: list[RouterEvent]) -> None:
         for asked in self._requests.put(received):
             self._complaints.say(f"refused a request of {asked.name or 'a nameless peer'}: {_TOO_MANY}")
-            response = Response(ControlResponse.FAILURE, reason=_TOO_MANY, id=_id_of(asked))
-            self._sockets.router.reply(asked.connection, wire.encode_response(response))
+            self._answer(asked, Response(ControlResponse.FAILURE, reason=_TOO_MANY, id=_id_of(asked)))
 
     def _handle_requests(self) -> None:
         for event in self._requests.take(_MOST_A_TURN, self._core.control.holder):
@@ -209,10 +212,14 @@ class Shell:
         except WireError as error:
             self._complaints.say(f"refused a request of {name or 'a nameless peer'}: {error}")
             response = Response(error.response, reason=str(error), id=_id_of(asked))
-            self._sockets.router.reply(asked.connection, wire.encode_response(response))
+            self._answer(asked, response)
             self._take(events.Unreadable(name, response))
             return
         self._take(events.RequestIn(asked.connection, name, request, asked.user))
+
+    def _answer(self, asked: PeerAsked, response: Response) -> None:
+        number = int.from_bytes(asked.frames[0][:1]) if asked.frames else 0
+        self._reply(events.Reply(asked.connection, asked.name, response, number))
 
     def _packets(self) -> None:
         for incoming in self._sockets.subscriber.receive():
@@ -235,13 +242,15 @@ class Shell:
 
     def _deadlines(self, now_s: float) -> None:
         """See to those that have come, and find the next."""
+        self._release(now_s)
         due_s = self._journal.due_s
         if due_s is not None and now_s >= due_s:
             self._journal.follow(self._core.cached())
         if self._core_due_s() <= now_s:
             self._take(events.Tick())
         due_s = self._journal.due_s
-        self._look_at_s = min(math.inf if due_s is None else due_s, self._core_due_s())
+        dues_s = (due_s, self._hold_back.due_s, self._core_due_s())
+        self._look_at_s = min(one_s for one_s in dues_s if one_s is not None)
 
     def _core_due_s(self) -> float:
         """When, in real monotonic time, the core is due."""
@@ -258,13 +267,13 @@ class Shell:
         for effect in effects:
             match effect:
                 case events.Reply():
-                    sockets.router.reply(effect.connection, wire.encode_response(effect.response))
+                    self._reply(effect)
                 case events.Forward():
                     sockets.link.send(effect.number, wire.encode_request(effect.request))
                 case events.Publish():
                     if not self.ended:  # what is said afterwards is of no use to a run that is resumed
                         self._journal.note(effect.packet, effect.source_ns, cached=effect.cached)
-                    sockets.publisher.publish(effect.packet)
+                    self._publish(effect.packet)
                 case events.Replay():
                     self._replay = effect.packets
                 case events.SaveState():
@@ -272,11 +281,28 @@ class Shell:
                 case events.Log():
                     self._log.log(_LEVELS.get(effect.level, logging.INFO), "%s", effect.text)
                 case events.Kill():
+                    self._release()
                     sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
                     sockets.publisher.kill()
                     self._tip_is_safe = effect.tip_is_safe
                     self._let_translator_go()
                     self.ended = True
+
+    def _reply(self, reply: events.Reply) -> None:
+        response = reply.response
+        frames = wire.encode_response(response) if reply.tells_why else wire.encode_answer(response, reply.asked)
+        self._sockets.router.reply(reply.connection, frames)
+
+    def _publish(self, packet: Packet) -> None:
+        publisher, now_s = self._sockets.publisher, self._clock.monotonic_s()
+        for one in self._hold_back.take(packet, now_s, wanted=publisher.plain.want(STATE)):
+            publisher.publish(one)
+        if self._hold_back.due_s is not None:
+            self._look_at_s = min(self._look_at_s, self._hold_back.due_s)
+
+    def _release(self, now_s: float = math.inf) -> None:
+        for packet in self._hold_back.release(now_s):
+            self._sockets.publisher.publish(packet)
 
 
 def _id_of(asked: PeerAsked) -> str:

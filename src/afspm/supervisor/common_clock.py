@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, WireError
-from afspm.model import CLOCK_REQUEST, Request, Response
+from afspm.model import CLOCK_REQUEST, ControlResponse, Request, Response
 from afspm.runtime.launch import Launch
 from afspm.transport.launching import open_port
 from afspm.transport.port import ControlConnected, ReplyReceived
@@ -40,7 +40,7 @@ def new_identity() -> str:
 
 
 def of_scheduler(launch: Launch, tell: Callable[[str], None]) -> Common:
-    """Ask the scheduler that `launch` leads to, which is waited for.
+    """Ask the scheduler that `launch` leads to, which is waited for. One of version 1 knows real time alone.
 
     Raises:
         ConfigError: it does not tell.
@@ -59,6 +59,9 @@ def of_scheduler(launch: Launch, tell: Callable[[str], None]) -> Common:
             for incoming in found:
                 connected = connected or isinstance(incoming, ControlConnected)
                 if isinstance(incoming, ReplyReceived) and incoming.response.id == asked:
+                    if incoming.response.code == ControlResponse.CMD_NOT_SUPPORTED:
+                        tell(f"{incoming.response.reason}: the experiment goes by real time")
+                        return Common(wall, "", simulated=False)
                     return _read(incoming.response, asked_s, wall.now_s(), str(launch.sockets.control))
             if not found and not waiting:
                 waiting = True

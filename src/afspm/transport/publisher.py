@@ -10,6 +10,7 @@ from afspm import wire
 from afspm.model import Packet
 from afspm.transport.frames import descriptor_of, property_of, readable, send_packet
 from afspm.transport.network import Network
+from afspm.transport.plain_subscribers import PlainSubscribers, meant
 from afspm.transport.replay import LONGEST, Marker, is_reserved, spelled_out
 from afspm.transport.subscribers import MOST_WAITING_BYTES, Subscribers
 
@@ -26,7 +27,8 @@ class Publisher:
 
     A subscriber of ours is sent what it missed under a topic of its own (see `replay`), so that no one else is sent
     it again, and from then on everything, without a gap. A subscriber of version 1 is sent what was kept as ordinary
-    packets, which all of that version see.
+    packets, which all of that version see; and of all envelopes, which it asks for by the empty prefix, those of
+    version 1, since it would end over any other.
 
     Nobody is waited for. A subscriber for which too much waits is disconnected: once it takes something again, it
     connects anew and gets what it missed.
@@ -46,6 +48,7 @@ class Publisher:
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
         self._guard = network.connections
         self._subscribers = Subscribers(most_waiting_bytes)
+        self.plain = PlainSubscribers(network, self.socket)
         self.address = network.bind(self.socket, address)
 
     def publish(self, packet: Packet) -> None:
@@ -78,13 +81,14 @@ class Publisher:
             if subscription[:1] == b"\1":
                 joined += self._subscribed(subscription[1:], frame, descriptor, plain)
             elif subscription[:1] == b"\0":
-                self._unsubscribed(subscription[1:], descriptor)
+                self._unsubscribed(subscription[1:], frame, descriptor)
             # anything else is no subscription: nobody has a reason to send that here
         for descriptor, prefixes in plain.items():
             # all of one peer's prefixes together: peers of version 1 lose what comes out of order
             if not self._subscribers.may_replay(descriptor):
                 continue
-            for packet in self.history(None, tuple(str(p, "utf-8", "replace") for p in prefixes), -1):
+            wanted = tuple(one.decode() for prefix in prefixes for one in meant(prefix))
+            for packet in self.history(None, wanted, -1):
                 self.publish(packet)
         return joined + len(plain)
 
@@ -92,8 +96,12 @@ class Publisher:
         self, subscription: bytes, frame: zmq.Frame, descriptor: int | None, plain: dict[int | None, list[bytes]]
     ) -> int:
         marker = Marker.decode(subscription)
-        prefixes = marker.prefixes if marker is not None else (subscription.decode("utf-8", "replace"),)
         ours = is_reserved(subscription) or property_of(frame, "Socket-Type") == "XSUB"
+        prefixes = (subscription.decode("utf-8", "replace"),)
+        if marker is not None:
+            prefixes = marker.prefixes
+        elif not ours:
+            prefixes = tuple(one.decode() for one in meant(subscription))
         if not self._subscribers.subscribed(descriptor, prefixes, len(subscription)):
             return 0
         if marker is not None:
@@ -103,15 +111,15 @@ class Publisher:
         # our own subscribers repeat their prefixes by themselves when a connection is made again, before they can say
         # what they have: they are subscribed by the marker, and only by it, so that they miss nothing
         elif not ours:
-            for prefix in spelled_out([subscription]):
+            for prefix in self.plain.subscribed(frame, subscription):
                 self.socket.setsockopt(zmq.SUBSCRIBE, prefix)
             plain.setdefault(descriptor, []).append(subscription)
         return 0
 
-    def _unsubscribed(self, subscription: bytes, descriptor: int | None) -> None:
+    def _unsubscribed(self, subscription: bytes, frame: zmq.Frame, descriptor: int | None) -> None:
         self._subscribers.unsubscribed(descriptor, len(subscription))
         if not is_reserved(subscription):
-            for prefix in spelled_out([subscription]):
+            for prefix in self.plain.unsubscribed(frame, subscription):
                 self.socket.setsockopt(zmq.UNSUBSCRIBE, prefix)
 
     def _replay(self, marker: Marker, descriptor: int | None) -> None:

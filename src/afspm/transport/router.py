@@ -11,6 +11,7 @@ from afspm.transport.complaints import Complaints
 from afspm.transport.frames import descriptor_of, property_of, readable, receive_small, send, user_of
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
 from afspm.transport.network import QUEUE_LENGTH, Network
+from afspm.wire.version import ANSWER, QUESTION
 
 _MOST_ROUNDS = 100
 _BATCH = 100
@@ -187,6 +188,9 @@ class Router:
     def _interpret(self, peer: _Peer, frames: list[bytes]) -> list[RouterEvent]:
         if len(frames) < 2 or frames[1]:
             self._complaints.say(f"dropped a request of {peer.name or 'somebody'}: no empty frame before it")
+            return []
+        if frames[2:] == [*QUESTION]:  # whether we are one of ours; whose name it is does not matter for that
+            self.reply(peer.connection, ANSWER)
             return []
         return [PeerAsked(peer.connection, peer.name, peer.user, frames[2:])]
 

@@ -11,12 +11,14 @@ from afspm.transport.complaints import Complaints
 from afspm.transport.frames import receive_small, send
 from afspm.transport.monitor import CONNECTED, DISCONNECTED, Monitor
 from afspm.transport.network import Network
+from afspm.wire.version import ANSWER, QUESTION, Version, as_version_1, is_of_version_1
 
 _LONGEST_NUMBER = 18
+_VERSION = b"version"  # stands where the numbers of requests do
 
 
 class LinkUp(NamedTuple):
-    """The translator can be asked."""
+    """The translator can be asked: it has answered which version of the protocol it speaks."""
 
 
 class LinkDown(NamedTuple):
@@ -33,12 +35,19 @@ class LinkReply(NamedTuple):
 class TranslatorLink:
     """Asks the translator, ours or of version 1: a REP socket gives back the number that stands before the empty frame,
     so that a late answer is never taken for another's.
+
+    Before anything else it is asked, in a way that all understand, whether it is one of ours. One of version 1 is sent
+    no ids and no requests that it would end over.
+
+    Attributes:
+        version: of the translator that is there now.
     """
 
     def __init__(self, network: Network, address: str, complaints: Complaints) -> None:
         self._complaints = complaints
         self._address = address
         self.touched = True
+        self.version = Version.UNKNOWN
         self.socket = network.socket(zmq.DEALER)
         # nothing waits for a translator that is gone, to be carried out when it is back. (With this an answer may be
         # lost together with the connection: it is asked for again by its id.)
@@ -47,24 +56,39 @@ class TranslatorLink:
         network.connect(self.socket, address)
 
     def send(self, number: int, frames: Sequence[bytes]) -> bool:
-        """Ask; False if there is no translator to ask."""
+        """Ask; False if there is no translator to ask, or it has no such request."""
         self.touched = True
+        if self.version is Version.ONE:
+            if not is_of_version_1(frames[0][0]):
+                return False
+            frames = as_version_1(frames)
         return send(self.socket, [b"%d" % number, b"", *frames])
 
-    def receive(self) -> LinkReply | None:
+    def receive(self) -> LinkReply | LinkUp | None:
         """The next answer; None: there is none, or it is malformed."""
         self.touched = True
         _, frames = receive_small(self.socket)
         if not frames:
             return None
+        if frames[0] == _VERSION:
+            self.version = Version.OURS if frames[2:] == [*ANSWER] else Version.ONE
+            return LinkUp()
         if len(frames) < 3 or frames[1] or not frames[0].isdigit() or len(frames[0]) > _LONGEST_NUMBER:
             self._complaints.say(f"dropped a malformed answer from {self._address}")
             return None
         return LinkReply(int(frames[0]), frames[2:])
 
-    def follow(self) -> list[LinkUp | LinkDown]:
-        """The translator's coming and going."""
-        return [LinkUp() if event.kind == CONNECTED else LinkDown() for event in self.monitor.drain()]
+    def follow(self) -> list[LinkDown]:
+        """The translator's going. One that comes is asked for its version; `receive` tells its answer."""
+        gone: list[LinkDown] = []
+        for event in self.monitor.drain():
+            self.version = Version.UNKNOWN
+            if event.kind == CONNECTED:
+                self.touched = True
+                send(self.socket, [_VERSION, b"", *QUESTION])
+            else:
+                gone.append(LinkDown())
+        return gone
 
     def close(self) -> None:
         self.monitor.close()

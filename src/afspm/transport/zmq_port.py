@@ -13,7 +13,7 @@ from afspm.transport.flood import REST_MS, Flood
 from afspm.transport.history import Published
 from afspm.transport.network import Network
 from afspm.transport.polling import milliseconds, poller
-from afspm.transport.port import Incoming
+from afspm.transport.port import Incoming, ReplyReceived
 from afspm.transport.publisher import Publisher
 from afspm.transport.subscriber import Subscriber
 from afspm.transport.wakeup import WakeUp
@@ -82,7 +82,8 @@ class ZmqPort:
             raise ConfigError(
                 "this component was given no scheduler to ask", where=self._name, hint="control = address"
             )
-        self._control.send(frames)
+        if (answer := self._control.send(frames)) is not None:
+            self._wake_up.post(ReplyReceived(answer))
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
         wait_ms = milliseconds(timeout_s)

@@ -8,13 +8,16 @@ import zmq
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
-from afspm.transport.frames import descriptor_of, receive_small, send, user_of
+from afspm.transport.frames import descriptor_of, property_of, receive_small, send, user_of
 from afspm.transport.history import Published
 from afspm.transport.network import Network
 from afspm.transport.polling import milliseconds, poller
 from afspm.transport.port import RequestReceived, Served, SubscriberJoined
 from afspm.transport.publisher import Publisher
 from afspm.transport.wakeup import WakeUp
+from afspm.wire.version import ANSWER, QUESTION, answer_as_version_1
+
+_WITH_ID = 3  # frames of a request
 
 
 class ZmqServerPort:
@@ -40,6 +43,7 @@ class ZmqServerPort:
         self._allowed = allowed
         self._asker: list[bytes] | None = None
         self._heard: set[int] = set()
+        self._asked_by_version_1: int | None = None
         self._closed = False
         self.touched = True
         self._wake_up: WakeUp[Served] = WakeUp()
@@ -91,16 +95,24 @@ class ZmqServerPort:
             if start == len(parts):
                 continue  # somebody says its name, as to a scheduler
             self._asker = parts[:start]
+            self._asked_by_version_1 = int.from_bytes(parts[start][:1]) if len(parts) - start < _WITH_ID else None
             user = user_of(first) if self._network.keys is not None else None
-            if self._allowed is None or self._network.keys is None or user == self._allowed:
+            allowed = self._allowed is None or self._network.keys is None or user == self._allowed
+            if not allowed:
+                self._asked_by_version_1 = None  # who may not ask hears why, whoever it is
+                self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])
+            elif parts[start:] == [*QUESTION] and property_of(first, "Socket-Type") == "DEALER":
+                self.reply(ANSWER)  # a REQ socket is that of a scheduler of version 1, which passes on what it is asked
+            else:
                 return [RequestReceived(parts[start:], user)]
-            self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])
         return []
 
     def reply(self, frames: Sequence[bytes] | None) -> None:
         asker, self._asker = self._asker, None
         if asker is not None and frames is not None:
             self.touched = True
+            if self._asked_by_version_1 is not None:
+                frames = answer_as_version_1(self._asked_by_version_1, frames)
             send(self._socket, [*asker, *frames])
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:

@@ -12,6 +12,7 @@ from afspm.wire.frames import (
     decode_parameter,
     decode_request,
     decode_response,
+    encode_answer,
     encode_packet,
     encode_request,
     encode_response,
@@ -21,6 +22,7 @@ from afspm.wire.frames import (
 from afspm.wire.journal import decode_orders, encode_orders
 from afspm.wire.messages import known_messages, message_of, message_type, messages_of_the_experiment, register
 from afspm.wire.places import encode_place, place_in, relocated
+from afspm.wire.version import Version, version_of
 
 __all__ = [
     "BEAT",
@@ -28,6 +30,7 @@ __all__ = [
     "CLOSING",
     "KILL",
     "Buffer",
+    "Version",
     "decode",
     "decode_orders",
     "decode_packet",
@@ -35,6 +38,7 @@ __all__ = [
     "decode_request",
     "decode_response",
     "encode",
+    "encode_answer",
     "encode_orders",
     "encode_packet",
     "encode_place",
@@ -50,4 +54,5 @@ __all__ = [
     "place_in",
     "register",
     "relocated",
+    "version_of",
 ]

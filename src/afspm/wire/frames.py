@@ -26,6 +26,7 @@ from afspm.wire import convert, journal
 from afspm.wire.codec import Buffer, encode
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.messages import parse
+from afspm.wire.version import answer_as_version_1, as_version_1
 
 KILL: Final = b"KILL"
 """The packet of one frame by which everybody who subscribes learns that the experiment has ended."""
@@ -81,13 +82,9 @@ def decode_packet(frames: Sequence[Buffer]) -> Packet:
 
 
 def encode_request(request: Request) -> list[bytes]:
-    """[number, object, id]; the object's frame is there, if empty, since the id comes third."""
+    """[number, object, id]; the object's frame is there, if empty, where the request has an object or an id."""
     frames = [bytes([request.kind]), request.payload or encode_subject(request.subject)]
-    if request.id:
-        frames.append(request.id.encode())
-    elif not frames[1]:
-        frames.pop()
-    return frames
+    return [*frames, request.id.encode()] if request.id else as_version_1(frames)
 
 
 def encode_subject(subject: Any) -> bytes:
@@ -147,6 +144,16 @@ def encode_response(response: Response) -> list[bytes]:
     while len(frames) > 1 and not frames[-1]:
         frames.pop()
     return frames
+
+
+def encode_answer(response: Response, asked: int) -> list[bytes]:
+    """A response as its peer reads it: who asked without an id is of version 1.
+
+    Args:
+        asked: the number of the request that is answered.
+    """
+    frames = encode_response(response)
+    return frames if response.id else answer_as_version_1(asked, frames)
 
 
 def decode_response(frames: Sequence[Buffer]) -> Response:

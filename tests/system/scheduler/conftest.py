@@ -78,6 +78,7 @@ class Rig:
         self.answer: Callable[[Request], Response | None] = lambda request: Response(0, id=request.id)
         self.asked: list[Request] = []
         self.components: list[Component] = []
+        self.peers: list[Any] = []  # of version 1
         self.settings: dict[str, Any] = {}
         self.request_timeout_s = 5.0
         self.translator: ZmqServerPort | None = self.make_translator(ANY, ANY)
@@ -146,6 +147,8 @@ class Rig:
                     self.translator.reply(None if response is None else wire.encode_response(response))
         for component in self.components:
             component.found += component.port.poll(0.001)
+        for peer in self.peers:
+            peer.pump()
 
     def until(self, condition: Callable[[], Any], timeout_s: float = 15.0) -> Any:
         """Pump until the condition is true; returns its value."""

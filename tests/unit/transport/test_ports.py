@@ -167,7 +167,7 @@ def test_a_server_takes_one_request_at_a_time_and_may_leave_one_unanswered(open_
     until(lambda: ControlConnected in kinds(found), (port, found))
     for n in range(3):
         port.send([b"\1", b"%d" % n, b""])
-    until(lambda: asked, (translator, asked))
+    until(lambda: asked, (translator, asked), (port, found))
     assert len(asked) == 1
     assert translator.poll(0.0) == []
     translator.reply(None)

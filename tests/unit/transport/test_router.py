@@ -33,11 +33,14 @@ class Listening:
         self.router = Router(self.network, "tcp://127.0.0.1:0", Complaints(logging.getLogger("test"), CLOCK))
         self.told: list[Any] = []
 
-    def until(self, count: int, kind: type = PeerAsked) -> list[Any]:
+    def until(self, count: int, kind: type = PeerAsked, *ports: ZmqPort) -> list[Any]:
+        """What was told of a kind, once it is so much; `ports` of ours are waited for meanwhile."""
         deadline_s = time.monotonic() + 5.0
         while len(found := [event for event in self.told if isinstance(event, kind)]) < count:
             assert time.monotonic() < deadline_s, self.told
             self.told += self.router.receive() + self.router.follow()
+            for port in ports:
+                port.poll(0.001)
         return found
 
 
@@ -92,7 +95,7 @@ def test_who_takes_a_name_is_another_connection_and_who_had_it_comes_back_when_i
     first = open_(ZmqPort(Network(), "A", CLOCK, control=listening.router.address))
     until(lambda: ControlConnected() in found, (first, found))
     first.send([b"\7", b"", b"A/first/1"])
-    listening.until(1)
+    listening.until(1, PeerAsked, first)
     second = peer(plain, listening, b"A")
     second.send_multipart([b"", b"\7", b"", b"A/second/1"])
     one, two = listening.until(2)
@@ -263,7 +266,7 @@ def test_to_be_looked_for_disturbs_no_component(open_: Any, until: Any, caplog: 
     component = open_(ZmqPort(Network(), "A", CLOCK, control=listening.router.address))
     until(lambda: ControlConnected() in found, (component, found))
     component.send([b"\7", b"", b"A/first/1"])
-    (asked,) = listening.until(1)
+    (asked,) = listening.until(1, PeerAsked, component)
     listening.router.socket.send_multipart([b"A", b""])
     listening.router.reply(asked.connection, wire.encode_response(Response(0, id="A/first/1")))
     until(lambda: any(isinstance(one, ReplyReceived) for one in found), (component, found))

@@ -142,7 +142,7 @@ def test_with_keys_the_server_knows_who_asks_and_packets_arrive(tmp_path: Path, 
     )  # fmt: skip
     assert [bytes(i.packet.payload) for i in found if isinstance(i, PacketReceived)] == [b"scan"]
     port.send([b"\1", b"", b""])
-    until(lambda: any(isinstance(a, RequestReceived) for a in asked), (server, asked))
+    until(lambda: any(isinstance(a, RequestReceived) for a in asked), (server, asked), (port, found))
     assert RequestReceived([b"\1", b"", b""], "scheduler") in asked
 
 
@@ -205,7 +205,7 @@ def test_strangers_are_not_let_in(tmp_path: Path, open_: Any, until: Any, plain:
     friend, found, asked = open_(locked_component(tmp_path, "scheduler", server)), [], []  # type: ignore[var-annotated]
     until(lambda: ControlConnected() in found, (server, asked), (friend, found))
     friend.send([b"\7", b"", b"friend"])
-    until(lambda: any(isinstance(a, RequestReceived) for a in asked), (server, asked))
+    until(lambda: any(isinstance(a, RequestReceived) for a in asked), (server, asked), (friend, found))
     assert [a.frames for a in asked if isinstance(a, RequestReceived)] == [[b"\7", b"", b"friend"]]
 
 
