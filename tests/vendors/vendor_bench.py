@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import socket
@@ -58,17 +59,19 @@ class Peer:
 
     def __init__(self, serve: str, publish: str) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
+        self._asked = itertools.count()
         self._request = self._context.socket(zmq.REQ)
         self._request.connect(serve)
         self._packets = self._context.socket(zmq.SUB)
-        self._packets.subscribe(b"")
+        for prefix in (b"", b"ScanLines"):  # by the first a plain socket means what version 1 has
+            self._packets.subscribe(prefix)
         self._packets.connect(publish)
         for each in (self._request, self._packets):
             each.setsockopt(zmq.LINGER, 0)
             each.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
 
     def ask(self, kind: int, subject: Any) -> Response:
-        request = Request(kind, subject, wire.frames.encode_subject(subject))
+        request = Request(kind, subject, wire.frames.encode_subject(subject), f"bench/{next(self._asked)}")
         self._request.send_multipart(wire.encode_request(request))
         return wire.decode_response(self._request.recv_multipart())
 

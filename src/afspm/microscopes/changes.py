@@ -98,8 +98,6 @@ def wanted_values(asked: list[Asked], table: ParameterTable) -> dict[str, Value]
     values: dict[str, Value] = {}
     for one in asked:
         spec = table.find(one.name)
-        if spec.read_only:
-            raise Refused(ControlResponse.PARAM_ERROR, f"{spec.name} can be asked for, not set")
         if isinstance(one.value, str):
             values[spec.name] = spec.parse(one.value, one.unit)
         elif isinstance(one.value, bool):

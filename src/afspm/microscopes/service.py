@@ -104,15 +104,31 @@ class Service:
         payload = encode(Parameter(spec.name, text, unit or None))[1]
         return Response(ControlResponse.SUCCESS, payload, id=request.id)
 
-    def _set(self, request: Request, values: Mapping[str, Value]) -> Answer:
+    def _set(self, request: Request, asked: Mapping[str, Value]) -> Answer:
+        values = self._settable(asked)
         self._refuse_if_busy(all(self._table[name].while_busy for name in values))
-        self._apply(values, lambda: self._about_to_act(request))
+        if values:
+            self._apply(values, lambda: self._about_to_act(request))
         steps = self._sequence.begin(ScopeState.MOVING) if MOVES & values.keys() else []
         if request.kind == ControlRequest.PARAM:
             announce = tuple(message for message in _ANNOUNCED.values() if set(of_message(message)) & values.keys())
             return Answer(self._told(request), steps, announce)
         announce = (_ANNOUNCED[ControlRequest(request.kind)],)
         return Answer(Response(ControlResponse.SUCCESS, id=request.id), steps, announce)
+
+    def _settable(self, asked: Mapping[str, Value]) -> dict[str, Value]:
+        """What is asked for without what can only be read: peers send back all of a message to change a part of it.
+
+        Raises:
+            Refused: PARAM_ERROR: what can only be read is to change.
+        """
+        fixed = [name for name in asked if self._table[name].read_only]
+        now = self._microscope.in_force(fixed) if fixed else {}
+        for name in fixed:
+            if not self._table[name].same(now[name], asked[name]):
+                reason = f"{name} can be asked for, not set: it is {self._table[name].quantity(now[name])}"
+                raise Refused(ControlResponse.PARAM_ERROR, reason)
+        return {name: value for name, value in asked.items() if name not in fixed}
 
     def _apply(self, values: Mapping[str, Value], about_to_act: Callable[[], None]) -> None:
         """Set the values, or change nothing.

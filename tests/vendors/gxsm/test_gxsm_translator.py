@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -227,6 +228,12 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     response = peer.set("x-feedback-on", False)
     assert response.code == ControlResponse.PARAM_ERROR
     assert "can be asked for, not set" in response.reason
+    # peers send back the whole message that was published, with one part changed
+    again = replace(heard[-1], proportional_gain=0.5)
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, again).ok
+    assert made.emulator.rig.feedback.proportional_gain == 0.5
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, replace(again, on=False)).code == ControlResponse.PARAM_ERROR
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True)).ok
 
 
 def test_what_this_hardware_lacks_is_not_supported(bench: Make) -> None:
