@@ -97,10 +97,11 @@ class Publisher:
     ) -> int:
         marker = Marker.decode(subscription)
         ours = is_reserved(subscription) or property_of(frame, "Socket-Type") == "XSUB"
-        prefixes = (subscription.decode("utf-8", "replace"),)
         if marker is not None:
             prefixes = marker.prefixes
-        elif not ours:
+        elif ours:
+            prefixes = (subscription.decode("utf-8", "replace"),)
+        else:
             prefixes = tuple(one.decode() for one in meant(subscription))
         if not self._subscribers.subscribed(descriptor, prefixes, len(subscription)):
             return 0
