@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 def check(
     files: Files,
     expanded: Annotated[bool, typer.Option("--expanded", help="Print the whole file as it is in force.")] = False,
+    explain: Annotated[
+        bool,
+        typer.Option(
+            "--explain",
+            help="Print the short form of a file of the published implementation, and say what each line has become.",
+        ),
+    ] = False,
 ) -> None:
     """Find every error of an experiment file, before anything starts.
 
@@ -29,13 +36,24 @@ def check(
 
     experiment = load(*files)
     findings = experiment.check()
-    console = Console(stderr=expanded, highlight=False)
+    console = Console(stderr=expanded or explain, highlight=False)
+    if explain:
+        _explain(experiment, console)
     show(findings, console)
     if expanded:
         typer.echo(experiment.expanded(), nl=False)
     console.print(_summary(experiment, findings), markup=False, soft_wrap=True)
     if any(finding.is_error for finding in findings):
         raise typer.Exit(1)
+
+
+def _explain(experiment: Experiment, console: Console) -> None:
+    """Print the short form, and to the console what has become of each line."""
+    from afspm.experiment.short_form import explained, short
+
+    for place, line, became in explained(experiment):
+        console.print(f"{place}: {line}: {became}", markup=False, soft_wrap=True)
+    typer.echo(short(experiment), nl=False)
 
 
 def show(findings: Sequence[Finding], console: Console) -> None:

@@ -24,11 +24,11 @@ from afspm.experiment import classes
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings
 from afspm.experiment.known import Wire
-from afspm.experiment.parts import wire_of
+from afspm.experiment.published import length_m, wire_of
 from afspm.experiment.sections import Section, parse
 from afspm.logic.envelopes import CacheRule, Envelopes
 from afspm.model import PacketHeader
-from afspm.units import Length, si
+from afspm.units import Length
 
 Count = Annotated[int, Field(ge=1)]
 
@@ -126,14 +126,16 @@ def _published_history(logic: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _published_rules(logic: Mapping[str, Any]) -> list[CacheRule]:
-    """Histories by size, [[width, height], count]: numbers are nm, as in the envelopes' names."""
+    """Histories by size, [[width, height], count]; a number is in nm, as in the envelopes' names."""
     histories = logic.get("proto_with_history_list")
     if wire_of(histories) is not Wire.HISTORIES or not isinstance(histories, Mapping):
         return []
     rules = []
-    for entry in histories.get("sizes_with_hist_list", ()):
+    channels = histories.get("channels_list") or []
+    for number, entry in enumerate(histories.get("sizes_with_hist_list", ())):
         match entry:
             case [[width, *_], int(count)] if count > 0:
-                width_m = si(width, "m") if isinstance(width, str) else float(width) * 1e-9
-                rules.append(CacheRule("Scan2d", None, None, width_m * 0.999, width_m * 1.001, None, count))
+                channel = channels[number] if number < len(channels) else None
+                wide = length_m(width)
+                rules.append(CacheRule("Scan2d", channel, None, wide * 0.999, wide * 1.001, None, count))
     return rules

@@ -12,7 +12,8 @@ from afspm.experiment import notifying, wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
 from afspm.experiment.known import WIRE_SETTINGS
-from afspm.experiment.parts import Role, wire_of
+from afspm.experiment.parts import Role
+from afspm.experiment.published import wire_of
 from afspm.experiment.resolved import Resolved
 from afspm.model import component_of, is_process_name
 from afspm.model.journal import LONGEST_PROCESS_NAME, PERSON
@@ -111,6 +112,9 @@ def check_intermediaries(resolved: Resolved) -> None:
             if key != "class" and key not in WIRE_SETTINGS[kind]:
                 hint = nearest(key, WIRE_SETTINGS[kind])
                 resolved.findings.error(f"[{name}] a {kind.value} has no setting {key!r}", place, hint)
+            elif key in ("request_timeout_ms", "request_retries") and not isinstance(value, int | float):
+                hint = "is it in a second file, to be laid over this one?"
+                resolved.findings.error(f"[{name}] {key} = {value!r} is no number", place, hint)
             elif key.endswith("url"):
                 for url in value if isinstance(value, list) else [value]:
                     if not isinstance(url, str) or not is_address(url):

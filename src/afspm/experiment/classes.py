@@ -16,6 +16,7 @@ from typing import Any
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.known import SHORT_NAME_PACKAGES
 from afspm.experiment.parts import DECLARED_KEYS, Role
+from afspm.experiment.published import GUIDE
 
 # By where they come from: a class of the user is recognised by what it is derived from.
 _ROLE_BY_BASE = (
@@ -175,8 +176,10 @@ def _import(package: str) -> Any:
 def _no_module(module: str, error: ModuleNotFoundError) -> Unloadable:
     missing = error.name or module
     if module != missing and not module.startswith(missing + "."):
-        ours = missing.partition(".")[0] == module.partition(".")[0]
-        hint = "" if ours else f"if it is spelt right: pip install {missing}"
+        package = missing.partition(".")[0]
+        if package == "afspm":
+            return Unloadable(f"{module} is written for the published implementation: it needs {missing!r}", GUIDE)
+        hint = "" if package == module.partition(".")[0] else f"if it is spelt right: pip install {missing}"
         return Unloadable(f"importing {module} fails: it needs {missing!r}, which is not installed", hint)
     parent, _, last = missing.rpartition(".")
     siblings: list[str] = []

@@ -58,33 +58,34 @@ def _without(secrets: list[str], value: Any) -> Any:
 
 def dumps(document: Mapping[str, Any]) -> str:
     """A document of plain TOML values as text."""
-    lines = [f"{_key(k)} = {_value(v)}" for k, v in document.items() if not isinstance(v, Mapping)]
+    lines = [f"{_key(k)} = {value(v)}" for k, v in document.items() if not isinstance(v, Mapping)]
     blocks = ["\n".join(lines)] if lines else []
-    blocks += [_table((key,), value) for key, value in document.items() if isinstance(value, Mapping)]
+    blocks += [_table((key,), one) for key, one in document.items() if isinstance(one, Mapping)]
     return "\n\n".join(blocks) + "\n"
 
 
 def _table(path: tuple[str, ...], table: Mapping[str, Any]) -> str:
     header = "[" + ".".join(map(_key, path)) + "]"
-    return "\n".join([header, *(f"{_key(k)} = {_value(v)}" for k, v in table.items() if v is not None)])
+    return "\n".join([header, *(f"{_key(k)} = {value(v)}" for k, v in table.items() if v is not None)])
 
 
 def _key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
 
 
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
+def value(of: Any) -> str:
+    """Return a value as TOML writes it."""
+    if isinstance(of, bool):
+        return "true" if of else "false"
+    if isinstance(of, str):
         # JSON's escapes are TOML's, but for the delete character, which TOML wants escaped
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, float):
-        return repr(value) if math.isfinite(value) else str(value)
-    if isinstance(value, datetime | date | time):
-        return value.isoformat()
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    return str(value)
+        return json.dumps(of, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(of, float):
+        return repr(of) if math.isfinite(of) else str(of)
+    if isinstance(of, datetime | date | time):
+        return of.isoformat()
+    if isinstance(of, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {value(v)}" for k, v in of.items() if v is not None) + " }"
+    if isinstance(of, list | tuple):
+        return "[" + ", ".join(map(value, of)) + "]"
+    return str(of)

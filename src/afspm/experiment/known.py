@@ -18,27 +18,30 @@ class Wire(Enum):
     CLIENT = "control client"
     CACHE_LOGIC = "cache logic"
     ENVELOPE = "envelope of scans by size"
+    SPECTRA = "envelope of spectra by kind"
     HISTORIES = "histories of scans by size"
 
 
-_PUBSUB = "afspm.io.pubsub"
-_CONTROL = "afspm.io.control"
-_LOGIC = f"{_PUBSUB}.logic"
+PUBLISHED_WIRES: Final = "afspm.io."
+"""Where the published implementation has its intermediary classes. Their modules moved between its versions."""
 
 WIRE_CLASSES: Final[dict[str, Wire]] = {
-    f"{_PUBSUB}.publisher.Publisher": Wire.PUBLISHER,
-    f"{_PUBSUB}.cache.PubSubCache": Wire.CACHE,
-    f"{_PUBSUB}.subscriber.Subscriber": Wire.SUBSCRIBER,
-    f"{_PUBSUB}.subscriber.ComboSubscriber": Wire.COMBINED,
-    f"{_CONTROL}.server.ControlServer": Wire.SERVER,
-    f"{_CONTROL}.router.ControlRouter": Wire.ROUTER,
-    f"{_CONTROL}.client.ControlClient": Wire.CLIENT,
-    f"{_CONTROL}.client.AdminControlClient": Wire.CLIENT,
-    f"{_LOGIC}.pbc_logic.PBCScanLogic": Wire.CACHE_LOGIC,
-    f"{_LOGIC}.pbc_logic.ProtoBasedCacheLogic": Wire.CACHE_LOGIC,
-    f"{_LOGIC}.cache_logic.CacheLogic": Wire.CACHE_LOGIC,
-    f"{_LOGIC}.pbc_logic.create_roi_scan_envelope": Wire.ENVELOPE,
-    f"{_LOGIC}.pbc_logic.create_roi_proto_hist_list": Wire.HISTORIES,
+    "Publisher": Wire.PUBLISHER,
+    "PubSubCache": Wire.CACHE,
+    "Subscriber": Wire.SUBSCRIBER,
+    "ComboSubscriber": Wire.COMBINED,
+    "ControlServer": Wire.SERVER,
+    "ControlRouter": Wire.ROUTER,
+    "ControlClient": Wire.CLIENT,
+    "AdminControlClient": Wire.CLIENT,
+    "PBCScanLogic": Wire.CACHE_LOGIC,
+    "ProtoBasedCacheLogic": Wire.CACHE_LOGIC,
+    "CacheLogic": Wire.CACHE_LOGIC,
+    "create_roi_scan_envelope": Wire.ENVELOPE,
+    "create_spec_envelope": Wire.SPECTRA,
+    "create_roi_proto_hist_list": Wire.HISTORIES,
+}
+SHORT_WIRE_CLASSES: Final[dict[str, Wire]] = {
     "Publisher": Wire.PUBLISHER,
     "Subscriber": Wire.SUBSCRIBER,
     "Cache": Wire.CACHE,
@@ -79,7 +82,8 @@ WIRE_SETTINGS: Final[dict[Wire, frozenset[str]]] = {
     Wire.CLIENT: frozenset({"url", "request_timeout_ms", "request_retries", "uuid"}),
     Wire.CACHE_LOGIC: frozenset({"default_scan_history", "proto_with_history_list"}),
     Wire.ENVELOPE: frozenset({"size", "channel"}),
-    Wire.HISTORIES: frozenset({"sizes_with_hist_list"}),
+    Wire.SPECTRA: frozenset({"type"}),
+    Wire.HISTORIES: frozenset({"sizes_with_hist_list", "channels_list"}),
 }
 
 # The keys by which a component names its intermediaries, and the kinds that fit.
@@ -90,16 +94,6 @@ WIRE_KEYS: Final[dict[str, tuple[Wire, ...]]] = {
     "control_server": (Wire.SERVER,),
     "pubsubcache": (Wire.CACHE,),
     "router": (Wire.ROUTER,),
-}
-
-# Components of the published implementation that are ours under another name.
-COMPONENT_ALIASES: Final[dict[str, str]] = {
-    "afspm.components.microscope.mediator.MicroscopeMediator": "Scheduler",
-    "afspm.components.microscope.scheduler.MicroscopeScheduler": "Scheduler",
-    "afspm.components.drift.mediator.DriftCompensatedMediator": "DriftCompensatedScheduler",
-    "afspm.components.drift.scheduler.DriftCompensatedScheduler": "DriftCompensatedScheduler",
-    "afspm.components.drift.rescanner.DriftRescanner": "Rescanner",
-    "afspm.components.scan.metadata.ScanMetadataWriter": "Metadata",
 }
 
 DASHBOARD: Final = "dashboard"

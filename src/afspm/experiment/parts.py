@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Final
 
+from afspm.errors import AfspmError
+from afspm.experiment import published
 from afspm.experiment.document import Document
+from afspm.experiment.expanded import value as toml
 from afspm.experiment.findings import Findings, Place, closest, nearest
-from afspm.experiment.known import COMPONENT_ALIASES, WIRE_CLASSES, WIRE_KEYS, Wire
+from afspm.experiment.known import WIRE_KEYS
+from afspm.experiment.lines import Path
+from afspm.experiment.published import Setting, wire_of
 from afspm.experiment.references import References
 
 SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart", "record", "notify")
@@ -39,7 +44,7 @@ class Part:
     """One process of the experiment as the file has it, references replaced.
 
     Attributes:
-        class_path: as written (an alias of the published form already ours); empty for a command.
+        class_path: as written (a class of the published form already ours); empty for a command.
         command: program and arguments; empty for a Python class.
         settings: what goes to the constructor, still with units.
         own: the keys of the table that are for us (wiring, envelopes, role …).
@@ -63,6 +68,10 @@ class Parts:
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)
     intermediaries: dict[str, dict[str, Any]] = field(default_factory=dict)
     components: list[Part] = field(default_factory=list)
+    became: dict[Path, str] = field(default_factory=dict)
+    """Of each line of the published form, where it is ours under another name or is no more."""
+    instead: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Tables of components that have no counterpart, by their names, as they are in the file."""
 
     def free_name(self, wanted: str) -> str:
         """A name for a component that is not in the file: `wanted`, with a number behind it where that is taken."""
@@ -89,18 +98,18 @@ def sort(document: Document, findings: Findings) -> Parts:
     parts.variables = {k: references.expand(v, (k,)) for k, v in parts.variables.items()}
     parts.sections = {k: references.expand(v, (k,)) for k, v in parts.sections.items()}
     parts.intermediaries = {k: references.expand(v, (k,)) for k, v in parts.intermediaries.items()}
-    for name, table in raw_components.items():
-        part = _component(name, references.expand(table, (name,)), document, findings)
-        if part is not None:
+    tables = {name: references.expand(table, (name,)) for name, table in raw_components.items()}
+    channels = published.renamed_channels(tables)
+    ours = _FromPublished(channels, parts, document, findings)
+    for name, table in parts.intermediaries.items():
+        renamed = published.with_channels(table, channels)
+        parts.intermediaries[name] = {k: published.evaluated(v, channels) for k, v in renamed.items()}
+    for name, table in tables.items():
+        part = _component(name, published.evaluated(table, channels), document, findings)
+        if part is not None and (part := ours.translated(part)) is not None:
             parts.components.append(part)
     _report_unused(parts, references.used, document, findings)
     return parts
-
-
-def wire_of(table: Any) -> Wire | None:
-    """The kind of intermediary that a value is, or None."""
-    name = table.get("class") if isinstance(table, dict) else None
-    return WIRE_CLASSES.get(name) if isinstance(name, str) else None
 
 
 def _is_component(name: str, table: dict[str, Any], document: Document, findings: Findings) -> bool:
@@ -131,12 +140,64 @@ def _component(name: str, table: dict[str, Any], document: Document, findings: F
     own_keys = OWN_KEYS if class_path else OWN_KEYS | {SIMULATED, *DECLARED_KEYS}
     return Part(
         name=name,
-        class_path=COMPONENT_ALIASES.get(class_path, class_path),
+        class_path=class_path,
         command=tuple(command),
         settings={k: v for k, v in table.items() if k not in own_keys},
         own={k: v for k, v in table.items() if k in own_keys},
         place=place,
     )
+
+
+@dataclass(frozen=True)
+class _FromPublished:
+    """Makes components of the published implementation ours, and notes what became of their lines."""
+
+    channels: Mapping[str, str]
+    parts: Parts
+    document: Document
+    findings: Findings
+
+    def translated(self, part: Part) -> Part | None:
+        """Return the component as ours; None: it has no process of its own here."""
+        table = {"class": part.class_path, **part.own, **part.settings}
+        here = (part.name, "class")
+        if instead := published.without_counterpart(part.class_path):
+            self.parts.instead[part.name] = table
+            self.parts.became[here] = instead
+            what = f"[{part.name}] {published.last(table)} calls code that is written for the published implementation"
+            self.findings.error(what, self.document.place(*here), instead)
+            return None
+        ours = published.class_of(table)
+        if ours is None:
+            return part
+        if ours.ours == "Dashboard":
+            for other in self.parts.components:
+                if other.class_path == ours.ours:
+                    self.parts.became[here] = f"the dashboard, [{other.name}], shows this too"
+                    return None
+        self.parts.became[here] = f'class = "{ours.ours}"'
+        settings: dict[str, Any] = {}
+        for key, value in part.settings.items():
+            if key in ours.settings:
+                self._put(settings, ours.settings[key], (part.name, key), value, table)
+            else:
+                settings[key] = value
+        return replace(part, class_path=ours.ours, settings=settings)
+
+    def _put(
+        self, settings: dict[str, Any], setting: Setting, here: tuple[str, str], value: Any, table: Mapping[str, Any]
+    ) -> None:
+        if here[1] == "channel_id":
+            value = self.channels.get(value, value)
+        try:
+            becomes = setting.becomes(value, table)
+        except (AfspmError, TypeError, ValueError) as error:
+            what, hint = (error.what, error.hint) if isinstance(error, AfspmError) else (str(error), "")
+            self.findings.error(f"[{here[0]}] {here[1]} = {value!r}: {what}", self.document.place(*here), hint)
+            return
+        for name, one in becomes.items():
+            published.put(settings, name, one)
+        self.parts.became[here] = ", ".join(f"{name} = {toml(one)}" for name, one in becomes.items()) or setting.why
 
 
 def _misspelt(table: Mapping[str, Any], wanted: tuple[str, ...]) -> str:

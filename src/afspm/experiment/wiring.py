@@ -15,7 +15,8 @@ from afspm.addresses import hint_on, is_address
 from afspm.experiment.classes import Declared
 from afspm.experiment.findings import Findings, Place
 from afspm.experiment.known import WIRE_KEYS, Wire
-from afspm.experiment.parts import Part, Role, wire_of
+from afspm.experiment.parts import Part, Role
+from afspm.experiment.published import wire_of
 
 
 @dataclass(frozen=True)

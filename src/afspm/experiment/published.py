@@ -1,0 +1,287 @@
+"""Files of the published implementation: what its classes and settings are called here, and what has no counterpart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from afspm import units
+from afspm.errors import AfspmError, InvalidValue
+from afspm.experiment.known import PUBLISHED_WIRES, SHORT_WIRE_CLASSES, WIRE_CLASSES, Wire
+from afspm.logic.envelopes import default_envelope
+from afspm.model import PacketHeader
+
+COMPONENTS: Final = "afspm.components."
+"""Where the published implementation has its components. Their modules moved between its versions."""
+GUIDE: Final = "see docs/how-to/from-the-published-implementation.md"
+CHANNEL: Final = "Height"
+"""The channel of the simulated microscope that stands for the one that a published picture was given."""
+
+Becomes = Callable[[Any, Mapping[str, Any]], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting of a published class.
+
+    Attributes:
+        becomes: our settings, with dots where one is within a table, from its value and the table that it is in.
+        why: for one that becomes nothing: how it is done here.
+    """
+
+    becomes: Becomes
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published class that is one of ours under another name."""
+
+    ours: str
+    settings: Mapping[str, Setting] = field(default_factory=dict)
+
+
+def wire_of(table: Any) -> Wire | None:
+    """Return the kind of intermediary that a value is, or None."""
+    name = table.get("class") if isinstance(table, Mapping) else None
+    if not isinstance(name, str):
+        return None
+    last = name.rpartition(".")[2]
+    return WIRE_CLASSES.get(last) if name.startswith(PUBLISHED_WIRES) else SHORT_WIRE_CLASSES.get(name)
+
+
+def evaluated(value: Any, channels: Mapping[str, str]) -> Any:
+    """Replace each call of a published function in a value by the envelope that the function would return.
+
+    Args:
+        channels: those of the file that have another name here.
+    """
+    if isinstance(value, list):
+        return [evaluated(item, channels) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if wire_of(value) in (Wire.ENVELOPE, Wire.SPECTRA):
+        return envelope(with_channels(value, channels))
+    return {key: evaluated(item, channels) for key, item in with_channels(value, channels).items()}
+
+
+def with_channels(table: Mapping[str, Any], channels: Mapping[str, str]) -> dict[str, Any]:
+    """Return the table of a published function with the names that its channels have here; others as they are."""
+    renamed = dict(table)
+    match wire_of(renamed):
+        case Wire.ENVELOPE if "channel" in renamed:
+            renamed["channel"] = channels.get(renamed["channel"], renamed["channel"])
+        case Wire.HISTORIES if isinstance(given := renamed.get("channels_list"), list):
+            renamed["channels_list"] = [channels.get(channel, channel) for channel in given]
+    return renamed
+
+
+def envelope(table: Mapping[str, Any]) -> Any:
+    """Return the envelope that a published function makes: create_spec_envelope, or create_roi_scan_envelope.
+
+    A size without a unit is in nm, as in the envelopes themselves. What makes no envelope is returned as it is.
+    """
+    if wire_of(table) is Wire.SPECTRA:
+        return default_envelope(PacketHeader("Spec1d", kind=str(table.get("type", ""))))
+    try:
+        width_m, height_m = (length_m(side) for side in table["size"])
+    except (AfspmError, KeyError, TypeError, ValueError):
+        return dict(table)
+    return default_envelope(PacketHeader("Scan2d", str(table.get("channel", "")), (width_m, height_m)))
+
+
+def length_m(value: Any) -> float:
+    """Return a length of the cache's settings in m: a text with its unit, or a number in nm."""
+    return units.si(value, "m") if isinstance(value, str) else float(value) * 1e-9
+
+
+def renamed_channels(components: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Return the channels that a file gives to simulated pictures, each with its name here."""
+    pictures = (table for table in components.values() if last(table) in _PICTURES)
+    return {str(table["channel_id"]): CHANNEL for table in pictures if "channel_id" in table}
+
+
+def class_of(table: Mapping[str, Any]) -> Published | None:
+    """Return what a component's class is here; None where the class is not a published one of these."""
+    name, path = last(table), str(table.get("class", ""))
+    if not path.startswith(COMPONENTS) and name != "DriftImageTranslator":  # beside the file, in its samples
+        return None
+    if name in _PICTURES:
+        return Published("ImageMicroscope" if "img_path" in table else "Simulator", _PICTURE)
+    return CLASSES.get(name)
+
+
+def without_counterpart(path: str) -> str:
+    """Return what to write instead of a published class that has no counterpart; empty for every other class."""
+    return INSTEAD.get(path.rpartition(".")[2], "") if path.startswith(COMPONENTS) else ""
+
+
+def put(settings: dict[str, Any], name: str, value: Any) -> None:
+    """Set a setting that may be within tables: put({}, "drift.channel", "Height")."""
+    *tables, last = name.split(".")
+    for table in tables:
+        settings = settings.setdefault(table, {})
+    settings[last] = value
+
+
+def last(table: Mapping[str, Any]) -> str:
+    """Return the name of a table's class, without its module."""
+    return str(table.get("class", "")).rpartition(".")[2]
+
+
+def _named(ours: str) -> Setting:
+    return Setting(lambda value, table: {ours: value})
+
+
+def _gone(why: str, *names: str) -> dict[str, Setting]:
+    return dict.fromkeys(names, Setting(lambda value, table: {}, why))
+
+
+def _paper(ours: str) -> Setting:
+    """A setting of the paper's tracker, whose queue is what the published scheduler caches."""
+
+    def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+        settings = {"drift.tracker.class": "paper", f"drift.tracker.{ours}": value}
+        count = _within(table, "pubsubcache", "update_cache_kwargs", "cache_logic", "default_scan_history")
+        return settings if count is None else {**settings, "drift.tracker.queue": count}
+
+    return Setting(becomes)
+
+
+def _within(value: Any, *keys: str) -> Any:
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
+
+
+def _estimator(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+    descriptor = str(_within(value, "descriptor_type") or "BRIEF").rpartition(".")[2].lower()
+    if descriptor not in ("brief", "orb", "sift"):
+        raise InvalidValue(f"there is no estimator {descriptor!r}", hint="drift.estimator is brief, orb or sift")
+    return {"drift.estimator": descriptor}
+
+
+def _oldest(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+    if value is not True:
+        raise InvalidValue("the paper's tracker compares with the oldest scan that fits", hint="leave the line out")
+    return {}
+
+
+def _client(address: Callable[[Mapping[str, Any]], str]) -> Becomes:
+    """The table of a client that the published translator was given: where the controller is, and its timeout."""
+
+    def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+        if not isinstance(value, Mapping):
+            raise InvalidValue(f"{value!r} is no table of a client", hint='address = "…" says where the controller is')
+        found = {"address": address(value)}
+        if "timeout_s" in value:
+            found["reply_timeout_s"] = f"{value['timeout_s']} s"
+        elif "timeout_ms" in value:
+            found["reply_timeout_s"] = f"{value['timeout_ms']} ms"
+        return found
+
+    return becomes
+
+
+def _refused(hint: str) -> Setting:
+    def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+        raise InvalidValue("this is not taken over", hint=hint)
+
+    return Setting(becomes)
+
+
+def _width(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+    return {"width": f"{value[0]} {table.get('physical_units', 'nm')}"} if "img_path" in table else {}
+
+
+def _velocity(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+    unit = f"{table.get('spatial_units', 'nm')}/{table.get('temporal_units', 's')}"
+    x, y = (units.si(f"{part} {unit}", "m/s") for part in value)
+    return {"drift.velocity_m_per_s": [x, y, 0.0]}
+
+
+_PICTURES: Final = ("ImageTranslator", "DriftImageTranslator")
+_EVERY: Final[dict[str, Setting]] = {
+    **_gone("a process waits for its next message and never sleeps", "loop_sleep_s", "poll_timeout_ms"),
+    **_gone("[restart] beat_period and missed_beats", "beat_period_s", "hb_period_s"),
+    **_gone("[restart] start is the longest time for it", "spawn_delay_s"),
+    **_gone("a component is called as its table", "override_client_uuid", "uuid"),
+}
+_PICTURE: Final[dict[str, Setting]] = {
+    "img_path": _named("file"),
+    "physical_size": Setting(_width, "the simulated surface has no border"),
+    "drift_rate": Setting(_velocity),
+    **_gone("the middle of the sample is the origin", "physical_origin"),
+    **_gone("each length has its unit", "physical_units", "data_units", "spatial_units", "temporal_units"),
+    **_gone('initial = { scan-speed = "4 um/s" } says how fast the tip moves', "scan_time_s", "move_time_s"),
+    **_gone(f"the channel is {CHANNEL}", "channel_id"),
+}
+_ASYLUM: Final[dict[str, Setting]] = {"xop_client": Setting(_client(lambda client: str(client.get("url", ""))))}
+_NANONIS: Final[dict[str, Setting]] = {
+    "client": Setting(
+        _client(lambda client: f"{client.get('host', '127.0.0.1')}:{client.get('port', 6501)}"),
+    ),
+    **_gone("a spectroscopy is started with its kind", "mode"),
+}
+_GXSM: Final = _gone(
+    "channels are read in the physical units that GXSM's files give",
+    "read_channels_config_path", "read_use_physical_units", "read_allow_convert_from_metadata",
+    "read_simplify_metadata",
+)  # fmt: skip
+_HANDLERS: Final[dict[str, Setting]] = {
+    "param_handler": _refused("write your parameters as the table `parameters`"),
+    "action_handler": _refused("write your actions as the table `actions`"),
+    **_gone("a parameter's own step says when it is reached", "float_tolerance"),
+}
+_DRIFT: Final[dict[str, Setting]] = {
+    "channel_id": _named("drift.channel"),
+    "update_weight": _paper("w_update"),
+    "min_intersection_ratio": _paper("f_min"),
+    "min_spatial_res_ratio": _paper("sr_norm_min"),
+    "rescan_intersection_ratio": Setting(
+        lambda value, table: {"drift.rescan.rule": "paper", "drift.rescan.f_rescan": value}
+    ),
+    "drift_model": Setting(_estimator),
+    "grab_oldest_match": Setting(_oldest, "the oldest scan that fits is taken"),
+    **_gone("a pair counts where chance would hardly match it as well", "max_fitting_score"),
+    **_gone("drift_correction.csv is in the folder of the run", "csv_attribs"),
+    **_gone("the dashboard shows drift, and the component DriftPictures draws it", "display_fit"),
+}
+_RESCANNER: Final = {
+    **_gone("a rescan is asked for as soon as the microscope is free", "rerun_wait_s"),
+    **_gone("it listens to what the scheduler publishes", "scan_params_id", "control_state_id", "scope_state_id"),
+}
+_SHOWN: Final = _gone(
+    "the dashboard shows every channel and region; who looks chooses palette and levelling",
+    "list_keys", "channels_list", "cache_meaning_list", "scan_phys_origin_list", "scan_phys_size_list", "scan_id",
+    "visualization_style_list", "visualization_colormap_list", "visualize_undeclared_scans",
+    "message_received_method", "per_loop_method", "methods_kwargs",
+)  # fmt: skip
+
+CLASSES: Final[dict[str, Published]] = {
+    "MicroscopeMediator": Published("Scheduler", _EVERY),
+    "MicroscopeScheduler": Published("Scheduler", _EVERY),
+    "DriftCompensatedMediator": Published("DriftCompensatedScheduler", _EVERY | _DRIFT),
+    "DriftCompensatedScheduler": Published("DriftCompensatedScheduler", _EVERY | _DRIFT),
+    "DriftRescanner": Published("Rescanner", _EVERY | _RESCANNER),
+    "ScanMetadataWriter": Published("Metadata", _EVERY | _gone("metadata.csv is in the run's folder", "csv_attribs")),
+    "FeedbackAnalyzer": Published("FeedbackAnalysis", _EVERY),
+    "FeedbackCorrector": Published("FeedbackTuner", _EVERY),
+    "AfspmControlUI": Published("Dashboard", _EVERY),
+    "Visualizer": Published("Dashboard", _EVERY | _SHOWN),
+    "AsylumTranslator": Published("Asylum", _EVERY | _HANDLERS | _ASYLUM),
+    "GxsmTranslator": Published("Gxsm", _EVERY | _HANDLERS | _GXSM),
+    "NanonisTranslator": Published("Nanonis", _EVERY | _HANDLERS | _NANONIS),
+}
+"""By the name of the class, in whichever module of the published implementation it was."""
+
+_OWN = "derive a class of your own from afspm.Component, with on_scan, on_state … or a `run`"
+_TRANSLATOR = 'derive a class of your own from afspm.Microscope: "afspm new translator"'
+INSTEAD: Final[dict[str, str]] = {
+    "ScanningComponent": "ScanSeries takes a region again and again, ScanList takes one after the other, RegionGrid a "
+    "map; where its function chooses by what was measured, write the choice as `run` of an afspm.Component",
+    **dict.fromkeys(("AfspmComponent", "AfspmComponentBase", "AfspmComponentUI"), _OWN),
+    **dict.fromkeys(("MicroscopeTranslator", "ConfigTranslator", "MapTranslator", "SXMTranslator"), _TRANSLATOR),
+}
+"""What to write instead of a published class that calls code written against the published implementation."""

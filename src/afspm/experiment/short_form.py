@@ -1,0 +1,198 @@
+"""The short form of a file of the published implementation, and what each of its lines has become."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from afspm import units
+from afspm.addresses import is_address
+from afspm.errors import UnitError
+from afspm.experiment.expanded import dumps
+from afspm.experiment.expanded import value as toml
+from afspm.experiment.findings import Place
+from afspm.experiment.known import WIRE_KEYS, Wire
+from afspm.experiment.parts import Part, Role
+from afspm.experiment.published import INSTEAD, envelope, last, wire_of
+from afspm.transport.network import is_local
+
+if TYPE_CHECKING:
+    from afspm.experiment.experiment import Experiment
+    from afspm.experiment.resolved import Resolved
+    from afspm.experiment.wiring import Wires
+
+_VARIABLES: Final[tuple[str, ...]] = ("name", "messages")
+_FILLED_IN: Final = "filled in: processes on one computer find each other"
+_WIRES: Final[dict[Wire, str]] = {
+    **dict.fromkeys((Wire.PUBLISHER, Wire.CACHE, Wire.COMBINED, Wire.SERVER), _FILLED_IN),
+    **dict.fromkeys((Wire.ROUTER, Wire.CLIENT), f"{_FILLED_IN}; timeouts are [control] request_timeout"),
+    Wire.SUBSCRIBER: f"{_FILLED_IN}; topics are `envelopes` of the component",
+    **dict.fromkeys((Wire.CACHE_LOGIC, Wire.HISTORIES), "[cache]"),
+}
+
+
+def explained(experiment: Experiment) -> list[tuple[Place, str, str]]:
+    """Return for each line of the file where it is, what it sets, and what has become of it."""
+    resolved = experiment.resolved
+    return [(resolved.document.place(*path), _shown(path), became) for path, became in _lines(resolved)]
+
+
+def short(experiment: Experiment) -> str:
+    """Return the experiment in the short form: components with their settings, and what is not usual.
+
+    A component that has no counterpart is the one that may stand for it, where that can be told from its settings,
+    else a comment that says what to write.
+    """
+    resolved = experiment.resolved
+    parts = experiment.parts
+    kept = {name: parts.variables[name] for name in _VARIABLES if name in parts.variables}
+    blocks = [dumps(kept)] if kept else []
+    blocks += [dumps({name: table}) for name, table in _sections(resolved).items()]
+    for part in parts.components:
+        if not part.implied:
+            blocks.append(dumps({part.name: _table(part, resolved)}))
+    blocks += [_instead(name, table) for name, table in parts.instead.items()]
+    return "\n".join(blocks)
+
+
+def _lines(resolved: Resolved) -> Iterator[tuple[tuple[str, ...], str]]:
+    parts = resolved.parts
+    components = {part.name for part in parts.components} | parts.instead.keys()
+    for name, raw in resolved.document.data.items():
+        if name in parts.variables:
+            yield (name,), _variable(name, parts.variables[name])
+        elif name in parts.sections:
+            yield (name,), "as it is"
+        elif name in components or (name, "class") in parts.became:
+            for key in raw:
+                yield (name, key), parts.became.get((name, key)) or (_FILLED_IN if key in WIRE_KEYS else "as it is")
+        else:
+            yield (name,), _intermediary(parts.intermediaries[name])
+
+
+def _variable(name: str, value: Any) -> str:
+    if name in _VARIABLES:
+        return "as it is"
+    if isinstance(value, str) and is_address(value):
+        return f"{_FILLED_IN}; to be said where they are on several computers"
+    return f"{toml(value)} stands where it is named"
+
+
+def _intermediary(table: Mapping[str, Any]) -> str:
+    kind = wire_of(table)
+    if kind in (Wire.ENVELOPE, Wire.SPECTRA):
+        return f"the envelope {toml(envelope(table))}"
+    if kind is not None:
+        return _WIRES[kind]
+    if "component" in table:
+        return "switched off"
+    return "its settings are those of the component that names it"
+
+
+def _shown(path: tuple[str, ...]) -> str:
+    return path[0] if len(path) == 1 else f"[{path[0]}] {path[1]}"
+
+
+def _table(part: Part, resolved: Resolved) -> dict[str, Any]:
+    what: dict[str, Any] = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
+    own = {key: value for key, value in part.own.items() if key not in {"class", "command", *WIRE_KEYS}}
+    wires = resolved.wires[part.name]
+    if wires.envelopes is not None and "envelopes" not in own:
+        own["envelopes"] = wires.envelopes
+    return {"component": True, **what, **own, **_remote(wires, resolved.roles[part.name]), **part.settings}
+
+
+def _remote(wires: Wires, role: Role) -> dict[str, Any]:
+    """The addresses that other computers reach or are on: they can't be left out."""
+    places = {
+        "publisher": wires.publish,
+        "control_server" if role is Role.TRANSLATOR else "router": wires.serve,
+        "pubsubcache": wires.cache_out,
+    }
+    if role is Role.COMPONENT:
+        places["control_client"] = wires.control
+    found: dict[str, Any] = {key: at for key, at in places.items() if at is not None and _is_remote(at)}
+    if role is Role.COMPONENT and any(map(_is_remote, wires.subscribe or ())):
+        found["subscriber"] = {"class": "Subscriber", "sub_url": wires.subscribe}
+    return found
+
+
+def _is_remote(address: str) -> bool:
+    return is_address(address) and not is_local(address)
+
+
+def _sections(resolved: Resolved) -> dict[str, dict[str, Any]]:
+    sections = {name: dict(table) for name, table in resolved.parts.sections.items()}
+    timeouts = [wires.request_timeout_s for wires in resolved.wires.values() if wires.request_timeout_s]
+    retries = [wires.request_retries for wires in resolved.wires.values() if wires.request_retries is not None]
+    given = {"request_timeout": f"{max(timeouts):g} s"} if timeouts else {}
+    asked = {"request_retries": max(retries)} if retries else {}
+    if control := {**given, **asked, **sections.get("control", {})}:
+        sections["control"] = control
+    if any(wires.cache_logic for wires in resolved.wires.values()):
+        sections["cache"] = {**_cache(resolved), **sections.get("cache", {})}
+    return sections
+
+
+def _cache(resolved: Resolved) -> dict[str, Any]:
+    rules = [
+        {
+            "message": rule.message,
+            "channel": rule.channel,
+            "kind": rule.kind,
+            "above": _length(rule.above_m),
+            "up_to": _length(rule.up_to_m),
+            "envelope": rule.envelope,
+            "history": rule.history,
+        }
+        for rule in resolved.caching.rules
+    ]
+    found = {"history": dict(resolved.caching.history), "rules": rules}
+    return {key: value for key, value in found.items() if value}
+
+
+def _length(length_m: float | None) -> str | None:
+    return None if length_m is None else f"{length_m * 1e9:.9g} nm"
+
+
+def _instead(name: str, table: Mapping[str, Any]) -> str:
+    """A component without counterpart: as a series of scans where its data say which, else a comment."""
+    called = table.get("get_next_params") or table.get("message_received_method") or table.get("per_loop_method") or ""
+    was = f"# [{name}] was {last(table)}{f', which called {called}' if called else ''}."
+    series = _series(table)
+    if series is None:
+        return f"{was}\n# Instead: {INSTEAD[last(table)]}.\n"
+    return f"{was}\n# It is taken for one region again and again: see that this is so.\n{dumps({name: series})}"
+
+
+def _series(table: Mapping[str, Any]) -> dict[str, Any] | None:
+    """ScanSeries, where what the function is given says one region, and how long to wait after each scan."""
+    given = table.get("next_params_kwargs")
+    data = next((one for one in given.values() if isinstance(one, Mapping)), {}) if isinstance(given, Mapping) else {}
+    match data:
+        case {
+            "scan_origin": [origin_x, origin_y],
+            "scan_size": [width, height],
+            "length_units": str(unit),
+            "scan_res": [columns, rows],
+            "scan_wait_s": int(wait_s) | float(wait_s),
+        }:
+            try:
+                center = [_middle(origin_x, width, unit), _middle(origin_y, height, unit)]
+            except UnitError:
+                return None
+            return {
+                "component": True,
+                "class": "ScanSeries",
+                "size": [f"{width} {unit}", f"{height} {unit}"],
+                "center": center,
+                "pixels": [columns, rows],
+                "every": f"{wait_s} s",
+            }
+    return None
+
+
+def _middle(origin: float, length: float, unit: str) -> str:
+    """The middle of a side that begins at `origin`: regions are told by their centre here."""
+    units.si(f"{length} {unit}", "m")
+    return f"{origin + length / 2:g} {unit}"
