@@ -52,7 +52,7 @@ def _explain(experiment: Experiment, console: Console) -> None:
     from afspm.experiment.short_form import explained, short
 
     for place, line, became in explained(experiment):
-        console.print(f"{place}: {line}: {became}", markup=False, soft_wrap=True)
+        console.print(f"{place}: {line}: {became}", markup=False, emoji=False, soft_wrap=True)
     typer.echo(short(experiment), nl=False)
 
 

@@ -1,13 +1,16 @@
-"""Every sample runs as it is, to its end; here with fewer pixels and less to do. (Those of tip repair, of the makers'
-controllers and of the drift night run elsewhere.)"""
+"""Every sample runs as it is, to its end; here with fewer pixels and less to do.
+
+Those of tip repair and of the makers' controllers run elsewhere.
+"""
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 
 import pytest
-from experiment_lab import Run
+from experiment_lab import AfspmRun, Run
 
 import afspm
 from afspm.supervisor.ports import FreePorts
@@ -25,6 +28,7 @@ QUICKER: dict[str, tuple[str, int, int]] = {
     "two_computers": (SERIES, 2, 0),
     "wide_and_narrow": ("[list]\nrounds = 1\npixels = [16, 16]\n", 4, 0),
     "feedback_gains": ('[series]\nduration = "90 min"\npixels = [32, 32]\n', 4, 0),
+    "best_points": ("[best_points]\nrounds = 1\nbest = 2\npixels = 32\n[random_points]\npoints = 5\n", 3, 0),
     "paper_form": ('scan_pixels = [16, 16]\n[series]\nduration = "10 min"\n', 1, 0),
 }
 """What is other than in the sample, and how many scans and spectra come of it."""
@@ -41,18 +45,65 @@ SAYS = {
 """What the log has to say, in this order."""
 
 
+def to_its_end(afspm_run: Run, tmp_path: Path, files: tuple[str, ...], quicker: str, *options: str) -> AfspmRun:
+    """Run a sample, at free ports, with less to do; it ends without an error."""
+    samples, second, ports = [EXPERIMENTS / file for file in files], tmp_path / "quicker.toml", FreePorts()
+    used = ADDRESS.findall(samples[0].read_text(encoding="utf-8"))
+    second.write_text("".join(f'{use} = "{ports.address()}"\n' for use in used) + quicker, encoding="utf-8")
+    one = afspm_run(*map(str, samples), str(second), "--runs", str(tmp_path / "runs"), *options)
+    assert one.end() == 0, one.output
+    assert not [line for line in one.lines if re.search(r" (ERROR|CRITICAL) ", line)], one.output
+    return one
+
+
 @pytest.mark.parametrize("name", QUICKER)
 def test_a_sample_runs_to_its_end(afspm_run: Run, tmp_path: Path, name: str) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("PIL")
     quicker, scans, spectra = QUICKER[name]
-    sample, second, ports = EXPERIMENTS / name / "experiment.toml", tmp_path / "quicker.toml", FreePorts()
-    addresses = [f'{use} = "{ports.address()}"\n' for use in ADDRESS.findall(sample.read_text(encoding="utf-8"))]
-    second.write_text("".join(addresses) + quicker, encoding="utf-8")
-    one = afspm_run(str(sample), str(second), "--runs", str(tmp_path / "runs"))
-    assert one.end() == 0, one.output
-    assert not [line for line in one.lines if re.search(r" (ERROR|CRITICAL) ", line)], one.output
+    one = to_its_end(afspm_run, tmp_path, (f"{name}/experiment.toml",), quicker)
     assert re.search(".*".join(SAYS.get(name, ())), one.output, re.DOTALL | re.MULTILINE), one.output
     with afspm.open_run(one.folder) as record:
         taken = min(len(record.scans), scans) if name in FOR_A_TIME else len(record.scans)
         assert (taken, len(record.spectra)) == (scans, spectra), one.output
+
+
+SHORT_NIGHT = """
+[series]
+every = "5 min"
+duration = "40 min"
+pixels = [64, 64]
+[scheduler.drift]
+correct_after = "10 min"
+"""
+SHORT_SERIES = '[experiment]\nevery = "5 min"\nscans = 6\n'
+
+
+@pytest.mark.parametrize(
+    ("files", "quicker"),
+    [
+        (("drift_night/experiment.toml",), SHORT_NIGHT),
+        (("drift_night/experiment.toml", "drift_night/paper.toml"), SHORT_NIGHT),
+        (("paper_form/drift.toml",), SHORT_SERIES),
+    ],
+    ids=["drift_night", "drift_night-paper", "published"],
+)
+def test_a_night_of_drift_runs_and_the_frame_follows_the_sample(
+    afspm_run: Run, tmp_path: Path, files: tuple[str, ...], quicker: str
+) -> None:
+    if "drift_night/paper.toml" in files:
+        pytest.importorskip("skimage")
+    pictures = ("--without", "drift_pictures") if len(files) == 2 else ()  # drawn by the other
+    one = to_its_end(afspm_run, tmp_path, files, quicker, *pictures)
+    with (one.folder / "drift_correction.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) >= 4, one.output
+    assert [row["reason"] for row in rows if row["matched"] != "yes"] == []
+    corrected = [row for row in rows if row["correcting"] == "yes"][1:]
+    assert corrected
+    pixel_m = 2e-6 / 64
+    for row in corrected:  # the frame lies where the sample has gone
+        for axis in "xy":
+            assert float(row[f"center_{axis}_m"]) == pytest.approx(float(row[f"drift_{axis}_m"]), abs=pixel_m)
+    last = rows[-1]
+    assert max(abs(float(last["drift_x_m"])), abs(float(last["drift_y_m"]))) > 2 * pixel_m, "a sample that stands still"

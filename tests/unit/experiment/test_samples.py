@@ -16,6 +16,7 @@ WITHOUT_A_MICROSCOPE = "every_microscope"  # its second file has it
 SECOND_FILES = sorted(p.name for p in (EXPERIMENTS / WITHOUT_A_MICROSCOPE).glob("*.toml") if p.stem != "experiment")
 NAMES = sorted(folder.name for folder in EXPERIMENTS.iterdir() if (folder / "experiment.toml").exists())
 SAMPLES = [(name,) for name in NAMES if name != WITHOUT_A_MICROSCOPE]
+SAMPLES += [("best_points", "drift.toml")]
 SAMPLES += [(WITHOUT_A_MICROSCOPE, second) for second in SECOND_FILES]
 
 
@@ -68,3 +69,18 @@ def test_the_paper_s_form_says_the_same_as_the_short_one() -> None:
         assert long.class_paths[name] == short.class_paths[name]
     assert long.settings["translator"] == short.settings["microscope"]
     assert long.limits.region == short.limits.region
+
+
+def test_the_paper_s_drift_method_has_the_values_of_its_table() -> None:
+    experiment = sample("drift_night", "paper.toml")
+    assert experiment.check() == []
+    drift, series = (experiment.resolved.settings[name] for name in ("scheduler", "series"))
+    assert drift["drift"]["estimator"]["class"] == "brief"
+    tracker, rescan = drift["drift"]["tracker"], drift["drift"]["rescan"]
+    assert tracker == {"class": "paper", "transform": "translation", "f_min": 0.5, "sr_norm_min": 0.25, "w_update": 1.0}
+    assert (rescan["rule"], rescan["f_rescan"]) == ("paper", 0.75)
+    assert (series["size"], series["pixels"], series["every"]) == (pytest.approx([2e-6, 2e-6]), [128, 128], 900.0)
+
+
+def test_the_published_form_of_the_drift_night_has_nothing_wrong() -> None:
+    assert load(EXPERIMENTS / "paper_form" / "drift.toml").check() == []
