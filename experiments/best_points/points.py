@@ -33,8 +33,13 @@ class RandomPoints(Component):
     def _chosen(self, scan):
         """Pixels around which there is a whole narrow scan; of the same scan always the same."""
         random = np.random.default_rng(scan.time_ns)
-        margin = [round(n * self.around / size / 2) for n, size in zip(scan.shape, scan.region.size_m[::-1])]
-        return [[random.integers(edge, n - edge) for n, edge in zip(scan.shape, margin)] for _ in range(self.points)]
+        margin = [
+            round(n * self.around / size / 2) for n, size in zip(scan.shape, scan.region.size_m[::-1], strict=True)
+        ]
+        return [
+            [random.integers(edge, n - edge) for n, edge in zip(scan.shape, margin, strict=True)]
+            for _ in range(self.points)
+        ]
 
 
 class BestPoints(Component):

@@ -245,7 +245,7 @@ _DRIFT: Final[dict[str, Setting]] = {
     "drift_model": Setting(_estimator),
     "grab_oldest_match": Setting(_oldest, "the oldest scan that fits is taken"),
     **_gone("a pair counts where chance would hardly match it as well", "max_fitting_score"),
-    **_gone("drift_correction.csv is in the folder of the run", "csv_attribs"),
+    **_gone("the component DriftTable writes drift_correction.csv into the folder of the run", "csv_attribs"),
     **_gone("the dashboard shows drift, and the component DriftPictures draws it", "display_fit"),
 }
 _RESCANNER: Final = {

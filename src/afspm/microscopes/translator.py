@@ -411,6 +411,8 @@ class Translator:
         elif not self._connected:
             raise ControllerLost(f"it is being looked for: {self._why_lost}")
         answer = self._service.answer(request)
+        if request.kind == ControlRequest.ACTION and answer.response.ok and not answer.steps:
+            self._trusting(self._observe)  # first, so that the peer knows what its action has set when it is answered
         self._finish(request, answer.response)
         self._play(answer.steps)
         if answer.response.ok and (answer.steps or answer.announce):

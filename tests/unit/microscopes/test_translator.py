@@ -634,6 +634,19 @@ def test_actions_and_parameters_of_the_experiment_file(make_bench: Any) -> None:
     assert bench.microscope.done == ["BEEP 3"]
 
 
+def test_what_an_action_sets_is_published_before_it_is_answered(make_bench: Any) -> None:
+    bench = make_bench({"actions": {"x-soft": {"set": {"zctrl-setpoint": "2 nA"}}, "x-beep": {"command": "BEEP"}}})
+    bench.heard()
+    order: list[str] = []
+    publish, reply = bench.port.publish, bench.port.reply
+    bench.port.publish = lambda envelope, *rest, **kept: (order.append(envelope), publish(envelope, *rest, **kept))
+    bench.port.reply = lambda frames: (order.append("answer"), reply(frames))
+    assert bench.ask(ACTION, "x-soft").code == OK
+    assert order == ["ZCtrlParameters", "answer"]
+    assert bench.ask(ACTION, "x-beep").code == OK
+    assert order[2:] == ["answer"], "nothing has changed"
+
+
 @pytest.mark.parametrize(
     "settings",
     [
