@@ -73,6 +73,16 @@ def test_a_problem_is_raised_and_cleared(night: Night, page: Any) -> None:
     page.locator("[data-part=problem]").wait_for(state="detached")
 
 
+def test_all_problems_are_cleared_with_one_button(night: Night, page: Any) -> None:
+    for problem, number in (("drop-on-the-table", 9), ("thermal-drift", 4)):
+        choose(page, "problem", problem)
+        press(page, "Raise")
+        night.until(lambda number=number: number in night.control().problems)  # type: ignore[misc]
+    press(page, "Clear all problems")
+    night.until(lambda: not night.control().problems)
+    page.locator("[data-part=problem]").wait_for(state="detached")
+
+
 def test_parameters_are_read_and_set_and_refusals_give_their_reason(night: Night, page: Any, keep: Any) -> None:
     take_over(page, night)
     choose(page, "parameter", "tip-bias-voltage")

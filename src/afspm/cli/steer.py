@@ -56,18 +56,21 @@ def problems(
     clear: Annotated[
         list[str] | None, typer.Option("--clear", metavar="NAME", help="Remove its flag.", show_default=False)
     ] = None,
+    clear_all: Annotated[bool, typer.Option("--clear-all", help="Remove the flags of all problems.")] = False,
 ) -> None:
     """List the problems that are flagged, by whom and since when; or flag and clear them.
 
     Control is taken from whoever has it when a problem is flagged, until who solves it has cleared it.
     """
-    if flag or clear:
+    if flag or clear or clear_all:
         with acting(where) as scope:
             for name in flag or ():
                 scope.flag(name)
                 typer.echo(f"flagged {name}")
             for name in clear or ():
                 scope.clear(name)
+                typer.echo(f"cleared {name}")
+            for name in scope.clear_all() if clear_all else ():
                 typer.echo(f"cleared {name}")
         return
     _list(where)

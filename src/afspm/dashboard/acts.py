@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,6 +67,13 @@ class Acts:
         """Remove the flag of a problem."""
         response = self._ask(ControlRequest.RMV_EXP_PRBLM, problem)
         return self._told(response, f"{self._watch.problems.name(problem)} is cleared")
+
+    def clear_all(self, problems: Sequence[int]) -> Outcome:
+        """Remove the flags of these problems; the first refusal ends it."""
+        for problem in problems:
+            if not (outcome := self.clear(problem)).ok:
+                return outcome
+        return Outcome(f"{len(problems)} problems are cleared")
 
     def restart(self, process: str) -> Outcome:
         """Have a process ended and started anew."""

@@ -86,6 +86,8 @@ class SteeringPanel:
         with self._flagged:
             for number, name, _ in self._content.problems:
                 _button(f"Clear {name}", partial(self._do, partial(Acts.clear, problem=number)))
+            if len(numbers := [number for number, *_ in self._content.problems]) > 1:
+                _button("Clear all problems", partial(self._do, partial(Acts.clear_all, problems=numbers)))
 
     async def _ask_end(self) -> None:
         if await _asked("End the experiment?", "All components stop; what was measured is kept.", "End it") and (

@@ -245,6 +245,13 @@ class Scope:
         """Remove the flag of a problem; that it was not flagged is no error."""
         self._tell(ControlRequest.RMV_EXP_PRBLM, self.problems.number(problem))
 
+    def clear_all(self) -> tuple[str, ...]:
+        """Remove the flag of every problem that is flagged, and return their names."""
+        flagged = sorted(self.control_state.problems)
+        for problem in flagged:
+            self.clear(problem)
+        return tuple(map(self.problems.name, flagged))
+
     def is_flagged(self, problem: int | str) -> bool:
         """Whether a problem is, by name or number, as far as it was heard."""
         return self.problems.number(problem) in self.control_state.problems

@@ -138,6 +138,14 @@ def test_a_problem_is_flagged_and_cleared_by_the_person(night: Running) -> None:
     assert "no problem is flagged" in afspm_here("problems", night.runs).stdout
 
 
+def test_all_problems_are_cleared_at_once(night: Running) -> None:
+    flags = ("--flag", "thermal-drift", "--flag", "tip-shape-changed")
+    assert afspm_here("problems", night.runs, *flags).exit_code == 0
+    done = afspm_here("problems", night.runs, "--clear-all")
+    assert sorted(done.stdout.split("\n")) == ["", "cleared thermal-drift", "cleared tip-shape-changed"]
+    assert "no problem is flagged" in afspm_here("problems", night.runs).stdout
+
+
 def test_a_misspelt_problem_is_an_error_with_the_nearest(night: Running) -> None:
     said = afspm("problems", night.runs, "--flag", "thermal-drit")
     assert said.returncode == 1

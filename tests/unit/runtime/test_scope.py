@@ -387,6 +387,14 @@ def test_timeouts_are_told_in_words(lab: Lab, scope: Scope) -> None:
     assert lab.clock.passed_s < 60.0
 
 
+def test_all_problems_are_cleared_and_none_that_is_not_flagged(lab: Lab, scope: Scope) -> None:
+    assert scope.clear_all() == ()
+    lab.flag(TIP)
+    lab.flag(4)
+    assert set(scope.clear_all()) == {"tip-shape-changed", "thermal-drift"}
+    assert not lab.control.problems
+
+
 def test_a_solver_gets_control_and_loses_it_when_it_has_solved(lab: Lab, scope: Scope) -> None:
     lab.flag(TIP)
     with scope.control(solving="tip-shape-changed"):
