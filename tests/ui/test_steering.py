@@ -80,7 +80,7 @@ def test_all_problems_are_cleared_with_one_button(night: Night, page: Any) -> No
         night.until(lambda number=number: number in night.control().problems)  # type: ignore[misc]
     press(page, "Clear all problems")
     night.until(lambda: not night.control().problems)
-    page.locator("[data-part=problem]").wait_for(state="detached")
+    page.wait_for_selector("[data-part=problem]", state="detached")
 
 
 def test_parameters_are_read_and_set_and_refusals_give_their_reason(night: Night, page: Any, keep: Any) -> None:

@@ -6,6 +6,7 @@ import os
 import select
 import signal
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,26 @@ def test_part_of_an_experiment_can_be_left_out(run: Run) -> None:
     one = run("--without", "witness", over="[series]\nend_when_done = true\n")
     assert one.end() == 0
     one.wait_for("ran: microscope, scheduler, series, recorder$")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="inter-process sockets are files")
+def test_an_experiment_runs_on_inter_process_sockets(run: Run) -> None:
+    with tempfile.TemporaryDirectory(prefix="afspm-") as folder:  # tmp_path may be longer than a socket's name may
+        at = f"ipc://{folder}"
+        over = f"""
+            [microscope]
+            publisher = "{at}/microscope"
+            control_server = "{at}/asked"
+            [scheduler]
+            pubsubcache = "{at}/scheduler"
+            router = "{at}/router"
+            """
+        one = run(over=over)
+        one.wait_for("series is in control")
+        assert {file.name for file in Path(folder).iterdir() if file.is_socket()} >= {"scheduler", "router"}
+        assert one.end() == 0, one.output
+        require_each_once(one, 4)
+        assert one.facts()["processes"]["scheduler"]["serve"] == f"{at}/router"
 
 
 def test_an_experiment_can_be_started_in_two_parts(run: Run) -> None:
