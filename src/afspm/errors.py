@@ -150,6 +150,12 @@ class NoResponse(RequestError):
     code = "no-response"
 
 
+class MeasurementFailed(NoResponse):
+    """A scan or spectrum failed again and again, and nothing explains it: a person has to look."""
+
+    code = "measurement-failed"
+
+
 class ControlLost(RequestError):
     """Control was taken away and the caller asked not to wait for it."""
 

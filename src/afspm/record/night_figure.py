@@ -202,7 +202,7 @@ def _actions(ax: Axes, record: NightRecord, lanes: Mapping[str, int], limits: tu
 
 def _hours(ax: Axes, record: NightRecord) -> None:
     span_h = (record.end_ns - record.start_ns) / HOUR_NS
-    step = next((s for s in (0.25, 0.5, 1, 2, 4, 8, 24) if span_h / s <= 12), 48)
+    step = _step(span_h, (0.25, 0.5, 1, 2, 4, 8, 24), most=12)
     ticks = np.arange(0, span_h + 1e-9, step)
     ax.set_xticks([record.start_ns + t * HOUR_NS for t in ticks], [f"{t:g}" for t in ticks], size=6)
     ax.set_xlabel("time / h", size=6, labelpad=1)
@@ -222,11 +222,20 @@ def _minutes(ax: Axes, span: Span, record: NightRecord) -> None:
     low, high = ax.get_xlim()
     minute = 60e9
     span_min = (high - low) / minute
-    step = next((s for s in (1, 2, 5, 10, 15, 30, 60, 120) if span_min / s <= 6), 240)
+    step = _step(span_min, (1, 2, 5, 10, 15, 30, 60, 120), most=6)
     ticks = np.arange(math.ceil((low - span.start_ns) / minute / step), (high - span.start_ns) / minute / step) * step
     ax.set_xticks([span.start_ns + t * minute for t in ticks], [f"{t:g}" for t in ticks], size=6)
     hours = (span.start_ns - record.start_ns) / HOUR_NS
     ax.set_xlabel(f"min from {hours:.2f} h", size=6, labelpad=1)
+
+
+def _step(span: float, steps: Sequence[float], *, most: int) -> float:
+    """The first of the steps of which at most so many make up a span, else the last doubled as often as it takes.
+
+    A time that somebody told wrongly, in the far future, must not make millions of ticks.
+    """
+    step = next((s for s in steps if span / s <= most), steps[-1])
+    return step * 2.0 ** max(0, math.ceil(math.log2(max(span / step / most, 1.0))))
 
 
 def _episodes(record: NightRecord) -> list[Span]:

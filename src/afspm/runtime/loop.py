@@ -8,9 +8,9 @@ from pathlib import Path
 
 from afspm import wire
 from afspm.clock import NS_PER_S, Clock
-from afspm.errors import ConfigError, ExperimentEnded
+from afspm.errors import ConfigError, ExperimentEnded, MeasurementFailed, RequestError
 from afspm.exit_codes import ExitCode
-from afspm.model import Frame, Packet
+from afspm.model import Frame, Packet, Problem
 from afspm.runtime import failure
 from afspm.runtime.backlog import Backlog
 from afspm.runtime.component import Component
@@ -83,8 +83,17 @@ class ComponentLoop:
         except StopRequested:
             code = ExitCode.ORPHAN
             self._handle_the_rest(AFTER_A_STOP_S)
+        except MeasurementFailed as failed:
+            self._call_a_person(failed)
+            raise
         self._end()
         return code
+
+    def _call_a_person(self, failed: MeasurementFailed) -> None:
+        """Flag what keeps everybody from measuring on: started again, the component would scan without end."""
+        self._context.log.critical("%s. Nothing is measured until a person clears device-malfunction", failed.what)
+        with contextlib.suppress(RequestError, ExperimentEnded, StopRequested):
+            self._scope.flag(Problem.DEVICE_MALFUNCTION)
 
     def _begin(self) -> None:
         with self._handler():

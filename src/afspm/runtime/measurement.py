@@ -8,7 +8,7 @@ from datetime import UTC
 from typing import Any
 
 from afspm import wire
-from afspm.errors import NoResponse, Refused, WireError
+from afspm.errors import MeasurementFailed, NoResponse, Refused, WireError
 from afspm.logic.sessions import KEYED
 from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
 from afspm.model.words import day_and_time
@@ -99,7 +99,8 @@ class Measuring:
 
         Raises:
             Refused: the microscope, or a limit, says no.
-            NoResponse: not until `until_s`, or the microscope fails again and again.
+            NoResponse: not until `until_s`.
+            MeasurementFailed: the microscope fails again and again.
             ControlLost: control was not given until `until_s`.
         """
         if key is not None and (found := self._results.find(check_key(key), plan.facts)) is not None:
@@ -266,7 +267,7 @@ class Measuring:
         # losing control explains itself and is waited for; all else must not go on for a night
         progress.failures = progress.failures + 1 if self._holding.held else 0
         if progress.failures >= MOST_FAILURES:
-            raise NoResponse(f"the {plan.what} failed {progress.failures} times: {why}", where=self._link.name)
+            raise MeasurementFailed(f"the {plan.what} failed {progress.failures} times: {why}", where=self._link.name)
         return False
 
     def _note(self, progress: _Progress, why: str) -> None:

@@ -179,3 +179,25 @@ def test_simulated_is_written_on_the_picture_only_where_it_is(monkeypatch: pytes
     assert not any(re.search("SIMULATED", s) for s in written)
     draw(night(), tmp_path / "simulated.png", {}, simulated=True)
     assert "SIMULATED" in written
+
+
+@pytest.mark.parametrize("far_ns", [2**62, 2**63 - 1, -(2**62)])
+def test_a_time_that_is_centuries_off_makes_no_million_ticks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, far_ns: int
+) -> None:
+    from matplotlib.axes import Axes
+
+    ticks: list[int] = []
+    of_axes = Axes.set_xticks
+    monkeypatch.setattr(
+        Axes,
+        "set_xticks",
+        lambda self, at, *rest, **more: (
+            ticks.append(len(at)) or of_axes(self, at[:20], *[labels[:20] for labels in rest], **more)
+        ),
+    )
+    record = night()
+    record.add(scan_entry(scan(far_ns), far_ns, None, "series"))
+    record.add(control_entry(ControlState(holder="series", problems=(TIP,)), far_ns))
+    draw(record, tmp_path / "night.png", {TIP: "tip-shape-changed"})
+    assert max(ticks) < 20
