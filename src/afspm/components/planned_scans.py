@@ -104,7 +104,8 @@ class PlannedScans(Component):
     def _take(self, step: Step) -> None:
         scans = self.scope.scan(step.region, shape=step.shape, key=step.key)
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
-        self.memory.save()
+        if self.memory.save():  # else a restart asks for it again
+            self.scope.forget(step.key)
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted and taken again: %s", step.key, interruption)
         if (total := self._total) is not None:

@@ -69,9 +69,11 @@ class SpectroscopyGrid(Component):
         start_s = float(self.memory.setdefault("start_s", self.clock.now_s()))
         for index in range(int(self.memory.get("done", 0)), total):
             place, repeat = divmod(index, self.repeats)
-            self.scope.spectrum(self.positions[place], kind=self.kind, key=f"spectrum-{place}-{repeat}")
+            key = f"spectrum-{place}-{repeat}"
+            self.scope.spectrum(self.positions[place], kind=self.kind, key=key)
             self.memory["done"] = index + 1
-            self.memory.save()
+            if self.memory.save():  # else a restart asks for it again
+                self.scope.forget(key)
             per_spectrum_s = (self.clock.now_s() - start_s) / (index + 1)
             self.scope.progress(index + 1, total, left_s=per_spectrum_s * (total - index - 1))
             self.log.info("spectrum %d of %d", index + 1, total)

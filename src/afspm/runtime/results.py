@@ -7,6 +7,7 @@ import logging
 import re
 import struct
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,13 @@ class Results:
                 write_whole(path, parts)
         self._memory.pop("pending", None)
         self._memory.save()
+
+    def forget(self, key: str) -> None:
+        """Remove what is kept of a key that nobody will ask for again; whoever does, measures again."""
+        path = self._path(key)
+        if path is not None:
+            with suppress(OSError):  # what stays is only space
+                path.unlink(missing_ok=True)
 
     def _path(self, key: str) -> Path | None:
         if self._folder is None:

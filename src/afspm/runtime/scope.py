@@ -35,7 +35,7 @@ from afspm.runtime.holding import Holding
 from afspm.runtime.link import Link
 from afspm.runtime.measurement import Measuring
 from afspm.runtime.plans import MEASURED, Plans, fits
-from afspm.runtime.results import Results
+from afspm.runtime.results import Results, check_key
 from afspm.runtime.values import Value, from_parameter, to_parameter
 
 __all__ = ["Event", "Events", "Scope"]
@@ -109,7 +109,8 @@ class Scope:
             region: where; None: what is set.
             shape: (rows, columns); None: what is set.
             key: makes it happen once in this run: a component that is killed and started again gets the scan of its
-                earlier life. Keys are the component's own, each for one measurement.
+                earlier life. Keys are the component's own, each for one measurement. What is kept of it takes the space
+                of the scan, until `forget`.
         """
         with self._call():
             plan = self._plans.scan(region, shape)
@@ -135,6 +136,10 @@ class Scope:
             result = self._measuring.take(plan, key, self._link.until(timeout_s))
             spectrum: Spectrum = result.things[0]
             return spectrum
+
+    def forget(self, key: str) -> None:
+        """Remove what is kept of a keyed measurement that will not be asked for again, which a long series needs."""
+        self._results.forget(check_key(key))
 
     # --- setting and getting ---
 

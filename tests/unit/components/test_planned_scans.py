@@ -132,6 +132,17 @@ def test_killed_anywhere_no_scan_is_missing_or_there_twice(tmp_path: Path, is_la
         assert len(lab.finished) == 3, f"killed at call {call}"
 
 
+def test_what_is_kept_of_a_long_series_does_not_grow_with_it(tmp_path: Path) -> None:
+    """A night of a thousand scans would keep each of them twice."""
+    kept: list[int] = []
+    lab = Lab("series")
+    for number in range(1, 6):
+        lab.at(900.0 * number - 100.0, lambda: kept.append(len(list(tmp_path.rglob("scan-*")))))
+    run(series(scans=6), lab, tmp_path)
+    assert len(lab.finished) == 6
+    assert kept == [0] * 5
+
+
 def test_started_again_it_says_where_it_goes_on_unless_nothing_is_left(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

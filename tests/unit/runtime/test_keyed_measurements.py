@@ -256,3 +256,16 @@ def test_what_was_refused_is_done_once_at_whichever_step_it_was_killed(*, is_lat
         if not port.is_dead:
             break
     assert deadly_call > 5
+
+
+def test_what_is_forgotten_is_measured_again_and_takes_no_space(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    survey(scope)
+    scope.forget("tile-1")
+    scope.forget("tile-1")
+    assert len(list(tmp_path.rglob("tile-*"))) == 2
+    survey(scope)
+    assert lab.finished == [*TILES, TILES[1]]
+    with pytest.raises(InvalidValue, match="can't be a key"):
+        scope.forget("../tile-1")
