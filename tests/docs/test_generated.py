@@ -6,11 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
-def test_nothing_in_the_docs_is_stale() -> None:
-    done = subprocess.run(
-        [sys.executable, "tools/docs.py", "--check"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, f"run `python tools/docs.py`: stale are\n{done.stdout}{done.stderr}"
+@pytest.mark.parametrize("tool", ["tools/docs.py", "tools/drawings.py"])
+def test_nothing_in_the_docs_is_stale(tool: str) -> None:
+    done = subprocess.run([sys.executable, tool, "--check"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"run `python {tool}`: stale are\n{done.stdout}{done.stderr}"

@@ -1,0 +1,207 @@
+"""Draws the diagrams of the documentation: `python tools/drawings.py` (or `--check`)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from afspm.experiment.svg import Svg
+
+FOLDER: Final = Path(__file__).resolve().parents[1] / "docs" / "pictures"
+GREY, DATA, CONTROL, BAD, GOOD = "#777777", "#2c7fb8", "#d95f0e", "#c0392b", "#2a7f3f"
+FILLS: Final = {
+    "component": ("#eaf5ea", GOOD),
+    "scheduler": ("#fdf0e3", CONTROL),
+    "translator": ("#e7f1f8", DATA),
+    "controller": ("#eeeeee", GREY),
+    "frame": ("none", "#bbbbbb"),
+    "decision": ("#fff8dc", "#a08000"),
+}
+XY = tuple[float, float]
+
+
+@dataclass
+class Sheet:
+    """A drawing in the making; boxes are told by their middle."""
+
+    svg: Svg = field(default_factory=Svg)
+
+    def box(self, at: XY, size: XY, kind: str, *lines: str, bold: bool = True) -> None:
+        """A box with lines of text in its middle."""
+        (x, y), (width, height) = at, size
+        fill, stroke = FILLS[kind]
+        self.svg.box(x - width / 2, y - height / 2, width, height, fill=fill, stroke=stroke)
+        for number, line in enumerate(lines):
+            below = (number - (len(lines) - 1) / 2) * 15 + 4
+            self.svg.text(x, y + below, line, size=12, bold=bold and number == 0)
+
+    def frame(self, corner: XY, size: XY, title: str) -> None:
+        """A dashed frame with a title at its top."""
+        fill, stroke = FILLS["frame"]
+        self.svg.box(*corner, *size, fill=fill, stroke=stroke, dashed=True)
+        self.svg.text(corner[0] + 10, corner[1] + 18, title, anchor="start", fill="#555555")
+
+    def arrow(self, *points: XY, stroke: str = GREY, both: bool = False, text: str = "", at: XY | None = None) -> None:
+        """A line through points, with a word beside it."""
+        self.svg.line(points, stroke=stroke, start=both)
+        if text:
+            x, y = at or ((points[0][0] + points[-1][0]) / 2, (points[0][1] + points[-1][1]) / 2 - 5)
+            self.svg.text(x, y, text, size=11, fill=stroke, halo=True)
+
+    def note(self, at: XY, text: str, *, anchor: str = "middle", bold: bool = False, fill: str = "#222222") -> None:
+        """A line of text."""
+        self.svg.text(*at, text, anchor=anchor, bold=bold, fill=fill)
+
+    def document(self, width: float, height: float, title: str) -> str:
+        """The whole picture."""
+        return self.svg.document(width, height, title, (GREY, DATA, CONTROL, BAD, GOOD))
+
+
+def computers() -> str:
+    """One computer against two: the same file, and only addresses are other."""
+    sheet = Sheet()
+    for left, title, apart in ((10, "one computer", False), (330, "two computers", True)):
+        sheet.note((left + 145, 20), title, bold=True)
+        sheet.frame((left, 30), (290, 150 if apart else 265), "at the microscope")
+        if apart:
+            sheet.frame((left, 200), (290, 95), "")
+            sheet.note((left + 10, 284), "in the office, or one with a graphics card", anchor="start", fill="#555555")
+        x = left + 145
+        sheet.box((left + 65, 80), (105, 36), "controller", "controller")
+        sheet.box((left + 215, 80), (130, 36), "translator", "Translator")
+        sheet.box((x, 145), (150, 36), "scheduler", "Scheduler")
+        sheet.arrow((left + 120, 80), (left + 148, 80), both=True)
+        sheet.arrow((left + 200, 99), (left + 200, 126), stroke=DATA, both=True)
+        for number, name in enumerate(("Experiment", "Tip classifier", "Tip corrector")):
+            at = left + 52 + number * 93
+            sheet.box((at, 245), (88, 36), "component", name)
+            sheet.arrow((x + (number - 1) * 45, 164), (at, 226), stroke=CONTROL, both=True)
+    sheet.note(
+        (320, 318),
+        "One experiment file. Apart, it says the addresses between the two; each part is started by afspm run --only …",
+    )
+    return sheet.document(640, 332, "An experiment on one computer and on two")
+
+
+def reuse() -> str:
+    """A script for each microscope; one script for all; components that are put together."""
+    sheet = Sheet()
+    makers = ("maker A", "maker B")
+    for number, title in enumerate(("a  without", "b  with a translator", "c  with components")):
+        sheet.note((20 + number * 230, 20), title, anchor="start", bold=True)
+        for second, maker in enumerate(makers):
+            x = 70 + number * 230 + second * 105
+            sheet.box((x, 250), (90, 36), "controller", maker)
+            if number == 0:
+                sheet.box((x, 80), (96, 60), "component", "script", "for " + maker)
+                sheet.arrow((x, 111), (x, 231), text="its commands", at=(x, 175))
+            else:
+                sheet.box((x, 190), (96, 36), "translator", "Translator")
+                sheet.arrow((x, 209), (x, 231), both=True)
+    sheet.box((352, 80), (150, 60), "component", "one script", "generic commands")
+    for x in (300, 405):
+        sheet.arrow((352, 111), (352, 140), (x, 140), (x, 171), stroke=CONTROL)
+    for number, name in enumerate(("Experiment", "Classifier", "Corrector")):
+        x = 505 + number * 78
+        sheet.box((x, 65), (74, 36), "component", name)
+        sheet.arrow((x, 84), (555 + number * 28, 112), stroke=CONTROL, both=True)
+    sheet.box((583, 130), (150, 34), "scheduler", "Scheduler")
+    for x in (530, 635):
+        sheet.arrow((x, 148), (x, 171), stroke=DATA, both=True)
+    return sheet.document(720, 285, "Reuse: a script for each microscope, one script, components")
+
+
+def workflow() -> str:
+    """The correction's workflow, from a scan that ends to the mapping that aims the next."""
+    sheet = Sheet()
+    steps = (
+        ("scan S_i has ended", "tip coordinates"),
+        ("predict its mapping", "last rate × time since"),
+        ("candidates D of the queue", "overlap ≥ f_min, like resolution"),
+        ("register with the oldest of D", "the next, if that fails"),
+    )
+    for number, lines in enumerate(steps):
+        sheet.box((120, 45 + number * 70), (210, 44), "component", *lines)
+        if number:
+            sheet.arrow((120, 45 + number * 70 - 47), (120, 45 + number * 70 - 23))
+    sheet.box((375, 255), (170, 44), "decision", "one accepted?")
+    sheet.arrow((226, 255), (289, 255))
+    sheet.box((375, 160), (190, 44), "translator", "M_tot = predicted", "× residual")
+    sheet.arrow((375, 232), (375, 183), text="yes", at=(392, 212))
+    sheet.box((610, 255), (190, 44), "translator", "M_tot = predicted", "(prediction alone)")
+    sheet.arrow((461, 255), (514, 255), text="no", at=(486, 248))
+    sheet.box((375, 65), (190, 44), "decision", "shared region", "below f_rescan?")
+    sheet.arrow((375, 137), (375, 88))
+    sheet.box((610, 65), (190, 44), "scheduler", "Rescanner takes it again", "same sample coordinates")
+    sheet.arrow((471, 65), (514, 65), text="yes", at=(492, 58), stroke=CONTROL)
+    sheet.box((610, 160), (190, 44), "component", "scan joins the queue,", "and is published corrected")
+    sheet.arrow((471, 75), (492, 75), (492, 160), (514, 160), text="no", at=(502, 120))
+    sheet.arrow((610, 232), (610, 183))
+    sheet.arrow((610, 88), (610, 137))
+    sheet.note(
+        (365, 310),
+        "M_tot maps tip to sample coordinates. It corrects what is published, and its inverse aims the next scan.",
+    )
+    return sheet.document(720, 325, "The workflow of drift correction")
+
+
+def one_dimension() -> str:
+    """The paper's worked example: drift of 1 a step from the start, and of 1/2 at step 13."""
+    sheet = Sheet()
+    true = {0: 0.0, 1: 1.0, 2: 2.0, 12: 12.0, 13: 12.5, 14: 13.0}
+    total, rate = 0.0, 0.0
+    for number, (step, drifted) in enumerate(true.items()):
+        if step == 12:
+            total, rate = 11.0, 1.0  # the steps between are as the third
+        predicted = total + rate
+        residual = drifted - predicted
+        x = 75 + number * 112 + (25 if step >= 12 else 0)
+        sheet.note((x, 30), f"t{step}", bold=True)
+        lowest = 11.0 if step >= 12 else 0.0
+        sample, aimed = (210 - (place - lowest) * 60 for place in (drifted, predicted))
+        sheet.svg.box(x - 34, sample - 6, 68, 12, fill="#dddddd", stroke=GREY, corner=2)
+        sheet.svg.box(x - 40, aimed - 10, 80, 20, fill="none", stroke=DATA, dashed=True, corner=2)
+        if residual:
+            sheet.arrow((x + 50, aimed), (x + 50, sample), stroke=BAD)
+        total, rate = drifted, drifted - total if number else 0.0
+        for row, (text, colour) in enumerate(
+            ((f"predicted {predicted:g}", DATA), (f"residual {residual:g}", BAD), (f"total {total:g}", "#222222"))
+        ):
+            sheet.note((x, 250 + row * 18), text, fill=colour)
+    sheet.note((368, 120), "…", bold=True)
+    captions = (
+        "Grey: where the sample is. Blue: where the scan is aimed. Red: what registration finds; the total takes it.",
+        "At the start there is no rate; from t2 on the scan is aimed right. At t13 the drift becomes slower:",
+        "one scan is off by 0.5, the next is not.",
+    )
+    for number, caption in enumerate(captions):
+        sheet.note((20, 325 + number * 18), caption, anchor="start")
+    return sheet.document(740, 375, "Drift correction in one dimension")
+
+
+DRAWINGS: dict[str, Callable[[], str]] = {
+    "one-and-two-computers": computers,
+    "reuse": reuse,
+    "drift-workflow": workflow,
+    "drift-one-dimension": one_dimension,
+}
+
+
+def main() -> None:
+    """Write the drawings that are other than they were, and name them; with --check only name them."""
+    stale = []
+    for name, draw in DRAWINGS.items():
+        file, new = FOLDER / f"{name}.svg", draw()
+        if not file.exists() or file.read_text(encoding="utf-8") != new:
+            stale.append(file.name)
+            if "--check" not in sys.argv:
+                file.write_text(new, encoding="utf-8", newline="\n")
+    sys.stdout.write("".join(f"{name}\n" for name in stale))
+    sys.exit(bool(stale) and "--check" in sys.argv)
+
+
+if __name__ == "__main__":
+    main()
