@@ -5,16 +5,20 @@ The messages are read here as they came, each number with the unit that its peer
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Final
 
 from google.protobuf.message import DecodeError, Message
 
 from afspm.errors import Refused
-from afspm.microscopes.parameters import FEEDBACK_ON, ParameterTable, Value
+from afspm.microscopes.parameters import FEEDBACK_ON, ParameterSpec, ParameterTable, Value
 from afspm.model import ControlRequest, ControlResponse, names
 from afspm.wire.convert import shortest
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+
+_ANY: Final = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -89,8 +93,13 @@ def asked_for(kind: int, payload: bytes) -> list[Asked]:
     return list(reader(message))  # type: ignore[operator]
 
 
-def wanted_values(asked: list[Asked], table: ParameterTable) -> dict[str, Value]:
-    """What is asked for in SI, each value checked by itself.
+def wanted_values(
+    asked: list[Asked], table: ParameterTable, is_in_force: Callable[[str, Value], bool]
+) -> dict[str, Value]:
+    """Return what is asked for in SI, each value checked by itself.
+
+    A value that can't be set, and is in force, is no change: peers send back a whole message in which they have changed
+    one field.
 
     Raises:
         Refused: PARAM_NOT_SUPPORTED or PARAM_ERROR.
@@ -98,10 +107,22 @@ def wanted_values(asked: list[Asked], table: ParameterTable) -> dict[str, Value]
     values: dict[str, Value] = {}
     for one in asked:
         spec = table.find(one.name)
-        if isinstance(one.value, str):
-            values[spec.name] = spec.parse(one.value, one.unit)
-        elif isinstance(one.value, bool):
-            values[spec.name] = spec.checked(one.value)
-        else:
-            values[spec.name] = spec.checked(spec.from_unit(one.value, one.unit))
+        value = _value(one, replace(spec, range=_ANY, choices=()))
+        try:
+            values[spec.name] = _settable(spec, value)
+        except Refused:
+            if not is_in_force(spec.name, value):
+                raise
     return values
+
+
+def _value(one: Asked, spec: ParameterSpec) -> Value:
+    if isinstance(one.value, str):
+        return spec.parse(one.value, one.unit)
+    return spec.checked(one.value if isinstance(one.value, bool) else spec.from_unit(one.value, one.unit))
+
+
+def _settable(spec: ParameterSpec, value: Value) -> Value:
+    if spec.read_only:
+        raise Refused(ControlResponse.PARAM_ERROR, f"{spec.name} can be asked for, not set")
+    return spec.checked(value)

@@ -123,7 +123,8 @@ class Microscope(ABC):
     Args:
         parameters: rows added to the table or changed in it by the experiment file.
         actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
-            parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`).
+            parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`), both does both; with
+            `for = "50 ms"` the microscope is busy so long, and what was set is put back then.
         poll_period_s: the controller is looked at this often, in real seconds, when nothing is about to happen; its
             state more often when a measurement is about to end, as learned from those before.
         result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds (see
@@ -134,6 +135,8 @@ class Microscope(ABC):
         clock, log: of the experiment; given before `connect`.
         run_dir: the folder of this run.
         wake: call it, from any thread, to have the controller looked at now rather than at the next poll.
+        for_a_while: sets parameters by their generic names, in SI, and has them put back after so many experiment
+            seconds: for actions that are made of settings. The microscope is busy meanwhile.
         controller_at: where the controller is: to be set by the constructor, and read by `connect`, since an experiment
             with an emulator puts the emulator's address there. One run at a time commands it. Empty: there is none that
             others can reach.
@@ -162,6 +165,7 @@ class Microscope(ABC):
     log: logging.Logger
     run_dir: Path
     wake: Callable[[], None]
+    for_a_while: Callable[[Mapping[str, Value], float], None]
     controller_at: str = ""
     lacking: Mapping[str, str] = MappingProxyType({})
     memory: dict[str, Any]
@@ -204,6 +208,15 @@ class Microscope(ABC):
         """
         table = ParameterTable.from_toml(cls.parameters_file)
         return table.extended(changed, where="the experiment file", translated=cls.translated)
+
+    @classmethod
+    def excused(cls, controller: str) -> Mapping[str, str]:
+        """Return the checks of the translators' suite that a controller can't pass through no fault of ours, and why.
+
+        Args:
+            controller: its name and version, as `x-controller` tells.
+        """
+        return {}
 
     @abstractmethod
     def connect(self) -> None:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import contextlib
 import difflib
 import logging
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
-from afspm.errors import ConfigError, Refused
+from afspm import units
+from afspm.errors import AfspmError, ConfigError, Refused
 from afspm.microscopes.changes import asked_for, wanted_values
 from afspm.microscopes.in_force import FRAME, MOVES, check_together, of_message
 from afspm.microscopes.microscope import LOST, Action, Microscope
 from afspm.microscopes.parameters import ParameterTable, Value, refuse_value
 from afspm.microscopes.sequence import Sequence, Step
+from afspm.microscopes.temporary import Temporary, state_for
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
 from afspm.wire import encode
 
@@ -47,6 +51,10 @@ class Service:
     Args:
         sequence: says whether the microscope is free, and in which order peers hear of it.
         about_to_act: called right before anything is done that can't be taken back.
+        save: writes `kept`, which is JSON-able, down.
+
+    Attributes:
+        temporary: what an action has put in force for a while.
     """
 
     def __init__(
@@ -54,12 +62,16 @@ class Service:
         microscope: Microscope,
         sequence: Sequence,
         about_to_act: Callable[[Request], None],
+        kept: dict[str, Any],
+        save: Callable[[], None],
         log: logging.Logger,
     ) -> None:
         self._microscope = microscope
         self._sequence = sequence
         self._about_to_act = about_to_act
         self._log = log
+        self.temporary = Temporary(microscope, kept, self._apply_unasked, save, log)
+        microscope.for_a_while = self.temporary.begin
         self.actions = microscope.own_actions() | self._added_actions(microscope.added_actions)
 
     @property
@@ -90,12 +102,16 @@ class Service:
         if request.kind in _SETTERS:
             asked = asked_for(request.kind, request.payload)
             if asked:
-                return self._set(request, wanted_values(asked, self._table))
+                return self._set(request, wanted_values(asked, self._table, self._is_in_force))
             if request.kind == ControlRequest.PARAM:
                 return Answer(self._told(request))
             return Answer(Response(ControlResponse.SUCCESS, id=request.id))
         reason = f"{request_name(request.kind)} is not for a translator"
         raise Refused(ControlResponse.CMD_NOT_SUPPORTED, reason)
+
+    def _is_in_force(self, name: str, value: Value) -> bool:
+        now = self._microscope.in_force([name])
+        return self._microscope.same(name, now[name], value, now)
 
     def _told(self, request: Request) -> Response:
         asked: Parameter = request.subject
@@ -104,8 +120,7 @@ class Service:
         payload = encode(Parameter(spec.name, text, unit or None))[1]
         return Response(ControlResponse.SUCCESS, payload, id=request.id)
 
-    def _set(self, request: Request, asked: Mapping[str, Value]) -> Answer:
-        values = self._settable(asked)
+    def _set(self, request: Request, values: Mapping[str, Value]) -> Answer:
         self._refuse_if_busy(all(self._table[name].while_busy for name in values))
         if values:
             self._apply(values, lambda: self._about_to_act(request))
@@ -115,20 +130,6 @@ class Service:
             return Answer(self._told(request), steps, announce)
         announce = (_ANNOUNCED[ControlRequest(request.kind)],)
         return Answer(Response(ControlResponse.SUCCESS, id=request.id), steps, announce)
-
-    def _settable(self, asked: Mapping[str, Value]) -> dict[str, Value]:
-        """What is asked for without what can only be read: peers send back all of a message to change a part of it.
-
-        Raises:
-            Refused: PARAM_ERROR: what can only be read is to change.
-        """
-        fixed = [name for name in asked if self._table[name].read_only]
-        now = self._microscope.in_force(fixed) if fixed else {}
-        for name in fixed:
-            if not self._table[name].same(now[name], asked[name]):
-                reason = f"{name} can be asked for, not set: it is {self._table[name].quantity(now[name])}"
-                raise Refused(ControlResponse.PARAM_ERROR, reason)
-        return {name: value for name, value in asked.items() if name not in fixed}
 
     def _apply(self, values: Mapping[str, Value], about_to_act: Callable[[], None]) -> None:
         """Set the values, or change nothing.
@@ -158,6 +159,10 @@ class Service:
                 self._microscope.put_in_force(former)
                 made, asked = (self._table[name].quantity(one) for one in (after[name], value))
                 raise refuse_value(name, f"the controller made {made} of {asked}; nothing was changed")
+
+    def _apply_unasked(self, values: Mapping[str, Value]) -> None:
+        """Apply values within an action, or at its end: the request behind it was written down before it began."""
+        self._apply(values, lambda: None)
 
     def _act(self, request: Request) -> Answer:
         action = self._find_action(request.subject)
@@ -192,24 +197,40 @@ class Service:
         added = {}
         for name, what in given.items():
             where = f"actions.{name}"
-            if isinstance(what, Mapping) and set(what) == {"command"}:
-                added[name] = Action(name, _bound(self._microscope.command, str(what["command"])))
-            elif isinstance(what, Mapping) and set(what) == {"set"} and isinstance(what["set"], Mapping):
-                values = self._table.written(what["set"], where=where)
-                moves = ScopeState.MOVING if MOVES & values.keys() else None
-                added[name] = Action(name, _bound(self._apply, values, _already_said), moves)
-            else:
-                hint = '{ set = { "<parameter>" = <value> } } or { command = "<text>" }'
+            is_table = isinstance(what, Mapping) and set(what) <= {"set", "command", "for"} and len(what) > 0
+            if not is_table or set(what) == {"for"} or not isinstance(what.get("set", {}), Mapping):
+                hint = (
+                    '{ set = { "<parameter>" = <value> }, command = "<text>", for = "<time>" }, of these what is needed'
+                )
                 raise ConfigError(f"{what!r} is not an action", where=where, hint=hint)
+            values = self._table.written(what.get("set", {}), where=where)
+            command = str(what["command"]) if "command" in what else None
+            for_s = _duration_s(what["for"], f"{where}.for") if "for" in what else None
+            moves = ScopeState.MOVING if MOVES & values.keys() else None
+            added[name] = Action(
+                name, partial(self._do, values, command, for_s), moves if for_s is None else state_for(values)
+            )
         return added
 
+    def _do(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:
+        """Do what an action of the experiment file says."""
+        if for_s is not None:
+            self.temporary.begin(values, for_s)
+        elif values:
+            self._apply_unasked(values)
+        if command is not None:
+            self._microscope.command(command)
 
-def _bound(function: Callable[..., None], *arguments: Any) -> Callable[[], None]:
-    return lambda: function(*arguments)
 
-
-def _already_said() -> None:
-    """The request behind an action was written down before the action began."""
+def _duration_s(given: Any, where: str) -> float:
+    try:
+        number, unit = units.parse_quantity(given) if isinstance(given, str) else (float(given), "")
+        found = units.convert(number, unit or "s", "s")
+    except (AfspmError, ValueError, TypeError) as error:
+        raise ConfigError(f"{given!r} is no duration: {error}", where=where) from error
+    if not 0.0 < found < math.inf:
+        raise ConfigError(f"{given!r} is no duration", where=where, hint="more than 0 s")
+    return found
 
 
 def _failure(request: Request) -> ControlResponse:

@@ -92,7 +92,8 @@ class Translator:
         self._sequence = StateSequence(said, 2 * microscope.patience_s(microscope.result_timeout_s / 2))
         self._ledger = Ledger(self._kept["ledger"], all_or_nothing=microscope.memory_is_all)
         self._outbox = Outbox(microscope, self._kept["outbox"], self._stamp, log)
-        self._service = Service(microscope, self._sequence, self._about_to_act, log)
+        self._service = Service(microscope, self._sequence, self._about_to_act, self._kept, self._save, log)
+        self._temporary = self._service.temporary
         self._values: dict[str, Value] = {}
         self._connected = self._started = self._told_lost = False
         self._pace = Pace(microscope.poll_period_s, microscope.eager_poll_s)
@@ -143,7 +144,8 @@ class Translator:
             return max(0.0, self._retry_at_s - self._clock.monotonic_s())
         real_now_s, now_s = self._clock.monotonic_s(), self._clock.now_s()
         wait_s = min(self._pace.wait_s(real_now_s), self._all_at_s - real_now_s)
-        for at_s in (self.microscope.next_change_s(), self._sequence.deadline_s(), self._live.due_s):
+        due = (self.microscope.next_change_s(), self._sequence.deadline_s(), self._live.due_s, self._temporary.until_s)
+        for at_s in due:
             if at_s is not None:
                 # a change that should have been and was not seen yet is looked for eagerly, and not without a break
                 until_s = self._clock.real_s(at_s - now_s)
@@ -159,13 +161,18 @@ class Translator:
     def _look(self) -> None:
         if not (self._connected or self._connect()):
             return
+        self._temporary.end_if_due()
         if self._clock.monotonic_s() >= self._all_at_s:
             self._observe()
-        elif self.microscope.status() != self._sequence.said:
+        elif self._status() != self._sequence.said:
             # what ends a measurement changes nothing of what is in force; what else happens, may
             self._observe(values=self._sequence.said.state not in MEASURING)
         for name, payload in self._live.look(self._clock.now_s()):
             self._port.publish(name, payload, self._stamp(1)[0], keep=False)
+
+    def _status(self) -> ScopeStatus:
+        """Return what the microscope is in; while something is in force for a while, it is not asked."""
+        return self._temporary.status or self.microscope.status()
 
     def _trusting(self, do: Callable[[], None]) -> bool:
         """Whether that could be done; if not, the controller is gone, or says what can't be.
@@ -200,6 +207,7 @@ class Translator:
             for packet in self._outbox.start():
                 self._port.publish(*packet)
             self._save()
+        self._temporary.end()  # before a kill, or while the controller was lost, nobody could
         self._take_in(self._read())
         self._publish_all()
         return True
@@ -234,7 +242,7 @@ class Translator:
         if values:
             self._observe_values(announce)
         # the state first: a result that comes in between then waits for the next look, and is not lost
-        status = self.microscope.status()
+        status = self._status()
         if self._sequence.said.state in MEASURING and status.state not in MEASURING:
             self._pace.over(self._clock.monotonic_s())
         steps = self._sequence.observe(status, self._outbox.look(), self._clock.now_s())
@@ -348,12 +356,15 @@ class Translator:
         """The scheduler says that the experiment is over."""
         with contextlib.suppress(*LOST):
             self._stop_measuring()
+            self._temporary.end()
         self._reply(Response(ControlResponse.SUCCESS))
         self._ended = True
 
     def _leave(self) -> None:
         """Nobody is there any more. What is switched off at the panel is for whoever is at the panel."""
         self._trusting(self._stop_measuring)
+        if self._connected:
+            self._trusting(self._temporary.end)
         until_s = self._clock.monotonic_s() + _TIP_S
         while self.leaves_danger():
             off = "off" if self._kept.get("feedback_off") else "perhaps off"

@@ -126,6 +126,8 @@ class FakeMicroscope(Microscope):
 
     def get(self, vendor: str) -> Value:
         self.got += 1
+        if self.lost:
+            raise ConnectionError("unplugged")
         return self.values[vendor]
 
     def set(self, values: Mapping[str, Value]) -> None:

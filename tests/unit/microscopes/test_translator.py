@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -647,12 +648,86 @@ def test_what_an_action_sets_is_published_before_it_is_answered(make_bench: Any)
     assert order[2:] == ["answer"], "nothing has changed"
 
 
+BEEP = {"set": {"tip-bias-voltage": "4 V", "x-mode": "force"}, "command": "BEEP 3", "for": "50 ms"}
+
+
+def test_an_action_may_put_values_in_force_for_a_while(make_bench: Any) -> None:
+    bench = make_bench({"actions": {"x-pulse": BEEP}})
+    microscope, before = bench.microscope, dict(bench.microscope.values)
+    assert bench.ask(ACTION, "x-pulse").code == OK
+    assert (microscope.values["Bias"], microscope.values["Mode"]) == (4000.0, "force")
+    assert microscope.done == ["BEEP 3"]
+    assert bench.heard()[-1] == "BUSY_PARAM"
+    assert bench.ask(ACTION, names.START_SCAN).code == NOT_FREE
+    assert bench.translator.wait_s() <= 0.05
+    bench.clock.t_s += 0.049
+    bench.translator.look()
+    assert microscope.values["Bias"] == 4000.0
+    bench.clock.t_s += 0.002
+    bench.translator.look()
+    assert microscope.values == before
+    assert bench.heard() == ["FREE"]
+
+
+@pytest.mark.parametrize("how", ["killed", "lost", "ended", "orphaned"])
+def test_what_was_in_force_for_a_while_is_put_back_come_what_may(make_bench: Any, how: str) -> None:
+    bench = make_bench({"actions": {"x-pulse": BEEP}})
+    microscope, before = bench.microscope, dict(bench.microscope.values)
+    assert bench.ask(ACTION, "x-pulse").code == OK
+    if how == "killed":
+        bench.start()
+    elif how == "lost":
+        microscope.lost = True
+        bench.look(10.0)
+        assert microscope.values["Bias"] == 4000.0
+        microscope.lost = False
+        bench.look(10.0)
+    elif how == "ended":
+        bench.run_to_the_end(RequestReceived([wire.CLOSE]))
+    else:
+        bench.run_to_the_end(ParentGone())
+    assert microscope.values == before
+
+
+def test_an_action_that_can_not_be_set_changes_nothing_and_is_over(make_bench: Any) -> None:
+    bench = make_bench({"actions": {"x-pulse": BEEP}})
+    before = dict(bench.microscope.values)
+    bench.microscope.stuck = {"Bias": 100.0}
+    assert bench.ask(ACTION, "x-pulse").code == ControlResponse.PARAM_ERROR
+    assert bench.microscope.values == before
+    assert bench.microscope.done == []
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+@pytest.mark.parametrize(("name", "value"), [("x-serial", "007"), ("zctrl-pgain", "1000"), ("x-mode", "of the panel")])
+def test_an_unchanged_value_that_can_not_be_set_is_no_change(bench: Any, name: str, value: str) -> None:
+    """Read only, or put there at the panel beyond what may be asked for."""
+    vendor = {"x-serial": "Serial", "zctrl-pgain": "P", "x-mode": "Mode"}[name]
+    bench.microscope.values[vendor] = value if vendor != "P" else 1000.0
+    calls = bench.microscope.set_calls
+    assert told(bench.ask(PARAM, Parameter(name, value)))[0] == value
+    assert bench.microscope.set_calls == calls
+    assert bench.ask(PARAM, Parameter(name, value + "1")).code == ControlResponse.PARAM_ERROR
+
+
+def test_a_whole_message_may_be_sent_back_with_one_field_changed(make_bench: Any) -> None:
+    bench = make_bench({"parameters": {"x-feedback-on": {"read_only": True}}})
+    wanted = Feedback(on=True, proportional_gain=7.0, setpoint=1.0)
+    bench.microscope.values |= {"Loop": True, "Setpoint": 1.0}
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted).code == OK
+    assert bench.microscope.values["P"] == 7.0
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, replace(wanted, on=False)).code == ControlResponse.PARAM_ERROR
+
+
 @pytest.mark.parametrize(
     "settings",
     [
         {"actions": {"x-a": {"set": {"scan-sped": 1}}}},
         {"actions": {"x-a": {"set": {"scan-speed": "1 V"}}}},
         {"actions": {"x-a": {"do": "it"}}},
+        {"actions": {"x-a": {"for": "1 s"}}},
+        {"actions": {"x-a": {"set": {"scan-speed": "1 um/s"}, "for": "1 V"}}},
+        {"actions": {"x-a": {"set": {"scan-speed": "1 um/s"}, "for": 0}}},
         {"parameters": {"scan-speed": {"rang": [1, 2]}}},
         {"parameters": {"scan-speed": {"range": [2, 1]}}},
         {"parameters": {"scan-speed": {"unit": "V"}}},
