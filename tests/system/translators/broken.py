@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
-from afspm.errors import Refused
+from afspm.errors import FileError, Refused
 from afspm.microscopes import in_force, parameters, sequence, service
 from afspm.microscopes.microscope import Action, action
 from afspm.microscopes.parameters import Value
@@ -88,6 +88,17 @@ class TurnedTheWrongWay(AngleOfTheWrongSign):
 
     def read(self, wanted: Any) -> dict[str, Value]:
         return _turned(super().read(wanted))
+
+
+class TurnedAsIsKnown(TurnedTheWrongWay):
+    @classmethod
+    def excused(cls, controller: str) -> Mapping[str, str]:
+        return {"scan/picture": f"{controller} is known to turn"}
+
+
+class LosesScans(Broken):
+    def load(self, result: str) -> Sequence[Scan | Spectrum]:
+        raise FileError("is lost", where=result)
 
 
 def _turned(values: Mapping[str, Value]) -> dict[str, Value]:

@@ -8,9 +8,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from afspm.testing.translators import Options, Report, bench, run
+from afspm.testing.translators.report import Outcome
 from afspm.testing.translators.session import SPEED
+from afspm.testing.translators.showing import show_result
 
 HERE = Path(__file__).parent
 STUCK = ("NeverFreeAgain", "SuccessWithoutChange")
@@ -77,6 +80,24 @@ def test_what_is_wrong_is_said_in_one_line(
     assert not report.passed
     if name not in STUCK:
         assert report.unrestored == []
+
+
+def test_what_a_translator_logs_is_shown_with_the_check_that_failed(tmp_path: Path) -> None:
+    report = checked(tmp_path, "broken.LosesScans", "scan/frame")
+    (failure,) = report.failed
+    assert any("is lost" in line and line.startswith("microscope said: ") for line in failure.complaints)
+    console = Console(width=200)
+    with console.capture() as shown:
+        show_result(failure, console)
+    assert "is lost" in shown.get()
+
+
+def test_what_a_controller_is_known_not_to_do_is_skipped_with_the_reason(tmp_path: Path) -> None:
+    report = checked(tmp_path, "broken.TurnedAsIsKnown", "scan/picture")
+    (result,) = report.results
+    assert result.outcome is Outcome.SKIPPED
+    assert "is known to turn: expected details" in result.line
+    assert report.passed
 
 
 def test_a_spectrum_that_goes_on_when_it_is_stopped_is_not_one_that_was_over(

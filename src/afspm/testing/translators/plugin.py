@@ -90,7 +90,7 @@ class CheckItem(pytest.Item):
         if result.outcome is Outcome.SKIPPED:
             pytest.skip(result.line)
         if result.outcome is Outcome.FAILED:
-            pytest.fail(result.line, pytrace=False)
+            pytest.fail("\n".join((result.line, *result.complaints)), pytrace=False)
 
     def reportinfo(self) -> tuple[Path, None, str]:
         return self.path, None, f"{self._check.name}: {self._check.title}"

@@ -23,10 +23,11 @@ class Processes:
     Args:
         log: gets what they print.
         woken: called, from any thread, when one of them has ended.
+        complaints: gets the warnings and errors that they tell, each with the name of its process.
     """
 
-    def __init__(self, log: RunLog, clock: Clock, woken: Callable[[], None]) -> None:
-        self._log, self._clock, self._woken = log, clock, woken
+    def __init__(self, log: RunLog, clock: Clock, woken: Callable[[], None], complaints: list[str]) -> None:
+        self._log, self._clock, self._woken, self._complaints = log, clock, woken, complaints
         self._readers: dict[str, LineReader] = {}
         self._exits: SimpleQueue[Exited] = SimpleQueue()
         self._writing = threading.Lock()
@@ -80,6 +81,8 @@ class Processes:
             case Printed():
                 level, text = self._readers[event.name].read(event.stream, event.line)
                 self._write(event.name, level, text)
+                if level >= logging.WARNING:
+                    self._complaints.append(f"{event.name} said: {text}")
             case Exited():
                 said = self._readers[event.name].last_error
                 self._ended[event.name] = f"{describe_exit(event.code)}{f' ({said})' if said else ''}"

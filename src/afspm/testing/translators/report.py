@@ -24,6 +24,7 @@ class Result:
 
     Attributes:
         line: what was expected and what came, or why it was skipped.
+        complaints: of a check that failed, the warnings and errors that were logged meanwhile.
         real_s: how long it took.
     """
 
@@ -32,6 +33,7 @@ class Result:
     outcome: Outcome
     line: str = ""
     real_s: float = 0.0
+    complaints: tuple[str, ...] = ()
 
 
 @dataclass

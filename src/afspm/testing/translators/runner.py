@@ -38,10 +38,11 @@ def do(check: Check, kit: Taking) -> Result:
         Lost: nothing more can be checked.
     """
     clock: Clock = kit.bench.clock
-    began_s = clock.monotonic_s()
+    began_s, heard = clock.monotonic_s(), len(kit.complaints)
 
     def result(outcome: Outcome, line: str = "") -> Result:
-        return Result(check.name, check.title, outcome, line, clock.monotonic_s() - began_s)
+        meanwhile = tuple(kit.complaints[heard:]) if outcome is Outcome.FAILED else ()
+        return Result(check.name, check.title, outcome, line, clock.monotonic_s() - began_s, meanwhile)
 
     missing = kit.support.missing(check.needs)
     if missing:
@@ -50,6 +51,8 @@ def do(check: Check, kit: Taking) -> Result:
         check.do(kit)
         return result(Outcome.PASSED)
     except Failed as failure:
+        if check.name in kit.excused:
+            return result(Outcome.SKIPPED, f"{kit.excused[check.name]}: {failure}")
         return result(Outcome.FAILED, str(failure))
     except Skipped as skipped:
         return result(Outcome.SKIPPED, str(skipped))
@@ -58,7 +61,9 @@ def do(check: Check, kit: Taking) -> Result:
 @contextmanager
 def restored(session: Session, report: Report) -> Iterator[Taking]:
     """What is in force when the block begins is so again at its end, however that comes."""
-    kit = Taking(session.bench, session.support, session.options.frame_m)
+    kit = Taking(
+        session.bench, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
+    )
     before = Before.of(session.bench, session.support)
     try:
         yield kit

@@ -7,7 +7,7 @@ import os
 import signal
 import tempfile
 import threading
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -18,6 +18,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.logic.telling import LOGGED_AS
+from afspm.microscopes import Microscope
 from afspm.model import Frame
 from afspm.record.facts import STATE_DIR
 from afspm.runtime.component import Component
@@ -83,6 +84,8 @@ class Session:
         support: what the microscope has.
         translator: its class or command.
         folder: of this run.
+        excused: checks that this controller can't pass, with the reason.
+        complaints: the warnings and errors that were logged; it grows.
     """
 
     bench: Bench
@@ -91,6 +94,8 @@ class Session:
     simulated: bool
     folder: Path
     options: Options
+    excused: Mapping[str, str]
+    complaints: Sequence[str]
 
 
 def prepare(options: Options) -> Experiment:
@@ -128,14 +133,18 @@ def opened(options: Options) -> Iterator[Session]:
     resolved = experiment.resolved
     (translator,) = resolved.with_role(Role.TRANSLATOR)
     with ExitStack() as stack:
-        bench, folder, simulated = _bench(experiment, options, stack)
+        complaints: list[str] = []
+        bench, folder, simulated = _bench(experiment, options, stack, complaints)
         stack.callback(bench.end)
         stack.enter_context(_interrupting(bench))
         abilities = resolved.abilities(translator)
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
         support = find_out(bench, sorted(actions), sorted(parameters))
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
-        yield Session(bench, support, named, simulated, folder, options)
+        class_ = resolved.classes.get(translator.name)
+        known = isinstance(class_, type) and issubclass(class_, Microscope)
+        excused = class_.excused(support.controller) if known else {}
+        yield Session(bench, support, named, simulated, folder, options, excused, complaints)
 
 
 @contextmanager
@@ -151,7 +160,9 @@ def _interrupting(bench: Bench) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _bench(experiment: Experiment, options: Options, stack: ExitStack) -> tuple[Bench, Path, bool]:
+def _bench(
+    experiment: Experiment, options: Options, stack: ExitStack, complaints: list[str]
+) -> tuple[Bench, Path, bool]:
     """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
     common = _common(experiment, options)
     clock = common.clock
@@ -170,7 +181,7 @@ def _bench(experiment: Experiment, options: Options, stack: ExitStack) -> tuple[
         for port in ports:
             port.wake_up(ParentGone())
 
-    processes = Processes(log, clock, none_goes_on)
+    processes = Processes(log, clock, none_goes_on, complaints)
     stack.callback(processes.close)
     for port in ports:
         stack.callback(port.close)

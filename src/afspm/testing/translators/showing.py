@@ -29,8 +29,8 @@ def show_result(result: Result, console: Console) -> None:
     """One check; what was expected and what came below it."""
     mark, style = _MARKS[result.outcome]
     line = Text.assemble((mark, style), f" {result.name:{_NAME_WIDTH}} ", (result.title, "dim"))
-    if result.line:
-        line.append(f"\n    {result.line}", style)
+    for told in filter(None, (result.line, *result.complaints)):
+        line.append(f"\n    {told}", style)
     console.print(line, soft_wrap=True)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TypeVar
 
 from afspm.model import (
@@ -74,13 +75,24 @@ class Taking:
     """Takes measurements for checks. What failed once is not tried again: who needs it is skipped.
 
     Attributes:
+        excused: checks that this controller can't pass, with the reason.
+        complaints: what is logged as wrong; it grows.
         frames: to take scans of; Skipped where the microscope has not said what is set.
             `frame_m` is the side of what they are parts of, instead of the frame that is set.
     """
 
-    def __init__(self, bench: Bench, support: Support, frame_m: float | None = None) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        support: Support,
+        frame_m: float | None = None,
+        *,
+        excused: Mapping[str, str] = MappingProxyType({}),
+        complaints: Sequence[str] = (),
+    ) -> None:
         self.bench = bench
         self.support = support
+        self.excused, self.complaints = excused, complaints
         self._kept: dict[str, Taken | Exception] = {}
         initial = bench.story.newest(ScanParameters)
         region = None if initial is None else initial.region
