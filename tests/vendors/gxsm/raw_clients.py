@@ -19,12 +19,14 @@ import numpy as np
 
 
 class SocketClient:
-    """A line of JSON out, a line in."""
+    """The secret, and then a line of JSON out, a line in."""
 
     def __init__(self, address: str) -> None:
         host, _, port = address.rpartition(":")
         self._socket = socket.create_connection((host, int(port)), 10.0)
         self._lines = self._socket.makefile("rb")
+        self._socket.sendall(Path("~/.afspm/gxsm-bridge-secret").expanduser().read_bytes() + b"\n")
+        assert json.loads(self._lines.readline()) == {"value": "afspm bridge"}
 
     def call(self, method: str, *arguments: Any) -> Any:
         self._socket.sendall(json.dumps([method, *arguments]).encode() + b"\n")
@@ -36,6 +38,14 @@ class SocketClient:
             content = base64.b64decode(value["bytes"])
             return np.frombuffer(content, value["array"]).reshape(value["shape"])
         return value
+
+    def sent_away(self, lines: bytes) -> bool:
+        """Send these; whether the other end then closes without an answer."""
+        self._socket.sendall(lines)
+        try:
+            return not self._lines.readline()
+        except ConnectionError:
+            return True
 
     def close(self) -> None:
         self._lines.close()

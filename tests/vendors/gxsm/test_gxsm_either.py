@@ -49,7 +49,7 @@ def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
         rate = found.get_response("x-pixel-rate")
         if rate.ok:  # GXSM's own simulator
             kept = found.get("x-pixel-rate")
-            assert found.set("x-pixel-rate", 400).ok
+            assert found.set("x-pixel-rate", 4000).ok
         in_force(found, ScanParameters(FRAME, SHAPE, ""))
         yield found
         in_force(found, before)

@@ -12,6 +12,7 @@ from gxsm_bench import Bench
 from vendor_bench import SHAPE, SOON, Peer, ready, scans, states
 
 from afspm.emulators.gxsm.program import Program
+from afspm.files import read
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -125,6 +126,9 @@ def test_a_gxsm_that_crashes_and_is_started_again_is_found(bench: Make, settings
         made = bench(process=process, **settings)
         address = f"{made.address.partition('@')[0]}@{process}"
     peer = small(made, address=address)
+    made.strike("wedge", duration_s=1e6)
+    while not made.emulator.unanswered:  # what it was asked, it will never answer
+        pass
     made.strike("crash")
     peer.until(UNDEFINED)
     made.start_controller_again()
@@ -135,7 +139,7 @@ def test_a_gxsm_that_crashes_and_is_started_again_is_found(bench: Make, settings
 def test_the_memory_of_a_gxsm_that_has_ended_is_not_believed(bench: Make, left_behind: Path) -> None:
     made = bench(block=left_behind.name, **SHM)
     peer = small(made)
-    made.strike("stale-block")
+    made.strike("crash")
     peer.until(UNDEFINED)
     assert left_behind.exists()
     response = peer.act(names.START_SCAN)
@@ -194,7 +198,7 @@ def test_a_scan_that_did_not_begin_is_told_and_an_old_one_not_taken_for_it(bench
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
     assert not scans(heard)
-    made.until_said("did it begin at all")
+    made.until_said("it was stopped, or never began")
 
 
 def test_a_scan_without_channels_is_told(bench: Make) -> None:
@@ -206,21 +210,147 @@ def test_a_scan_without_channels_is_told(bench: Make) -> None:
     made.until_said("is a channel set")
 
 
-@pytest.mark.parametrize("saving", ["afspm", "gxsm"])
-def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, saving: str) -> None:
-    """GXSM saves it with zeros in the lines that it did not come to, and nothing says so."""
-    made = bench(speed=5.0)
-    peer = small(made, saving=saving)
+def stopped_at_panel(made: Bench, peer: Peer) -> None:
+    """A scan is begun, and somebody stops it after a few lines; nothing comes of it."""
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
-    until_s = made.clock.now_s() + 60.0
-    while made.clock.now_s() < until_s and (made.emulator.program.last is None):
-        peer.get(names.SPEC_KIND)
+    until_line(made, peer, 2)
     made.strike("panel-stop")
     heard = peer.until(FREE)
     assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
     assert not scans(heard)
+
+
+def until_line(made: Bench, peer: Peer, line: int) -> None:
+    """Until so many lines of the running scan are complete."""
+    until_s = made.clock.now_s() + 60.0
+    last = made.emulator.program.last
+    assert last is not None
+    while last.lines_done(made.clock.now_s()) < line and made.clock.now_s() < until_s:
+        peer.get(names.SPEC_KIND)
+
+
+KINDS: list[dict[str, Any]] = [{"version": 3}, {}, SHM, {"card": "RPSPMC"}, {"card": "simulator"}]
+
+
+@pytest.mark.parametrize("saving", ["afspm", "gxsm"])
+@pytest.mark.parametrize("kind", KINDS, ids=["gxsm3", "gxsm4", "shm", "rpspmc", "simulator"])
+def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: dict[str, Any], saving: str) -> None:
+    """GXSM keeps, and saves, the scan before in the rows that it did not come to, and nothing says so."""
+    made = bench(speed=5.0, **kind)
+    peer = small(made, saving=saving)
+    if kind.get("card") == "simulator":
+        assert peer.set("x-pixel-rate", 1000).ok
+    scanned(peer)
+    stopped_at_panel(made, peer)
+    made.until_said("still has the scan before")
+    assert scanned(peer), "the next one is whole, and published"
+
+
+@pytest.mark.parametrize(
+    ("region", "shape"),
+    [
+        (Region((0.0, 0.0), (100e-9, 2e-6)), (8, 16)),
+        (Region((0.0, 0.0), (100e-9, 1e-6)), (6, 16)),
+        (Region((0.0, 0.0), (100e-9, 1e-6)), (8, 12)),
+        (Region((0.0, 0.0), (100e-9, 1e-6)), (8, 24)),
+        (Region((0.0, 0.0), (100e-9, 1e-6)), (12, 16)),
+    ],
+    ids=["frame", "fewer-rows", "fewer-columns", "more-columns", "more-rows"],
+)
+def test_the_rows_of_another_frame_are_known_as_old_too(bench: Make, region: Region, shape: tuple[int, int]) -> None:
+    made = bench(speed=5.0)
+    peer = small(made)
+    scanned(peer)
+    assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, "")).ok
+    peer.until(FREE)
+    stopped_at_panel(made, peer)
+
+
+def test_a_scan_stopped_in_its_first_line_is_told_as_broken_off(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = small(made)
+    assert peer.set(names.SCAN_SPEED, "10", "um/s").ok
+    scanned(peer)
+    assert peer.set(names.SCAN_SPEED, "50", "nm/s").ok
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.strike("panel-stop")
+    assert states(peer.until(FREE)) == ["INTERRUPTED", "FREE"]
+
+
+def test_a_first_scan_that_is_stopped_is_told_as_broken_off(bench: Make) -> None:
+    """There was none before: its file has zeros."""
+    made = bench(speed=5.0)
+    peer = small(made)
+    stopped_at_panel(made, peer)
     made.until_said("lacks lines")
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_scan_begun_and_stopped_at_the_panel_is_told_as_broken_off(bench: Make, seen: bool) -> None:
+    """Also if the translator has not seen the scan before."""
+    made = bench(speed=5.0)
+    peer = small(made)
+    scanned(peer)
+    if not seen:
+        made.kill()
+        peer = made.start()
+        peer.until(FREE)
+    made.at_panel(lambda emulator: emulator.program.start_scan())
+    peer.until(ScopeState.SCANNING)
+    until_line(made, peer, 4)
+    made.strike("panel-stop")
+    heard = peer.until(FREE)
+    assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
+    assert not scans(heard)
+
+
+def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = small(made)
+    scanned(peer)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    until_line(made, peer, 2)
+    made.kill()
+    made.at_panel(lambda emulator: emulator.rig.stop_scan())
+    peer = made.start()
+    heard = peer.until(FREE)
+    assert "INTERRUPTED" in states(heard)
+    assert {Path(scan.filename).name[:7] for scan in scans(heard)} == {"scan001"}, "the one before, once more"
+
+
+def test_the_simulator_of_gxsm_that_ends_too_early_is_found_out(bench: Make) -> None:
+    """It does with lines longer than 0.2 s."""
+    made = bench(speed=5.0, card="simulator")
+    peer = small(made)
+    assert peer.set("x-pixel-rate", 4000).ok
+    assert scanned(peer)
+    assert peer.set("x-pixel-rate", 50).ok
+    assert peer.act(names.START_SCAN).ok
+    heard = peer.until(FREE)
+    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(heard)
+
+
+def test_a_scan_is_saved_when_gxsm_is_done_with_it(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = small(made)
+    for name in scanned(peer):
+        assert read(made.data / name).end_ns is not None, "saved at once, a file has no end in it"
+
+
+def test_a_folder_chosen_at_the_panel_between_two_scans_is_found(bench: Make, tmp_path: Path) -> None:
+    """Until it scans GXSM tells of the folder before."""
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert scanned(peer)
+    other = tmp_path / "other"
+    other.mkdir()
+    made.at_panel(lambda emulator: setattr(emulator.program.saving, "folder", other))
+    assert scanned(peer)
+    assert len(list(other.glob("*.nc"))) == 4
 
 
 @pytest.mark.parametrize(

@@ -143,8 +143,10 @@ def test_damaged_pickles_are_a_value_or_refused(content: bytes, at: int, damage:
 @contextmanager
 def talking(*replies: bytes, silent: bool = False) -> Iterator[BridgeLink]:
     """A link to somebody who answers each call with the next of these bytes, and then hangs up (or not)."""
-    with answering(*replies, silent=silent) as address:
-        link = BridgeLink(address, 0.3 if silent else 10.0, time.monotonic)
+    secret = Path("~/secret").expanduser()
+    secret.touch(0o600)
+    with answering(b'{"value": "afspm bridge"}\n', *replies, silent=silent) as address:
+        link = BridgeLink(address, 0.3 if silent else 10.0, time.monotonic, secret)
         try:
             yield link
         finally:
@@ -180,6 +182,30 @@ def test_what_is_no_answer_ends_the_link(reply: bytes) -> None:
             link.call("y_current")
         with pytest.raises(ControllerLost, match="the connection was lost"):
             link.call("y_current")
+
+
+def test_who_is_not_the_bridge_of_this_version_is_not_called(tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    with pytest.raises(ControllerLost, match="the bridge's secret can't be read"), answering() as address:
+        BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
+    secret.write_text("x" * 64)
+    secret.chmod(0o600)
+    with (
+        pytest.raises(ControllerLost, match="is not the bridge of this version"),
+        answering(b'{"error": "JSONDecodeError: x"}\n') as address,
+    ):
+        BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
+    with pytest.raises(ControllerLost, match="the bridge did not welcome us"), answering(b"") as address:
+        BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions as Unix has them")
+def test_a_secret_that_others_can_read_is_none(tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("x" * 64)
+    secret.chmod(0o644)
+    with pytest.raises(ControllerLost, match="others can read"), answering(b"") as address:
+        BridgeLink(address, 10.0, time.monotonic, secret).call("get", "RangeX")
 
 
 @pytest.mark.parametrize("part", [0, 1, 5, 11])
@@ -282,6 +308,32 @@ def test_a_memory_that_answers_nothing_is_given_up(block: Path) -> None:
             open_link(address, 0.2, time.monotonic)
 
 
+def status(block: Path) -> int:
+    return int.from_bytes(block.read_bytes()[100:108], "little", signed=True)
+
+
+def test_a_request_that_a_dead_gxsm_did_not_answer_is_taken_back(block: Path) -> None:
+    """The next one does not clear the memory, and every call would wait for the answer."""
+    command = [sys.executable, "-c", LISTENS]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        address = Address.parse(f"shm:{block.name}@{process.pid}")
+        link = open_link(address, 0.2, time.monotonic)
+        process.kill()
+        process.wait()
+        with pytest.raises(ControllerLost, match="has ended"):
+            link.call("get", "RangeX")
+        assert block.read_bytes()[:4] == bytes(4), "nothing was asked"
+        assert status(block) == 0
+    with block.open("r+b") as file:
+        file.seek(100)
+        file.write((1).to_bytes(8, "little"))
+    with pytest.raises(ControllerLost, match="no process is called"):
+        open_link(address, 0.2, time.monotonic)
+    assert status(block) == 0, "a request of somebody before"
+
+
 def test_a_gxsm_that_ends_during_a_call_is_noticed_at_once(block: Path) -> None:
     ends = LISTENS.replace("lambda *_: None", "lambda *_: __import__('os')._exit(1)")
     with subprocess.Popen([sys.executable, "-c", ends], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -290,6 +342,7 @@ def test_a_gxsm_that_ends_during_a_call_is_noticed_at_once(block: Path) -> None:
         link = open_link(Address.parse(f"shm:{block.name}@{process.pid}"), 60.0, time.monotonic)
         with pytest.raises(ControllerLost, match="Gxsm4 has ended"):
             link.call("get", "RangeX")
+        assert status(block) == 0
 
 
 def test_a_memory_that_is_too_small_is_none(block: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -67,10 +69,14 @@ def test_a_scan_from_first_to_last(bench: Make, kind: dict[str, Any]) -> None:
         gxsm.call("set", "RangeX", "2000")
         until(made, lambda: not bits(gxsm) & 2)
         assert list(gxsm.call("get_geometry", 0)) == [1000.0, 500.0, 200.0, 0.0, 15.0], "of the scan, not of the next"
-        assert list(gxsm.call("get_dimensions", 0))[:2] == [16.0, 8.0]
+        assert repr(list(gxsm.call("get_dimensions", 0))) == "[16, 8, 1, 1]"
+        assert gxsm.call("get_differentials", 0)[3] == 10.0
+        assert gxsm.call("get_slice", 0, 0, 0, 8, 1) == -1, "beyond the last row"
         image = gxsm.call("get_slice", 0, 0, 0, 0, 8)
         assert gxsm.call("autosave") == 7
-        path = Path(gxsm.call("chfname", 0))
+        told = gxsm.call("chfname", 0)
+        assert told.startswith("./scan001-"), "where GXSM was started, whose user has chosen no folder"
+        path = made.data / told
         until(made, lambda: path.exists() and _readable(path))
         (scan,) = read(path).scans
         np.testing.assert_allclose(scan.values[::-1] * 1e10, image, rtol=1e-6)
@@ -96,7 +102,9 @@ def test_what_is_set_is_never_refused_in_words(bench: Make, kind: dict[str, Any]
         assert gxsm.call("get", "RangeX") == 30.5
         assert gxsm.call("get", "RangeY") == 30.5, "set along with it"
         assert gxsm.call("gets", "RangeX") == "30.5 nm    "
-        assert gxsm.call("gets", "Rang") == "30.5 nm    ", "the last that begins so"
+        assert gxsm.call("gets", "Rang") == "30.5 nm    ", "the first that begins so"
+        assert gxsm.call("gets", "Rotation") == "     0 °"
+        assert gxsm.call("get", "StepsX") == pytest.approx(30.5 / 63), "of range and points"
         assert gxsm.call("set", "RangeX", "1e9") == 0
         assert gxsm.call("get", "RangeX") == 30.5
         assert made.emulator.program.dialogs == ["Valid Range of RangeX: 0.0 to 40000.0"]
@@ -106,12 +114,20 @@ def test_what_is_set_is_never_refused_in_words(bench: Make, kind: dict[str, Any]
         assert gxsm.call("get", "PointsX") == 33.0
         assert gxsm.call("set", "OffsetX", "abc") == 0
         assert gxsm.call("get", "OffsetX") == 0.0
+        for nothing in ("abc", "", "0"):
+            assert gxsm.call("set", "RangeX", nothing) == 0
+            assert gxsm.call("get", "RangeX") == pytest.approx(0.0422), "a step of its converter, never 0"
+        assert gxsm.call("set", "RangeX", "1.5") == 0
         assert gxsm.call("set", "nonsense", "1") == 0
         assert gxsm.call("gets", "nonsense") == "ERROR"
         with pytest.raises(RuntimeError, match="SystemError" if "transport" not in kind else "status -1"):
             gxsm.call("set", "RangeX", 12.5)
         assert gxsm.call("moveto_scan_xy", 10.0, 0.0) == -1, "in ångström, whatever the unit: 15 from side to side"
         assert gxsm.call("moveto_scan_xy", 7.0, 0.0) == 0
+        with pytest.raises(RuntimeError, match="SystemError" if "transport" not in kind else "status -1"):
+            gxsm.call("moveto_scan_xy", "7", "0")
+        with pytest.raises(RuntimeError, match="SystemError" if "transport" not in kind else "status -1"):
+            gxsm.call("set")
 
 
 def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
@@ -141,14 +157,16 @@ def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
         assert gxsm.call("chfname", 4) == "EE: invalid channel"
 
 
-def test_a_scan_that_is_stopped_is_saved_with_zeros(bench: Make) -> None:
+def test_a_scan_that_is_stopped_is_saved_with_the_rows_of_the_one_before(bench: Make) -> None:
     made = bench(speed=SEEN)
     with calling(made) as gxsm:
         small(gxsm)
+        assert gxsm.call("chfname", 0) == "EE: invalid channel"
         gxsm.call("startscan")
         until(made, lambda: gxsm.call("y_current") >= 3)
         gxsm.call("stopscan")
         assert not bits(gxsm) & 2, "free at once"
+        assert gxsm.call("y_current") == 7, "where it did not come to"
         path = made.data / "scan001-M-Xp-ZSmTopo.nc"
         until(made, lambda: path.exists() and _readable(path))
         (scan,) = read(path).scans
@@ -156,13 +174,28 @@ def test_a_scan_that_is_stopped_is_saved_with_zeros(bench: Make) -> None:
         assert there[-3:].all(), "from the top"
         assert not there[0]
         assert gxsm.call("get_slice", 0, 0, 0, 7, 1).tolist() == [[0.0] * 16]
+        gxsm.call("startscan")
+        assert gxsm.call("y_current") == 7, "until the first line is in"
+        until(made, lambda: not bits(gxsm) & 2 and gxsm.call("rtquery", "s")[0] == 1.0)
+        until(made, lambda: (made.data / "scan002-M-Xp-ZSmTopo.nc").exists())
+        before = gxsm.call("get_slice", 0, 0, 0, 0, 8)
+        gxsm.call("set", "PointsY", "10")
+        gxsm.call("set", "PointsX", "12")
+        gxsm.call("set", "PointsY", "10")
+        gxsm.call("startscan")
+        until(made, lambda: gxsm.call("y_current") == 3)
+        gxsm.call("stopscan")
+        now = gxsm.call("get_slice", 0, 0, 0, 0, 10)
+        assert not np.array_equal(now[0], before[0, :12])
+        np.testing.assert_array_equal(now[6:8], before[6:, :12])
+        assert not now[8:].any(), "rows that there were none of"
 
 
 def test_unknown_parameters_are_minus_infinity_in_4_and_garbage_in_3(bench: Make) -> None:
     with calling(bench(version=4)) as gxsm:
         assert gxsm.call("get", "dsp-nonsense") == -math.inf
-    with calling(bench(version=3)) as gxsm, pytest.raises(RuntimeError, match="UnicodeDecodeError"):
-        gxsm.call("get", "dsp-nonsense")
+    with calling(bench(version=3)) as gxsm:
+        assert gxsm.call("get", "dsp-nonsense") == "I\x025"
 
 
 def test_a_decimal_comma_cuts_numbers(bench: Make) -> None:
@@ -202,6 +235,49 @@ def test_the_bridge_passes_on_what_it_was_made_for_and_nothing_else(bench: Make)
         assert gxsm.call("y_current") == 0
     with calling(made) as gxsm:
         assert gxsm.call("y_current") == 0, "one client after the other"
+
+
+PAGE = (
+    b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: text/plain\r\nContent-Length: 40\r\n\r\n"
+    b'["action", "UNCHECK-MainAutoSave"]\n["set", "RangeX", "12"]\n'
+)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [PAGE, b'["set", "RangeX", "12"]\n', b"0" * 64 + b'\n["set", "RangeX", "12"]\n', b'\n["set", "RangeX", "12"]\n'],
+    ids=["a page", "no secret", "another", "nothing"],
+)
+def test_the_bridge_does_nothing_for_who_does_not_know_the_secret(bench: Make, sent: bytes) -> None:
+    made = bench()
+    host, _, port = made.address.rpartition(":")
+    with socket.create_connection((host, int(port)), 10.0) as stranger:
+        stranger.sendall(sent)
+        with suppress(ConnectionError):
+            assert stranger.recv(1000) == b"", "no answer"
+    with calling(made) as gxsm:
+        assert gxsm.call("get", "RangeX") == 1e4
+    assert made.emulator.program.auto_save
+
+
+@pytest.mark.parametrize("line", [b"Host: x", b"{}", b"[]", b"[1]", b'["get", {}]', b"[" * 9000, b"\xff"])
+def test_the_bridge_hangs_up_at_the_first_line_that_is_no_call(bench: Make, line: bytes) -> None:
+    made = bench()
+    with calling(made) as gxsm:
+        assert isinstance(gxsm, SocketClient)
+        assert gxsm.sent_away(line + b'\n["set", "RangeX", "12"]\n')
+    with calling(made) as gxsm:
+        assert gxsm.call("get", "RangeX") == 1e4
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions as Unix has them")
+def test_nobody_else_can_read_the_secret(bench: Make) -> None:
+    bench()
+    file = Path("~/.afspm/gxsm-bridge-secret").expanduser()
+    assert file.stat().st_mode & 0o777 == 0o600
+    file.chmod(0o640)
+    with pytest.raises(PermissionError, match="chmod 600"):
+        bench()
 
 
 def test_shared_memory_without_the_lock_mixes_answers_up(bench: Make) -> None:

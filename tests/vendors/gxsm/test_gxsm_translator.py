@@ -142,11 +142,12 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
     assert len(list(made.data.glob("*.nc"))) == 8
 
 
-@pytest.mark.parametrize("version", [3, 4])
-def test_lines_come_while_it_scans(bench: Make, version: int) -> None:
-    """Of the second scan on: only files tell what channels are called."""
+@pytest.mark.parametrize(("version", "live_lines_s"), [(3, 1.0), (4, 1.0), (4, 0.05)])
+def test_lines_come_while_it_scans(bench: Make, version: int, live_lines_s: float) -> None:
+    """Of the second scan on: only files tell what channels are called. Before its first line is in, GXSM tells of the
+    scan before."""
     made = bench(speed=5.0, version=version)
-    peer = made.start(live_lines_s=1.0)
+    peer = made.start(live_lines_s=live_lines_s)
     ready(peer, shape=(40, 32))
     assert peer.act(names.START_SCAN).ok
     assert not any(isinstance(one, ScanLines) for one in peer.until(FREE))
@@ -254,7 +255,7 @@ def test_what_this_hardware_lacks_is_not_supported(bench: Make) -> None:
 def test_gxsms_own_simulator_scans(bench: Make) -> None:
     peer = bench(card="simulator").start()
     ready(peer)
-    assert peer.set("x-pixel-rate", 400).ok
+    assert peer.set("x-pixel-rate", 4000).ok
     assert scanned(peer)["ZS-Topo"].region == TURNED
 
 

@@ -48,7 +48,7 @@ class GxsmEmulator(Emulator):
     usual: ClassVar[Mapping[str, Any]] = {"port": 65431, "block": "gxsm4_py_shm_data_block", "process": "gxsm4"}
     fault_kinds: ClassVar[Mapping[str, str]] = {
         "wedge": "nothing is answered for the duration",
-        "crash": "GXSM vanishes",
+        "crash": "GXSM vanishes; its shared memory stays",
         "script-stopped": "script-control is set to 0: the script in the console ends",
         **calls.FAULT_KINDS,
         **program.FAULT_KINDS,
@@ -112,7 +112,9 @@ class GxsmEmulator(Emulator):
         self.program.auto_save, self.program.probe_auto_save = self._auto_save, self._probe_auto_save
         self._calls = Calls(self.program)
         if self._transport == "shm":
-            self._block = Block(self._block_name, self._process, self.faults, self.clock.now_s, self.unanswered.append)
+            self._block = Block(
+                self._block_name, self._process, self.folder, self.faults, self.clock.now_s, self.unanswered.append
+            )
             return f"shm:{self._block_name}@{self._block.pid}"
         return self.run_script()
 
@@ -122,7 +124,7 @@ class GxsmEmulator(Emulator):
         if before is not None:
             before.end()
             self.unanswered.clear()
-        self._console = Console(self._script, self.port, self._post, self.woken.post)
+        self._console = Console(self._script, self.port, self.folder.absolute(), self._post, self.woken.post)
         while (address := self._console.poll()) is None:
             self.serve(1.0)
         self.port = int(address.rpartition(":")[2])
@@ -143,11 +145,10 @@ class GxsmEmulator(Emulator):
     def tick(self, now_s: float) -> float | None:
         """Scans end, files are written, and what has waited is answered."""
         if self.faults.strikes("crash", now_s):
+            if self._block is not None:
+                self._block.end(remains=True)
+                self._block = None
             raise Crashed("as it was told to")
-        if self._block is not None and self.faults.strikes("stale-block", now_s):
-            self._block.end(remains=True)
-            self._block = None
-            raise Crashed("its shared memory stays")
         if self._console is not None and self._listens and not self._console.runs:
             self._listens = False
             self.listening("")

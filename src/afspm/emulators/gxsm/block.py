@@ -22,7 +22,6 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
     "evil-pickle": "shared memory: the result would run a program if it were unpickled",
     "code": "shared memory: the status says that the result can't be passed on",
     "huge": "shared memory: a result that is longer than the memory",
-    "stale-block": "shared memory: GXSM ends, and its memory stays",
 }
 NAME_BYTES: Final = 64
 _NO_SUCH_FUNCTION, _NOT_PASSED_ON = -4, -1
@@ -34,17 +33,24 @@ class Block:
     Args:
         name: of the memory.
         process: what the process calls itself.
+        folder: in which it was started.
         post: takes the calls; `take` must be called when `fileno` is readable.
     """
 
     def __init__(
-        self, name: str, process: str, faults: Faults, now_s: Callable[[], float], post: Callable[[Call], None]
+        self,
+        name: str,
+        process: str,
+        folder: Path,
+        faults: Faults,
+        now_s: Callable[[], float],
+        post: Callable[[Call], None],
     ) -> None:
         if not sys.platform.startswith("linux"):
             raise ConfigError("Gxsm4's shared memory is there on Linux alone", where="transport", hint='"bridge"')
         self._name, self._faults, self._now_s, self._post = name, faults, now_s, post
         command = [sys.executable, "-I", "-S", str(Path(__file__).with_name("signalled.py")), name, process]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=folder)
         self._frame()  # it is ready
 
     @property

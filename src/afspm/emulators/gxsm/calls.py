@@ -26,7 +26,9 @@ _MODES: Final = {
     "simulator": (),
 }
 _KINDS: Final = {"FZ": "force"}
-_NOBODY: Final = 4294967295.0
+_NOBODY: Final = 4294967295
+_VOLT: Final = 532.0
+"""Of the scanner, in ångström."""
 
 
 _signature = cache(inspect.signature)  # which takes longer than most calls
@@ -60,7 +62,10 @@ class Calls:
         if self._faults.strikes("error", now_s):
             raise SystemError("an emulated error")
         try:
-            _signature(getattr(Calls, f"_{method}")).bind(self, *arguments)
+            try:
+                _signature(getattr(Calls, f"_{method}")).bind(self, *arguments)
+            except TypeError as error:
+                raise SystemError(f"<built-in function {method}> returned a result with an exception set") from error
             found = function(*arguments)
         except RigBusy as busy:
             raise SystemError(str(busy)) from busy
@@ -94,7 +99,7 @@ class Calls:
             return 0
         return self._program.entries.set(ref, value)
 
-    def _get(self, ref: str) -> float:
+    def _get(self, ref: str) -> float | str:
         if self._faults.strikes("nan", self._program.clock.now_s()):
             return math.nan
         return self._program.entries.get(ref)
@@ -137,15 +142,28 @@ class Calls:
         now_s = program.clock.now_s()
         if self._faults.strikes("garbage", now_s):
             return (_NEVER_WRITTEN, 1.4e-45, -2.7e209)
-        if code == "s":
+        if code in ("s", "S") or (code == "W" and program.version == 4):
             return (float(self._bits(now_s)), _NEVER_WRITTEN, _NEVER_WRITTEN)
+        if code in ("o", "O"):
+            volts = program.entries["OffsetX"] / _VOLT, program.entries["OffsetY"] / _VOLT
+            return (0.0, *volts)
+        if code == "f":
+            return (0.0, 0.0, 0.0)
+        if code in ("p", "P"):
+            return self._pixel(now_s, centred=code == "p")
         if code == "R":
             return (0.0, program.entries["ScanX"], program.entries["ScanY"])
         if code == "z":
             x_m, y_m = program.rig.probe_at(now_s)
-            volts = 532.0 * ANGSTROM_M
-            return (0.0, x_m / volts, y_m / volts)
+            volt_m = _VOLT * ANGSTROM_M
+            return (0.0, x_m / volt_m, y_m / volt_m)
         return (_NEVER_WRITTEN, _NEVER_WRITTEN, _NEVER_WRITTEN)
+
+    def _pixel(self, now_s: float, *, centred: bool) -> tuple[float, float, float]:
+        """Where the tip is in the scan."""
+        rows, columns = self._program.last.shape if self._program.last is not None else (0, 0)
+        x, y = columns // 2, self._program.y_current(now_s)
+        return (float(x - columns // 2), float(rows // 2 - y), 0.0) if centred else (float(x), float(y), 0.0)
 
     def _bits(self, now_s: float) -> int:
         program = self._program
@@ -162,11 +180,7 @@ class Calls:
         return bits
 
     def _y_current(self) -> int:
-        program = self._program
-        scan = program.last
-        if scan is None:
-            return 0
-        return min(scan.lines_done(program.clock.now_s()), scan.shape[0] - 1)
+        return self._program.y_current(self._program.clock.now_s())
 
     def _startscan(self) -> int:
         self._program.start_scan()
@@ -190,9 +204,11 @@ class Calls:
         names = self._program.names(self._program.clock.now_s())
         if not 0 <= channel % 100 < len(names):
             return "EE: invalid channel"
-        return str(names[channel % 100])
+        return self._program.shown(names[channel % 100])
 
     def _moveto_scan_xy(self, x: float, y: float) -> float:
+        if isinstance(x, str) or isinstance(y, str):
+            raise SystemError("<built-in function moveto_scan_xy> returned a result with an exception set")
         return self._program.move_tip(float(x), float(y))
 
     # --- data ---
@@ -201,21 +217,22 @@ class Calls:
         x, y, width, height, angle_deg = self._program.last_frame
         return (width, height, x, y, angle_deg)
 
-    def _get_dimensions(self, channel: int) -> tuple[float, ...]:
+    def _get_dimensions(self, channel: int) -> tuple[int, ...]:
         scan = self._program.last
-        return (_NOBODY,) * 4 if scan is None else (float(scan.shape[1]), float(scan.shape[0]), 1.0, 1.0)
+        return (_NOBODY,) * 4 if scan is None else (scan.shape[1], scan.shape[0], 1, 1)
 
     def _get_differentials(self, channel: int) -> tuple[float, ...]:
         _, _, width, height, _ = self._program.last_frame
         columns, rows, _, _ = self._get_dimensions(channel)
-        return (width / (columns - 1), height / (rows - 1), self._program.channels[channel].dz, 1.0)
+        return (width / (columns - 1), height / (rows - 1), self._program.channels[channel].dz, 10.0)
 
     def _get_slice(self, channel: int, value: int, time: int, first: int, count: int) -> Any:
         program = self._program
         if program.last is None or not 0 <= channel < len(program.channels):
             return -1
         one = program.channels[channel]
-        return program.image(one)[first : first + count].astype(np.float64) * one.dz
+        image = program.image(one)
+        return image[first : first + count].astype(np.float64) * one.dz if first + count <= len(image) else -1
 
     def _get_probe_event(self, channel: int, nth: int) -> Any:
         program = self._program

@@ -33,11 +33,16 @@ class Channel:
         return f"{'M-' if master else ''}{self.direction}-{self.label.replace('-', 'm')}.nc"
 
     def raw(self, values: np.ndarray) -> np.ndarray:
-        """What is stored of an image [y, x] with y ascending: rows from the top, 0 where nothing was scanned."""
-        return np.nan_to_num(values[::-1] * (self.scale / self.dz)).astype(np.float32)
+        """Return what is stored of an image [y, x] with y ascending: rows from the top, NaN where not scanned."""
+        return (values[::-1] * (self.scale / self.dz)).astype(np.float32)
 
 
 _ANGSTROM: Final = (("AA", "Å"), 1e10)
+SIMULATED_3: Final = (
+    Channel("Height", "Topo", "Xp", *_ANGSTROM, 0.117506942891),
+    Channel("Amplitude", "MIX1", "Xp", ("V", "V"), 1.0, 0.000305185),
+)
+"""Of the simulator that Gxsm3 has."""
 CHANNELS: Final = {
     3: (
         Channel("Height", "Topo", "Xp", *_ANGSTROM, 0.117506942891),

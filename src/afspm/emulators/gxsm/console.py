@@ -68,16 +68,17 @@ class Console:
 
     Args:
         script: that listens at a port, and says so.
+        folder: in which GXSM was started.
         post: takes its calls, from its own thread.
         ended: called from that thread when the script has ended.
     """
 
     def __init__(
-        self, script: Path, port: int, post: Callable[[Call], None], ended: Callable[[], None] = lambda: None
+        self, script: Path, port: int, folder: Path, post: Callable[[Call], None], ended: Callable[[], None]
     ) -> None:
         self._module = Module(post)
         self._said: Future[str] = Future()
-        self._script, self._port, self._ended = script, port, ended
+        self._script, self._port, self._folder, self._ended = script, port, folder, ended
         self._runs = True
         self._thread = threading.Thread(target=self._run, daemon=True, name="GXSM's console")
         self._thread.start()
@@ -106,7 +107,13 @@ class Console:
             if found and not self._said.done():
                 self._said.set_result(f"{found[1]}:{found[2]}")
 
-        scope = {"__name__": "__main__", "gxsm": self._module, "PORT": self._port, "print": print_}
+        scope = {
+            "__name__": "__main__",
+            "gxsm": self._module,
+            "PORT": self._port,
+            "FOLDER": str(self._folder),
+            "print": print_,
+        }
         try:
             exec(compile(self._script.read_text(encoding="utf-8"), str(self._script), "exec"), scope)
         except Gone:

@@ -12,6 +12,9 @@ USER_UNITS: Final = {"Å": 1.0, "nm": 10.0, "µm": 1e4}
 """In ångström."""
 _FLOAT: Final = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _ANGSTROM: Final = "Å"
+_PADDING: Final = " " * 4
+_DAC_STEP: Final = 0.422
+"""In ångström: a range is never less."""
 
 
 @dataclass
@@ -21,6 +24,8 @@ class Entry:
     Attributes:
         value: lengths in ångström, whatever the panel shows.
         unit: that `gets` shows; of lengths the user's.
+        shown: how `gets` writes the number.
+        zero: what 0 becomes.
         whole: of points.
         told: called with each new value.
     """
@@ -29,6 +34,8 @@ class Entry:
     low: float = -math.inf
     high: float = math.inf
     unit: str = ""
+    shown: str = "{:.6g}"
+    zero: float = 0.0
     whole: bool = False
     told: Callable[[float], None] | None = None
 
@@ -73,37 +80,37 @@ class Entries:
         if entry is None:
             return 0
         value = self._atof(text) * self._factor(entry)
-        value = float(int(value)) if entry.whole else value
+        value = (float(int(value)) if entry.whole else value) or entry.zero
         if not entry.low <= value <= entry.high:
             self._dialogs(f"Valid Range of {ref}: {entry.low} to {entry.high}")
             return 0
+        if ref in ("StepsX", "StepsY"):
+            ref, value = f"Range{ref[-1]}", value * max(self[f"Points{ref[-1]}"] - 1.0, 1.0)
         self._take(ref, value)
-        if ref in ("RangeX", "PointsX", "StepsX"):  # the ratio is kept: here 1:1
+        if ref in ("RangeX", "PointsX"):  # the ratio is kept: here 1:1
             self._take(f"{ref[:-1]}Y", value)
+        for axis in "XY":
+            self.put(f"Steps{axis}", self[f"Range{axis}"] / max(self[f"Points{axis}"] - 1.0, 1.0))
         return 0
 
-    def get(self, ref: str) -> float:
-        """In the user's unit.
-
-        Raises:
-            UnicodeDecodeError: there is none, in Gxsm3 (memory that nobody has written).
-        """
+    def get(self, ref: str) -> float | str:
+        """Return a value in the user's unit; of what there is not: -inf, or in Gxsm3 memory that nobody has written."""
         entry = self._entries.get(ref)
         if entry is not None:
             return entry.value / self._factor(entry)
         if self._version == 3:
-            raise UnicodeDecodeError("utf-8", b"\xe0\x04", 0, 1, "invalid continuation byte")
+            return "I\x025"
         return -math.inf
 
     def gets(self, ref: str) -> str:
-        """As shown; by the last name that begins so."""
+        """Return a value as shown, by the first name that begins so."""
         found = [entry for name, entry in self._entries.items() if name.startswith(ref)]
         if not found:
             return "ERROR"
-        entry = found[-1]
-        number = f"{entry.value / self._factor(entry):.1f}" if entry.unit == _ANGSTROM else f"{entry.value:.6g}"
-        unit = self._user_unit if entry.unit == _ANGSTROM else entry.unit
-        return f"{number.replace('.', ',') if self._comma else number} {unit}    "
+        entry = found[0]
+        number = entry.shown.format(entry.value / self._factor(entry))
+        unit = f"{self._user_unit}{_PADDING}" if entry.unit == _ANGSTROM else entry.unit
+        return f"{number.replace('.', ',') if self._comma else number} {unit}"
 
     def _take(self, ref: str, value: float) -> None:
         entry = self._entries[ref]
@@ -125,19 +132,34 @@ def lengths(reach: float, told: Callable[[str], Callable[[float], None]]) -> dic
     """The entries of the scan frame that every GXSM has, in ångström, up to so far from the centre."""
 
     def length(ref: str, value: float, low: float, high: float) -> Entry:
-        return Entry(value, low, high, _ANGSTROM, told=told(ref))
+        return Entry(value, low, high, _ANGSTROM, "{:.1f}", told=told(ref))
+
+    def extent(value: float, shown: str) -> Entry:
+        return Entry(value, 0.0, 2 * reach, _ANGSTROM, shown, _DAC_STEP)
 
     return {
-        "RangeX": length("RangeX", 1e4, 0.0, 2 * reach),
-        "RangeY": length("RangeY", 1e4, 0.0, 2 * reach),
-        "PointsX": Entry(64.0, 2.0, 8192.0, whole=True),
-        "PointsY": Entry(64.0, 2.0, 8192.0, whole=True),
-        "StepsX": length("StepsX", 1e4 / 63, 0.0, 2 * reach),
-        "StepsY": length("StepsY", 1e4 / 63, 0.0, 2 * reach),
+        "RangeX": extent(1e4, "{:.1f}"),
+        "RangeY": extent(1e4, "{:.1f}"),
+        "PointsX": Entry(64.0, 2.0, 20_000.0, whole=True),
+        "PointsY": Entry(64.0, 2.0, 20_000.0, whole=True),
+        "StepsX": extent(1e4 / 63, "{:.3f}"),
+        "StepsY": extent(1e4 / 63, "{:.3f}"),
         "OffsetX": length("OffsetX", 0.0, -reach, reach),
         "OffsetY": length("OffsetY", 0.0, -reach, reach),
         "ScanX": length("ScanX", 0.0, -reach, reach),
         "ScanY": length("ScanY", 0.0, -reach, reach),
-        "Rotation": Entry(0.0, -360.0, 360.0, "deg"),
-        "script-control": Entry(0.0, 0.0, 10.0),
+        "Rotation": Entry(0.0, -360.0, 360.0, "°", "{:6.0f}"),
+        "script-control": Entry(50.0, 0.0, 100.0),
+    }
+
+
+def simulated_3() -> dict[str, Entry]:
+    """Return the entries that the simulator of Gxsm3 has besides those of Gxsm4's."""
+    return {
+        "sim-stm-fbs-bias": Entry(0.1, -10.0, 10.0, "V"),
+        "sim-stm-fbs-mx0-current-set": Entry(0.5, -100.0, 100.0, "nA"),
+        "sim-stm-fbs-cp": Entry(0.0, 0.0, 200.0),
+        "sim-stm-fbs-ci": Entry(0.0, 0.0, 200.0),
+        "sim-config-adv-scan-slope-x": Entry(0.0, -0.2, 0.2),
+        "sim-config-adv-scan-slope-y": Entry(0.0, -0.2, 0.2),
     }

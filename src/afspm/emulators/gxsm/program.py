@@ -13,8 +13,8 @@ import numpy as np
 from afspm.clock import Clock
 from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm import files
-from afspm.emulators.gxsm.channels import CHANNELS, Channel
-from afspm.emulators.gxsm.entries import Entries, Entry, lengths
+from afspm.emulators.gxsm.channels import CHANNELS, SIMULATED_3, Channel
+from afspm.emulators.gxsm.entries import Entries, Entry, lengths, simulated_3
 from afspm.emulators.gxsm.saving import Saving
 from afspm.emulators.rig import Rig
 from afspm.emulators.running import RunningScan, RunningSpectrum
@@ -33,6 +33,12 @@ NAMED_S: Final = 0.04
 """Until so long after its begin the names of the scan before are told."""
 IGAIN: Final = 10.0
 """The simulated integral gain for one of GXSM's, which go to 200."""
+UNFINISHED_S: Final = 0.25
+"""So long after the end of a scan GXSM is not done with it: a file that is saved then has no end in it."""
+_PIXELS_S: Final = 0.045
+"""What its own simulator takes for a line besides its pixels."""
+_EARLY_LINE_S, _EARLY_S = 0.2, 1.0
+"""It ends a scan with lines longer than this after so long, and tells nobody."""
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
@@ -72,13 +78,16 @@ class Program:
         self.repeats = False
         self.entries = Entries(version, user_unit, decimal_comma=decimal_comma, dialogs=self.dialogs.append)
         self.auto_save, self.probe_auto_save = True, True
-        self.channels: list[Channel] = [one for one in CHANNELS[version] if one.source in rig.channels]
+        known = SIMULATED_3 if (version, card) == (3, "simulator") else CHANNELS[version]
+        self.channels: list[Channel] = [one for one in known if one.source in rig.channels]
         self.saving = Saving(folder, faults)
         self.last: RunningScan | None = None
         self.last_frame = (0.0, 0.0, 0.0, 0.0, 0.0)
         self.curve: RunningSpectrum | None = None
         self._scanning = self._saved = False
-        self._before: list[Path] = []
+        self._before: list[Path] | None = None
+        self._y_before = 0
+        self._memory: dict[Channel, np.ndarray] = {}
         self._own: list[Path] = []
         self._curves = 0
         for ref, entry in lengths(reach_m / ANGSTROM_M, self._told).items():
@@ -96,7 +105,8 @@ class Program:
         rig, loop = self.rig, self.rig.feedback
         bias = Entry(rig.bias_v, -10.0, 10.0, "V", told=lambda value: setattr(rig, "bias_v", value))
         if self.card == "simulator":
-            return {"sim-stm-speed": Entry(1.0, 0.0, 4000.0), "sim-stm-bias": bias}
+            speed = Entry(1.0, 0.01, 4000.0, "px/s", "{:.2f}")
+            return {"sim-stm-speed": speed, "sim-stm-bias": bias, **(simulated_3() if self.version == 3 else {})}
 
         def fed_back(name: str, factor: float = 1.0) -> Callable[[float], None]:
             def told(value: float) -> None:
@@ -129,12 +139,12 @@ class Program:
 
     def advance(self, now_s: float) -> float | None:
         """Up to now; returns when a file is to be written."""
-        if self._scanning and self.faults.strikes("panel-stop", now_s):
+        if self._scanning and (self.faults.strikes("panel-stop", now_s) or self._ends_early(now_s)):
             self.rig.stop_scan()
         if self._scanning and self.last is not None and not self.last.running(now_s):
             self._scanning = False
             if self.auto_save:
-                self.save(now_s)
+                self.save(now_s, finished=True)
             if self.repeats:
                 self.start_scan()
         if self.curve is not None and not self.curve.running(now_s):
@@ -152,9 +162,14 @@ class Program:
         if self.rig.busy(now_s) or not self.channels or self.faults.strikes("no-start", now_s):
             return
         entries, columns, rows = self.entries, int(self.entries["PointsX"]), int(self.entries["PointsY"])
-        self.rig.region, self.rig.shape, self.rig.upwards = self.frame(), (rows, columns), False
-        if "sim-stm-speed" in entries:
-            self.rig.line_s = 2.0 * columns / max(entries["sim-stm-speed"], 1e-3)
+        self._memory = {one: _resized(self.image(one), (rows, columns)) for one in self.channels}
+        self._y_before = self.y_current(now_s)
+        region = self.frame()
+        self.rig.region, self.rig.shape, self.rig.upwards = region, (rows, columns), False
+        if self.card == "simulator":
+            # it turns its picture the other way than the frame
+            self.rig.region = replace(region, angle_rad=-region.angle_rad)
+            self.rig.line_s = _PIXELS_S + len(self.channels) * columns / entries["sim-stm-speed"]
         else:
             self.rig.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
         self._before, self._own = self.names(now_s), []
@@ -162,44 +177,74 @@ class Program:
         self.last_frame = tuple(entries[ref] for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY", "Rotation"))  # type: ignore[assignment]
         self._scanning, self._saved = True, False
 
+    def _ends_early(self, now_s: float) -> bool:
+        return (
+            self.card == "simulator"
+            and self.last is not None
+            and self.last.line_s > _EARLY_LINE_S
+            and now_s >= self.last.start_s + _EARLY_S
+        )
+
+    def y_current(self, now_s: float) -> int:
+        """The last line that is complete: that of the scan before until the first is; the very last after a stop."""
+        scan = self.last
+        if scan is None:
+            return 0
+        if not scan.running(now_s):
+            return scan.shape[0] - 1
+        done = scan.lines_done(now_s)
+        return done - 1 if done else self._y_before
+
     def frame(self) -> Region:
         """Of the next scan."""
         x, y, width, height = (self.entries[ref] * ANGSTROM_M for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY"))
         return Region((x, y), (width, height), -math.radians(self.entries["Rotation"]))
 
     def names(self, now_s: float) -> list[Path]:
-        """Where each channel is to be saved, whatever is there already; or was."""
-        if self._before and self.last is not None and now_s < self.last.start_s + NAMED_S:
+        """Return where each channel is to be saved, whatever is there already, or was; none before the first scan."""
+        if self.last is None:
+            return []
+        if self._before is not None and now_s < self.last.start_s + NAMED_S:
             return self._before
         if self._own:
             return self._own
         return [self.saving.named(ending, self.saving.counter) for ending in self._endings()]
 
+    def shown(self, path: Path) -> str:
+        """Return a path as it is told: a GXSM whose user has chosen no folder saves to ".", wherever it was started."""
+        return f"./{path.name}" if path.parent == self.folder else str(path)
+
     def image(self, channel: Channel) -> np.ndarray:
-        """What there is of a channel of the last scan, as it is stored."""
-        if self.last is None:
+        """Return what is in memory of a channel: rows that the last scan did not come to are as they were."""
+        if self.last is None or channel not in self._memory:
             return np.zeros((0, 0), np.float32)
         now_s = self.clock.now_s()
         until_s = now_s if self._scanning else self.last.stopped_s
         drawn = self.last.channels(until_s)
-        return channel.raw(drawn[channel.source][1])
+        scanned = channel.raw(drawn[channel.source][1])
+        return np.where(np.isnan(scanned), self._memory[channel], scanned)
 
-    def save(self, now_s: float) -> None:
-        """The last scan, if there is one: again, if it was saved."""
+    def save(self, now_s: float, *, finished: bool = False) -> None:
+        """Save the last scan, if there is one: again, if it was saved.
+
+        Args:
+            finished: GXSM is done with it, whatever the time.
+        """
         if self.last is None:
             return
         if self._saved:
             self._own = []
         own = [self.saving.free(ending) for ending in self._endings()]
-        contents = [(path, self._file(one, path)) for path, one in zip(own, self.channels, strict=True)]
-        self.saving.write(contents, now_s)
+        finished = finished or now_s >= self.last.end_s + UNFINISHED_S
+        pairs = zip(own, self.channels, strict=True)
+        self.saving.write([(path, self._file(one, path, finished=finished)) for path, one in pairs], now_s)
         self.saving.counted(own)
         self._own, self._saved = own, True
 
     def _endings(self) -> list[str]:
         return [channel.ending(master=number == 0) for number, channel in enumerate(self.channels)]
 
-    def _file(self, channel: Channel, path: Path) -> bytes:
+    def _file(self, channel: Channel, path: Path, *, finished: bool) -> bytes:
         scan = self.last
         assert scan is not None
         saved = files.SavedScan(
@@ -210,7 +255,7 @@ class Program:
             channel.unit,
             self.last_frame,
             scan.start_s - self.behind_s,
-            scan.end_s - self.behind_s,
+            scan.end_s - self.behind_s if finished else 0.0,
             CARDS[self.card],
             scan.bias_v,
         )
@@ -266,3 +311,11 @@ class Program:
 
     def _curve_path(self) -> Path:
         return self.folder / f"scan{self.saving.counter:03d}-VP{self._curves:03d}-VP.vpdata"
+
+
+def _resized(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return memory of another size: what both have stays, the rest is zero."""
+    found = np.zeros(shape, np.float32)
+    rows, columns = (min(pair) for pair in zip(shape, image.shape, strict=True))
+    found[:rows, :columns] = image[:rows, :columns]
+    return found

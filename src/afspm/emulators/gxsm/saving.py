@@ -27,12 +27,12 @@ class _Write:
 class Saving:
     """The files of one folder.
 
-    Args:
-        folder: of scans and spectra.
+    Attributes:
+        folder: of scans and spectra; somebody at the panel may choose another.
     """
 
     def __init__(self, folder: Path, faults: Faults) -> None:
-        self._folder = folder
+        self.folder = folder
         self._faults = faults
         self._writes: list[_Write] = []
         self.counter = 1
@@ -40,7 +40,7 @@ class Saving:
 
     def named(self, ending: str, counter: int) -> Path:
         """A scan's file."""
-        return self._folder / f"scan{counter:03d}-{ending}"
+        return self.folder / f"scan{counter:03d}-{ending}"
 
     def free(self, ending: str) -> Path:
         """The first file, from the counter on, that is not there yet: each channel counts by itself."""

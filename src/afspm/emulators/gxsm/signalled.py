@@ -2,7 +2,8 @@
 
 Run by `block.py` as a script of its own, with the name of the block and of the process; frames of a length and
 content go out to standard output (a call: the function's name, 64 bytes, and the pickled arguments), and come in from
-standard input (a status of 8 bytes, and the pickled result). It ends when that does.
+standard input (a status of 8 bytes, and the pickled result). It ends when that does. A block that is there already is
+taken over as it is, with a request in it that nobody has answered.
 """
 
 from __future__ import annotations
@@ -55,7 +56,6 @@ def run(block: str, name: str) -> None:
     descriptor = os.open(f"/dev/shm/{block}", os.O_RDWR | os.O_CREAT, 0o644)
     os.ftruncate(descriptor, SIZE)
     memory = mmap.mmap(descriptor, SIZE)
-    memory[STATUS : STATUS + 8] = bytes(8)
     sys.stdout.buffer.write(struct.pack(">I", 0))
     sys.stdout.buffer.flush()
     while True:

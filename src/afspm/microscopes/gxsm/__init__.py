@@ -42,6 +42,7 @@ class Gxsm(Microscope):
             Auto Save is left on, and its files are waited for.
         hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
         scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
+        secret_file: a copy of the bridge's `~/.afspm/gxsm-bridge-secret`, if GXSM runs on another computer.
         reply_timeout_s: how long an answer may take, in real time.
         parameters, actions, poll_period_s, result_timeout_s, live_lines_s: as for every microscope.
     """
@@ -59,6 +60,7 @@ class Gxsm(Microscope):
         hardware: str | None = None,
         scan_dir: str | None = None,
         probe_dir: str | None = None,
+        secret_file: str | None = None,
         reply_timeout_s: Duration = 5.0,
         parameters: Mapping[str, Mapping[str, Any]] | None = None,
         actions: Mapping[str, Mapping[str, Any]] | None = None,
@@ -83,16 +85,26 @@ class Gxsm(Microscope):
         self._saves = saving == "afspm"
         self._given_hardware = hardware
         self._scan_dir, self._probe_dir = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
+        self._secret_file = None if secret_file is None else Path(secret_file)
         self._reply_timeout_s = reply_timeout_s
         self._whole_table = self.table
         self._refs: dict[str, str] = {}
         self._asking: Asking | None = None
 
+    @classmethod
+    def excused(cls, controller: str) -> Mapping[str, str]:
+        """Return what GXSM's own simulator does otherwise than GXSM itself says."""
+        if not controller.endswith(f"({Hardware.SIMULATOR.value})"):
+            return {}
+        return {"scan/picture": "GXSM's simulator turns its picture the other way than GXSM turns the frame"}
+
     def connect(self) -> None:
         """The link; what this GXSM has, in which unit it has it, and how it saves."""
         self.close()
         address = Address.parse(self.controller_at)
-        ask = self._asking = Asking(open_link(address, self._reply_timeout_s, self.clock.monotonic_s))
+        ask = self._asking = Asking(
+            open_link(address, self._reply_timeout_s, self.clock.monotonic_s, self._secret_file)
+        )
         self.prove()
         self._refnames, self._actions = ask.names("list_refnames"), ask.names("list_actions")
         missing = [ref for ref in REFNAMES if ref not in self._refnames]
@@ -253,11 +265,14 @@ class Gxsm(Microscope):
         return self._harvest.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """From GXSM's memory, where lines that were not scanned yet are zero; of channels that a scan was saved of."""
-        endings, taken = self._activity.endings(), self._harvest.scanning
-        if taken is None or not endings:
+        """Return what is new in GXSM's memory; of channels that a scan was saved of."""
+        endings = self._activity.endings()
+        if not endings:
             return ()
-        return new_lines(self._ask, endings, self._harvest.channels, taken, start)
+        done = self._activity.lines_done()
+        found = new_lines(self._ask, endings, self._harvest.channels, self._harvest.scanning, start, done)
+        # of a scan that is stopped meanwhile GXSM says that it is at its last line
+        return found if self._activity.doing().measuring else ()
 
     # --- actions ---
 

@@ -13,9 +13,12 @@ from afspm.microscopes.gxsm.frame import Frame
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
 from afspm.microscopes.gxsm.harvest import Harvest, endings
 from afspm.microscopes.gxsm.link import Asking
+from afspm.microscopes.gxsm.staleness import Rows, is_unfinished, looked_at
 from afspm.microscopes.measurements import SCAN, as_list
 from afspm.model import Region, ScopeState, ScopeStatus
 
+SETTLES_S: Final = 0.3
+"""So long GXSM needs from the end of a scan until it is done with it: a file that is saved before lacks its end."""
 SHOWS_S: Final = 1.0
 """So long what was begun may take to be seen running; 0.3 s were measured."""
 _CHANNELS: Final = 40
@@ -66,12 +69,20 @@ class Activity:
         self._idle_ns = 0  # when it was last seen to measure nothing
         self._shows_until_s = 0.0
         self._endings: list[str] = []
+        self._settles_until_s = 0.0
+        self._ended_ns = 0
+        self._y_before: int | None = None
+        self._y_moved = False
+        self._seen_last: tuple[tuple[int, int], Rows | None] = (0, 0), None
 
     # --- what is begun ---
 
     def start_scan(self) -> None:
         """Scan the frame."""
         self._begin_scan(self._clock.now_ns())
+        self._y_before = int(self._ask.number("y_current"))
+        rows, columns = self._set_frame()[1]
+        self._harvest.before = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
         self._shows_until_s = self._clock.now_s() + self._shows_s
         self._ask.call("startscan")
 
@@ -113,7 +124,7 @@ class Activity:
     def next_change_s(self) -> float | None:
         """When the tip has arrived, what was begun must show, or files must be there."""
         now_s = self._clock.now_s()
-        times = (self._arrives_s, self._shows_until_s, self._harvest.next_s() or 0.0)
+        times = (self._arrives_s, self._shows_until_s, self._settles_until_s, self._harvest.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
     # --- what goes on ---
@@ -126,6 +137,14 @@ class Activity:
         if not self._endings:
             self._endings = [next(iter(endings([Path(path)])), "") for path in self._channels()]
         return self._endings
+
+    def lines_done(self) -> int:
+        """Return how many lines of the running scan are complete; until the first is, GXSM tells of the scan before."""
+        y = int(self._ask.number("y_current"))
+        if self._y_before is None:
+            self._y_before = y
+        self._y_moved = self._y_moved or y != self._y_before
+        return y if self._y_moved else 0
 
     def doing(self) -> Doing:
         """What GXSM says."""
@@ -152,6 +171,8 @@ class Activity:
         what = self._harvest.what
         if what and now_s < self._shows_until_s:
             return ScopeStatus(ScopeState.SCANNING if what == SCAN else ScopeState.SPEC)
+        if what == SCAN and not self._is_settled(now_s):
+            return ScopeStatus(ScopeState.SCANNING)
         if what:
             self._end(what)
         if doing.approaching:
@@ -161,14 +182,29 @@ class Activity:
         return ScopeStatus(ScopeState.INTERRUPTED if self._harvest.broken_off else ScopeState.FREE)
 
     def _measuring(self, doing: Doing) -> ScopeStatus:
-        self._shows_until_s = 0.0
+        self._shows_until_s = self._settles_until_s = 0.0
         if not self._harvest.what and not self._stopping:  # somebody began it at the panel
             if doing.scanning:
                 self._begin_scan(self._idle_ns)
             else:
                 self._begin_curve("VP", self._frame.tip())
+        if self._harvest.what == SCAN and self._harvest.before is None:
+            self._harvest.before = self._last_row()
         curve = doing.probing and (self._harvest.what not in ("", SCAN) or not doing.scanning)
         return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
+
+    def _last_row(self) -> Rows | None:
+        """Return what is in the last row of a scan that was found running; None once it may have been scanned."""
+        rows, columns = self._harvest.scanning[1]
+        last = 0 if self._harvest.upwards else rows - 1
+        found = looked_at(self._ask, len(self._channels()), [last], columns)
+        return found if abs(int(self._ask.number("y_current")) - last) > 1 else None
+
+    def _is_settled(self, now_s: float) -> bool:
+        """Return whether GXSM is done with the scan that has just ended."""
+        if not self._settles_until_s:
+            self._settles_until_s, self._ended_ns = now_s + SETTLES_S, self._clock.now_ns()
+        return now_s >= self._settles_until_s
 
     def _forestalled(self) -> ScopeStatus:
         """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
@@ -184,6 +220,7 @@ class Activity:
 
     def _begin_scan(self, begun_ns: int) -> None:
         self._stopping, self._endings = False, []
+        self._settles_until_s, self._y_before, self._y_moved = 0.0, None, False
         region, shape = self._set_frame()
         taken = {"frame": as_list(region), "shape": list(shape)}
         self._harvest.begin(SCAN, self._folder(), begun_ns, taken)
@@ -199,17 +236,34 @@ class Activity:
         self._harvest.forget()
 
     def _end(self, what: str) -> None:
-        channels = self._channels() if what == SCAN else []
-        self._harvest.end(self._clock.now_ns(), channels)
-        if what == SCAN and self._saves:
+        if what != SCAN:
+            self._harvest.end(self._clock.now_ns())
+            return
+        is_whole = self._is_whole()
+        if is_whole and self._saves:
             try:
                 self._ask.call("autosave")
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
+        # only now: before, GXSM may still tell of the folder of the scan before
+        self._harvest.end(self._ended_ns, self._channels(), self._folder(), is_whole=is_whole)
+
+    def _is_whole(self) -> bool:
+        """Return whether the scan that has ended came to its end, as far as GXSM's memory tells."""
+        before, (_, shape) = self._harvest.before, self._harvest.scanning
+        if before is None and self._seen_last[0] == shape:  # somebody began it, and it was soon over
+            before = self._seen_last[1]
+        columns = shape[1] if before is None else before["columns"]
+        after = looked_at(self._ask, len(self._channels()), (0, shape[0] - 1), columns)
+        self._seen_last = shape, after
+        return before is None or not is_unfinished(before, after)
 
     def _folder(self) -> Path | None:
-        channels = [] if self._scan_dir else self._channels(1)
-        return self._scan_dir or (Path(channels[0]).parent if channels else None)
+        """Return where GXSM saves; before its first scan it does not say, and saves where it was started."""
+        if self._scan_dir:
+            return self._scan_dir
+        channels = self._channels(1)
+        return Path(channels[0]).parent if channels else self._ask.working_folder()
 
     def _channels(self, most: int = _CHANNELS) -> list[str]:
         """Where GXSM would save each channel."""
@@ -218,5 +272,10 @@ class Activity:
             path = self._ask.text("chfname", channel)
             if path.startswith(_NO_CHANNEL):
                 break
-            found.append(path)
+            found.append(self._absolute(path))
         return found
+
+    def _absolute(self, path: str) -> str:
+        """Return a path that does not depend on where GXSM was started, if that can be told."""
+        folder = None if path.startswith("/") else self._ask.working_folder()
+        return path if folder is None else str(folder / path)

@@ -1,17 +1,26 @@
 """Lets afspm call GXSM: run this in GXSM's Python console, and leave it running.
 
 It listens on this computer only, for one client at a time, and passes on calls of the functions named below and no
-others. Set `script-control` to 0 to end it. Nothing but Python itself is needed here.
+others. A client first sends a secret, which is in a file that only this user can read; a line that is neither that nor
+a call ends the connection, so that no page in a browser can command GXSM. Set `script-control` to 0 to end it. Nothing
+but Python itself is needed here.
 """
 
 from __future__ import annotations
 
 import base64
+import hmac
 import json
+import os
+import secrets
 import select
 import socket
+from pathlib import Path
 
-HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)
+HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)  # if it is in use: another number here and in `address`
+SECRET = Path("~/.afspm/gxsm-bridge-secret").expanduser()
+FOLDER = globals().get("FOLDER", str(Path.cwd()))
+WELCOME = "afspm bridge"
 METHODS = {
     *("set", "get", "gets", "list_refnames", "list_actions", "action", "rtquery", "y_current"),
     *("startscan", "stopscan", "autosave", "chfname", "moveto_scan_xy"),
@@ -20,6 +29,7 @@ METHODS = {
 LONGEST = 10_000
 CALLS_A_LOOK = 50  # at script-control
 LOOK_S = 0.5
+STRANGER_LOOKS = 2
 SILENT_LOOKS = 20  # one that says nothing for so long is gone if another comes: its connection may have been lost
 gxsm = globals().get("gxsm")  # the console has it
 
@@ -29,10 +39,35 @@ def packed(value):  # type: ignore[no-untyped-def]
     return {"array": value.dtype.str, "shape": value.shape, "bytes": base64.b64encode(value.tobytes()).decode()}
 
 
-def answer(line: bytes) -> str:
-    """What a call, ["method", arguments…] in JSON, comes to."""
+def secret() -> bytes:
+    """Return the secret, made when this is run for the first time."""
+    SECRET.parent.mkdir(mode=0o700, exist_ok=True)
+    if not SECRET.exists():
+        with os.fdopen(os.open(SECRET, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(secrets.token_hex(32).encode())
+    if os.name == "posix" and SECRET.stat().st_mode & 0o077:
+        raise PermissionError(f"{SECRET} can be read by others: chmod 600 {SECRET}")
+    found = SECRET.read_bytes().strip()
+    if len(found) < 32:
+        raise ValueError(f"{SECRET} holds no secret: remove it")
+    return found
+
+
+def parsed(line: bytes):  # type: ignore[no-untyped-def]
+    """Return a call, ["method", arguments…] in JSON; None if it is none."""
     try:
-        method, *arguments = json.loads(line)
+        call = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    is_call = isinstance(call, list) and call and isinstance(call[0], str)
+    return call if is_call and all(isinstance(one, (str, int, float)) for one in call) else None
+
+
+def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
+    """Return what a call comes to."""
+    try:
+        if method == "getcwd":
+            return json.dumps({"value": FOLDER})
         if method not in METHODS:
             raise NameError(f"{method} is not passed on")
         value = getattr(gxsm, method)(*arguments)
@@ -47,13 +82,13 @@ def wanted() -> bool:
     return gxsm is not None and gxsm.get("script-control") > 0.5
 
 
-def serve(client: socket.socket, listener: socket.socket) -> None:
-    """Answer one client until it goes, or the script is to end."""
-    received, calls, silent = b"", 0, 0
+def serve(client: socket.socket, listener: socket.socket, known: bytes) -> None:
+    """Answer one client until it goes, says what is no call, or the script is to end."""
+    received, calls, silent, welcome = b"", 0, 0, False
     while calls % CALLS_A_LOOK or wanted():
         if not select.select([client], [], [], LOOK_S)[0]:
             calls, silent = 0, silent + 1
-            if silent >= SILENT_LOOKS and select.select([listener], [], [], 0.0)[0]:
+            if silent >= (SILENT_LOOKS if welcome else STRANGER_LOOKS) and select.select([listener], [], [], 0.0)[0]:
                 return
             continue
         silent = 0
@@ -63,12 +98,21 @@ def serve(client: socket.socket, listener: socket.socket) -> None:
             return
         while b"\n" in received:
             line, received = received.split(b"\n", 1)
-            client.sendall(answer(line).encode() + b"\n")
+            call = parsed(line) if welcome else None
+            if call is not None:
+                reply = answer(call[0], call[1:])
+            elif not welcome and hmac.compare_digest(line, known):
+                welcome, reply = True, json.dumps({"value": WELCOME})
+            else:
+                print("afspm bridge: sent a client away that said neither the secret nor a call")  # noqa: T201
+                return
+            client.sendall(reply.encode() + b"\n")
             calls += 1
 
 
 def run() -> None:
     """Listen until script-control is 0."""
+    known = secret()
     if gxsm is not None:
         gxsm.set("script-control", "1")
     with socket.socket() as listener:
@@ -82,7 +126,7 @@ def run() -> None:
                 client.settimeout(10.0)  # one that does not take its answers is let go
                 try:
                     with client:
-                        serve(client, listener)
+                        serve(client, listener, known)
                 except OSError as error:
                     print(f"afspm bridge: the client is gone: {error}")  # noqa: T201
     print("afspm bridge: ended")  # noqa: T201

@@ -13,6 +13,7 @@ from afspm.clock import NS_PER_S
 from afspm.errors import AfspmError
 from afspm.files import read
 from afspm.files.content import FileContent
+from afspm.microscopes.gxsm.staleness import Rows
 from afspm.microscopes.measurements import SCAN, Measurements, as_set, lines_missing, region_of
 from afspm.model import Region, Scan, Spectrum
 
@@ -47,6 +48,7 @@ class Harvest(Measurements):
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: set[int] = set()
         self._whole: dict[Path, FileContent] = {}
+        self.upwards = False
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
         kept.setdefault("program", "")
@@ -54,12 +56,20 @@ class Harvest(Measurements):
         kept.setdefault("behind_ns", 0)  # how much their clock was
 
     @property
-    def scanning(self) -> tuple[Region, tuple[int, int]] | None:
-        """The frame of the running scan, and (rows, columns)."""
-        if self.what != SCAN:
-            return None
+    def scanning(self) -> tuple[Region, tuple[int, int]]:
+        """The frame of the running scan, and (rows, columns). Only while one runs."""
         rows, columns = self._kept["running"]["shape"]
         return region_of(self._kept["running"]), (rows, columns)
+
+    @property
+    def before(self) -> Rows | None:
+        """What was in GXSM's memory before the running scan; None: nobody has looked."""
+        found: Rows | None = self._kept["running"]["before"]
+        return found
+
+    @before.setter
+    def before(self, rows: Rows | None) -> None:
+        self._kept["running"]["before"] = rows
 
     @property
     def channels(self) -> dict[str, list[str]]:
@@ -83,22 +93,29 @@ class Harvest(Measurements):
         """
         newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
         place = None if folder is None else str(folder)
-        self._begins(what, {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, **taken})
+        facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
+        self._begins(what, {**facts, **taken})
 
-    def end(self, now_ns: int, channels: Iterable[str]) -> None:
+    def end(
+        self, now_ns: int, channels: Iterable[str] = (), folder: Path | None = None, *, is_whole: bool = True
+    ) -> None:
         """It has ended.
 
         Args:
             channels: where GXSM says that it saves each channel of a scan.
+            folder: of them, which may be another than at the beginning.
+            is_whole: a scan came to its last row.
         """
         paths = [Path(path) for path in channels]
         until_s = now_ns / NS_PER_S + self._patience_s
         self._ends({"end_ns": now_ns, "until_s": until_s, "channels": sorted(endings(paths))})
         ended = self._kept["ended"]
-        if ended["folder"] is None and paths:  # a scan's: old ones in there are told by when they began
-            ended["folder"] = str(paths[0].parent)
+        if folder is not None and str(folder) != ended["folder"]:  # old scans in there are told by when they began
+            ended["folder"] = str(folder)
             ended["begun_ns"] = ended["begun_ns"] or now_ns
         self._sizes, self._whole, self._before = {}, {}, set()
+        if not is_whole:
+            self._give_up("it was stopped, or never began: GXSM still has the scan before in its first or last row")
 
     def next_s(self) -> float | None:
         """When to look again at the latest."""
@@ -188,6 +205,8 @@ class Harvest(Measurements):
         folder = _folder(ended)
         if folder is None:
             return "GXSM does not say where it saves: did it begin at all, is a channel set?"
+        if not folder.is_absolute():
+            return f"its folder {folder} depends on where GXSM was started: choose another, or set scan_dir, probe_dir"
         if not folder.is_dir():
             return f"its folder {folder} can't be seen from here (scan_dir, probe_dir)"
         if self._before:
@@ -210,6 +229,7 @@ class Harvest(Measurements):
                 self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
             self._kept["absent"] = absent
             self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
+            self.upwards = any(content.upwards for content in files.values())
             for ending, file in endings(files).items():
                 scan, header = files[file].scans[0], files[file].header
                 self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 from afspm.errors import ConfigError
@@ -25,6 +26,9 @@ class Link(Protocol):
             GxsmError: it could not be done; the link is as before.
             ControllerLost: no answer, or none to be believed; the link is of no more use.
         """
+
+    def working_folder(self) -> Path | None:
+        """Return the folder in which GXSM was started; None: that can't be told. Raises as `call`."""
 
     def close(self) -> None:
         """Let go of it."""
@@ -63,12 +67,15 @@ class Address:
         return cls(host=host, port=int(port))
 
 
-def open_link(address: Address, timeout_s: float, monotonic_s: Callable[[], float]) -> Link:
+def open_link(
+    address: Address, timeout_s: float, monotonic_s: Callable[[], float], secret_file: Path | None = None
+) -> Link:
     """A link to GXSM.
 
     Args:
         timeout_s: how long an answer may take, in real time.
         monotonic_s: real time.
+        secret_file: of the bridge, if it is not where the bridge puts it.
 
     Raises:
         ControllerLost: it is not there. ConfigError: not on this computer.
@@ -79,7 +86,7 @@ def open_link(address: Address, timeout_s: float, monotonic_s: Callable[[], floa
         return SharedMemoryLink(address.block, address.process, timeout_s, monotonic_s)
     from afspm.microscopes.gxsm.bridge_client import BridgeLink
 
-    return BridgeLink((address.host, address.port), timeout_s, monotonic_s)
+    return BridgeLink((address.host, address.port), timeout_s, monotonic_s, secret_file)
 
 
 class Asking:
@@ -87,6 +94,7 @@ class Asking:
 
     def __init__(self, link: Link) -> None:
         self.call = link.call
+        self.working_folder = link.working_folder
         self.close = link.close
 
     def number(self, method: str, *arguments: str | int | float) -> float:

@@ -1,4 +1,4 @@
-"""Lines of a running scan, from GXSM's memory: rows from the top, zeros where nothing was scanned yet."""
+"""Lines of a running scan, from GXSM's memory: rows from the top, of the scan before where nothing was scanned yet."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ def new_lines(
     known: Mapping[str, Sequence[str]],
     taken: tuple[Region, tuple[int, int]],
     start: int,
+    done: int,
 ) -> list[ScanLines]:
-    """The lines beyond the first `start` that all channels have, in the order in which they are scanned.
+    """The lines from `start` to `done`, in the order in which they are scanned.
 
     GXSM tells neither names nor units of what it hands out: those of the files before are taken.
 
@@ -28,8 +29,7 @@ def new_lines(
         taken: the frame that is being scanned, and (rows, columns).
     """
     region, shape = taken
-    reached = int(ask.number("y_current"))
-    count = min(reached + 1, shape[0]) - start
+    count = min(done, shape[0]) - start
     if count < 1:
         return []
     images: dict[str, np.ndarray] = {}
@@ -39,18 +39,9 @@ def new_lines(
             # of another shape: somebody has changed the next frame, and this one was found running
             if isinstance(found, np.ndarray) and found.shape == (count, shape[1]):
                 images[ending] = found.astype(np.float64)
-    images = {ending: image for ending, image in images.items() if image.any()}
-    done = min((_whole(image) for image in images.values()), default=0)
     lines = []
-    for ending, image in images.items() if done else ():
+    for ending, image in images.items():
         name, unit = known[ending]
-        rows = image[:done][::-1] * (ANGSTROM_M if unit == "m" else 1.0)
-        lines.append(ScanLines(region, shape, name, unit, shape[0] - start - done, rows))
+        rows = image[::-1] * (ANGSTROM_M if unit == "m" else 1.0)
+        lines.append(ScanLines(region, shape, name, unit, shape[0] - start - count, rows))
     return lines
-
-
-def _whole(image: np.ndarray) -> int:
-    """How many lines are complete: the last that is there may not be."""
-    empty = (image == 0.0).all(axis=1)
-    there = int(np.argmax(empty)) if empty.any() else len(image)
-    return max(there - 1, 0)

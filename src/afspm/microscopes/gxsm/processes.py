@@ -14,6 +14,10 @@ _SIGUSR1_BIT: Final = 1 << 9  # signal 10, counted from 1
 _DEAD: Final = ("Z", "X")
 
 
+class NoProcess(ControllerLost):
+    """No process of that name, or number, is there."""
+
+
 @dataclass(frozen=True)
 class Process:
     """A process, told from a later one with the same number by when it was started."""
@@ -24,6 +28,13 @@ class Process:
     def lives(self) -> bool:
         """Whether it is still there."""
         return _started(self.pid) == self.started
+
+    def working_folder(self) -> Path | None:
+        """Return the folder in which it runs; None: it may not be known."""
+        try:
+            return (_PROC / str(self.pid) / "cwd").readlink()
+        except OSError:
+            return None
 
     def signal(self, number: int) -> None:
         """Send it a signal.
@@ -43,16 +54,17 @@ def find(process: str) -> Process:
     """The process of a name, or of a number, which expects to be signalled.
 
     Raises:
-        ControllerLost: there is none, or several.
+        NoProcess: there is none. ControllerLost: there are several, or it does not expect signals.
     """
     if process.isdigit():
         pids = [int(process)] if _started(int(process)) else []
     else:
         pids = [pid for pid in _all() if _name(pid) == process]
-    if len(pids) != 1:
-        found = f"{len(pids)} processes are" if pids else "no process is"
-        hint = 'one can be chosen by its number: address = "shm:@<number>"' if pids else "is Gxsm4 running?"
-        raise ControllerLost(f"{found} called {process!r}", hint=hint)
+    if not pids:
+        raise NoProcess(f"no process is called {process!r}", hint="is Gxsm4 running?")
+    if len(pids) > 1:
+        hint = 'one can be chosen by its number: address = "shm:@<number>"'
+        raise ControllerLost(f"{len(pids)} processes are called {process!r}", hint=hint)
     started = _started(pids[0])
     if started is None or not _expects_signals(pids[0]):
         raise ControllerLost(f"process {pids[0]} does not serve its shared memory", hint="was GXSM started with -s?")

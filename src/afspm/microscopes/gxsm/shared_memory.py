@@ -6,6 +6,7 @@ lock that GXSM's own tools take, too: two callers at once would get each other's
 
 from __future__ import annotations
 
+import mmap
 import os
 import pickle
 import signal
@@ -21,7 +22,7 @@ from typing import Any, Final
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm import pickles
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
-from afspm.microscopes.gxsm.processes import Process, find
+from afspm.microscopes.gxsm.processes import NoProcess, Process, find
 from afspm.microscopes.microscope import ControllerLost
 
 _FOLDER: Final = Path("/dev/shm")
@@ -57,20 +58,29 @@ class SharedMemoryLink:
         if not sys.platform.startswith("linux"):
             hint = "run bridge.py in GXSM's console, and give its address"
             raise ConfigError("Gxsm4's shared memory is there on Linux alone", where="address", hint=hint)
-        import mmap
-
         self._timeout_s = timeout_s
         self._monotonic_s = monotonic_s
         self._where = f"shm:{block}"
         # what waits for the memory to change has nothing to be woken by but the end
         self._closed = Event()
-        self._process: Process = find(process)
         path = _FOLDER / block
+        try:
+            self._process: Process = find(process)
+        except NoProcess:
+            if path.exists():
+                self._memory = self._mapped(path)
+                with self._alone():
+                    self._withdraw_request()
+                self.close()
+            raise
+        self._memory = self._mapped(path)
+
+    def _mapped(self, path: Path) -> mmap.mmap:
         try:
             with path.open("r+b") as file:
                 if os.fstat(file.fileno()).st_size < _BYTES:
                     raise ControllerLost(f"{path} is not Gxsm4's shared memory: it is too small")
-                self._memory = mmap.mmap(file.fileno(), _BYTES)
+                return mmap.mmap(file.fileno(), _BYTES)
         except OSError as error:
             hint = "is Gxsm4 running on this computer, by the same user, and without -s?"
             raise ControllerLost(f"no shared memory: {error}", where=self._where, hint=hint) from error
@@ -86,6 +96,10 @@ class SharedMemoryLink:
             self.close()
             raise
 
+    def working_folder(self) -> Path | None:
+        """Return the folder in which GXSM was started."""
+        return self._process.working_folder()
+
     def close(self) -> None:
         """Let go of the block."""
         if not self._closed.is_set():
@@ -94,6 +108,7 @@ class SharedMemoryLink:
 
     def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> Any:
         until_s = self._monotonic_s() + self._timeout_s
+        self._see_alive()
         if self._status() == _REQUEST:  # of somebody who has given up waiting: its answer would be taken for ours
             before = self._memory[:_NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
             self._wait(until_s, f"GXSM is busy with an earlier call of {before!r} for more than {self._timeout_s:g} s")
@@ -105,7 +120,11 @@ class SharedMemoryLink:
         self._memory[_CONTENT : _CONTENT + len(content)] = content
         struct.pack_into("<Q", self._memory, _LENGTH, len(content))
         struct.pack_into("<q", self._memory, _STATUS, _REQUEST)
-        self._process.signal(signal.SIGUSR1)
+        try:
+            self._process.signal(signal.SIGUSR1)
+        except ControllerLost:
+            self._withdraw_request()
+            raise
         self._wait(until_s, f"no answer to {method} within {self._timeout_s:g} s")
         return self._answer(method)
 
@@ -126,12 +145,22 @@ class SharedMemoryLink:
         looks = 0
         while self._status() == _REQUEST:
             looks += 1
-            if not self._process.lives():
-                raise ControllerLost("Gxsm4 has ended", where=self._where)
+            self._see_alive()
             if self._monotonic_s() >= until_s:
                 hint = "a call that blocks silences GXSM until it is started anew; started with -s it never answers"
                 raise ControllerLost(complaint, where=self._where, hint=hint)
             self._closed.wait(_SOON_S if looks < _LOOKS_SOON else _LATER_S)
+
+    def _see_alive(self) -> None:
+        """Raise ControllerLost if GXSM has ended. The next one would find, and never answer, what it was asked."""
+        if not self._process.lives():
+            self._withdraw_request()
+            raise ControllerLost("Gxsm4 has ended", where=self._where)
+
+    def _withdraw_request(self) -> None:
+        """Take back what nobody is there to answer. Only under the lock."""
+        if self._status() == _REQUEST:
+            struct.pack_into("<q", self._memory, _STATUS, 0)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

@@ -142,8 +142,9 @@ def opened(options: Options) -> Iterator[Session]:
         support = find_out(bench, sorted(actions), sorted(parameters))
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
         class_ = resolved.classes.get(translator.name)
-        known = isinstance(class_, type) and issubclass(class_, Microscope)
-        excused = class_.excused(support.controller) if known else {}
+        excused: Mapping[str, str] = {}
+        if isinstance(class_, type) and issubclass(class_, Microscope):
+            excused = class_.excused(support.controller)
         yield Session(bench, support, named, simulated, folder, options, excused, complaints)
 
 
