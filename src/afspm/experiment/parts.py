@@ -165,7 +165,7 @@ class _FromPublished:
             self.parts.instead[part.name] = table
             self.parts.became[here] = instead
             what = f"[{part.name}] {published.last(table)} calls code that is written for the published implementation"
-            self.findings.error(what, self.document.place(*here), instead)
+            self.findings.error(what, self.document.place(*here), f"{instead}; {published.GUIDE}")
             return None
         ours = published.class_of(table)
         if ours is None:
@@ -175,7 +175,7 @@ class _FromPublished:
                 if other.class_path == ours.ours:
                     self.parts.became[here] = f"the dashboard, [{other.name}], shows this too"
                     return None
-        self.parts.became[here] = f'class = "{ours.ours}"'
+        self.parts.became[here] = f'class = "{ours.ours}"{ours.why and "; "}{ours.why}'
         settings: dict[str, Any] = {}
         for key, value in part.settings.items():
             if key in ours.settings:

@@ -40,6 +40,7 @@ class Published:
 
     ours: str
     settings: Mapping[str, Setting] = field(default_factory=dict)
+    why: str = ""
 
 
 def wire_of(table: Any) -> Wire | None:
@@ -108,7 +109,9 @@ def class_of(table: Mapping[str, Any]) -> Published | None:
     if not path.startswith(COMPONENTS) and name != "DriftImageTranslator":  # beside the file, in its samples
         return None
     if name in _PICTURES:
-        return Published("ImageMicroscope" if "img_path" in table else "Simulator", _PICTURE)
+        if "img_path" in table:
+            return Published("ImageMicroscope", _EVERY | _PICTURE)
+        return Published("Simulator", _EVERY | _PICTURE, "a picture of yours is shown by ImageMicroscope with `file`")
     return CLASSES.get(name)
 
 

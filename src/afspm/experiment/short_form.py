@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from afspm import units
@@ -58,9 +58,10 @@ def short(experiment: Experiment) -> str:
 def _lines(resolved: Resolved) -> Iterator[tuple[tuple[str, ...], str]]:
     parts = resolved.parts
     components = {part.name for part in parts.components} | parts.instead.keys()
+    addresses = _addresses(resolved)
     for name, raw in resolved.document.data.items():
         if name in parts.variables:
-            yield (name,), _variable(name, parts.variables[name])
+            yield (name,), _variable(name, parts.variables[name], addresses)
         elif name in parts.sections:
             yield (name,), "as it is"
         elif name in components or (name, "class") in parts.became:
@@ -70,10 +71,19 @@ def _lines(resolved: Resolved) -> Iterator[tuple[tuple[str, ...], str]]:
             yield (name,), _intermediary(parts.intermediaries[name])
 
 
-def _variable(name: str, value: Any) -> str:
+def _addresses(resolved: Resolved) -> set[str]:
+    """Every address between processes of the experiment, as the tables of the wiring say it."""
+    found = {slot.address for slot in resolved.net.slots.values()}
+    for table in resolved.parts.intermediaries.values():
+        if wire_of(table) is not None:
+            found |= {url for key, url in table.items() if key.endswith("url") and isinstance(url, str)}
+    return {address for address in found if address is not None}
+
+
+def _variable(name: str, value: Any, addresses: Collection[str]) -> str:
     if name in _VARIABLES:
         return "as it is"
-    if isinstance(value, str) and is_address(value):
+    if isinstance(value, str) and value in addresses:
         return f"{_FILLED_IN}; to be said where they are on several computers"
     return f"{toml(value)} stands where it is named"
 

@@ -341,7 +341,9 @@ def test_every_line_is_told_what_it_has_become(write: Write) -> None:
     assert told["[mediator] update_weight"] == (
         'drift.tracker.class = "paper", drift.tracker.w_update = 0.8, drift.tracker.queue = 7'
     )
-    assert told["[translator] class"] == 'class = "Simulator"'
+    assert told["[translator] class"].startswith('class = "Simulator"; a picture of yours is shown by ImageMicroscope')
+    assert told["pub_url"].startswith("filled in")
+    assert told["xop_url"] == '"tcp://127.0.0.1:5555" stands where it is named'
     assert "dashboard, [ui]" in told["[visualizer] class"]
     assert "ScanList" in told["[experiment] class"]
     assert told["full_id"] == 'the envelope "Scan2d_200.0_Height"'
