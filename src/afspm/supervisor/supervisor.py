@@ -134,6 +134,12 @@ class _Child:
         beating = self.process is not None and self.up and self.beat is not None and not self.beat.closing
         return beating and now_s - self.beat_s >= liveness.silence_s and not self.is_busy(now_s, liveness)
 
+    def ended_too_soon(self, code: int) -> bool:
+        """Whether it has crashed though its exit code says that it is done: a translator never is, and one of version 1
+        that has caught an error of its own ends like that. One that closes on purpose says so by its last beat."""
+        said = self.beat is not None and self.beat.closing
+        return code == ExitCode.DONE and self.task.role is Role.TRANSLATOR and not said
+
     @property
     def over(self) -> bool:
         return self.given_up or self.watch.over
@@ -265,6 +271,10 @@ class Supervisor:
                 self._rescue(child)
             else:
                 self._log.write(child.name, logging.DEBUG, child.last_exit)
+            return
+        if child.ended_too_soon(exited.code):
+            told = f"{how}, before the experiment has ended and without saying that it closes"
+            self._carry_out(child, child.watch.exited(ExitCode.CRASHED, self._clock.monotonic_s(), told))
             return
         self._carry_out(child, child.watch.exited(exited.code, self._clock.monotonic_s(), how))
         if exited.code == ExitCode.ENDED:

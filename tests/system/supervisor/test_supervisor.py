@@ -35,6 +35,17 @@ def test_a_crashed_process_is_started_again(run_tasks: RunTasks, tmp_path: Path)
     assert running.stop().reports[0].starts == 2
 
 
+def test_a_translator_that_ends_without_a_word_has_crashed_whatever_its_exit_code(
+    run_tasks: RunTasks, tmp_path: Path
+) -> None:
+    lives = str(tmp_path / "lives")
+    running = run_tasks(peer("scope", Role.TRANSLATOR, first="quit", lives=lives), peer("other"))
+    running.terminal.wait_for(" scope ", "before the experiment has ended")
+    running.terminal.wait_for(" scope ", "life 2")
+    outcome = running.stop()
+    assert (outcome.why, outcome.reports[0].starts) == (Why.STOPPED, 2)
+
+
 @posix_only
 def test_a_killed_process_is_started_again(run_tasks: RunTasks, tmp_path: Path) -> None:
     running = run_tasks(peer("a", lives=str(tmp_path / "lives")))
