@@ -12,6 +12,7 @@ from afspm.runtime.link import Link
 
 PATIENCE_S = 60.0  # real time that a translator may take to be there again
 NOT_THERE_S = 1.0  # before one that can't be reached is asked again, when nothing is published in between
+STATE_WITHIN_S = 5.0  # before it is said that the microscope has told no state
 SETTLED_WITHIN_S = 2.0  # what was set is published, if it changed anything
 ASK_FREE_AGAIN_S = 5.0  # should the state FREE never reach us
 
@@ -28,6 +29,10 @@ _ASKED_FOR = {
     ControlRequest.SET_CONTROL_MODE: "the mode",
     ControlRequest.END_EXPERIMENT: "ending the experiment",
 }
+_NO_STATE = (
+    "waiting for the microscope, which has told no state yet: is its translator running? One of version 1 that was "
+    "there before the scheduler tells its state at the next change: start it anew, or scan once by hand"
+)
 NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
 
@@ -98,8 +103,7 @@ class Asker:
         if until_s is not None:
             give_up_s = min(give_up_s, until_s)
         told = False
-        # a microscope that has not said a word yet is still starting: a request to it would only come back
-        self._link.wait(lambda: self._link.view.status is not None, give_up_s)
+        self._wait_for_state(give_up_s)
         while True:
             response = self._link.request(kind, subject, request_id=request_id, until_s=until_s)
             if told and response.code in NOT_IN_CONTROL:  # now; whether it was done before is as unknown as it was
@@ -119,6 +123,14 @@ class Asker:
                 self._link.log.warning("the microscope does not answer %s; asking again", kind.name)
                 told = True
             self._wait_for_something(min(give_up_s, clock.monotonic_s() + NOT_THERE_S))
+
+    def _wait_for_state(self, give_up_s: float) -> None:
+        """Wait for the first state: a microscope that has not said a word yet is still starting, and would refuse."""
+        link = self._link
+        link.wait(lambda: link.view.status is not None, min(give_up_s, link.clock.monotonic_s() + STATE_WITHIN_S))
+        if link.view.status is None:
+            link.log.warning("%s", _NO_STATE)
+            link.wait(lambda: link.view.status is not None, give_up_s)
 
     def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
         """After a response that is no success: wait for what stands in the way, or raise Refused.

@@ -73,7 +73,7 @@ class Link:
         self._requests = 0
         self._asked = ""
         self._answer: Response | None = None
-        self._ids_are_echoed: bool | None = None
+        self.version = wire.Version.UNKNOWN
         self._told: dict[str, float] = {}  # ids of what was told and not answered yet, with the monotonic time
         self._untold: dict[str, Told] = {}
         self._caught_up: set[str] = set()
@@ -207,8 +207,9 @@ class Link:
                     return answer
                 if until_s is not None and self.clock.monotonic_s() >= until_s:
                     break
-                # a connection that was lost is the scheduler's restart, not its silence
-                sent += connection == self.connections
+                # a connection that was lost is the scheduler's restart, not its silence; one of version 1 may have
+                # ended over just this request
+                sent += connection == self.connections or self.version is wire.Version.ONE
                 self.log.debug("%s (%s) is asked again", request_name(kind), request.id)
         finally:
             self._asked = ""
@@ -227,7 +228,7 @@ class Link:
 
         While some of it is not answered, only the newest of each kind is kept to be sent later.
         """
-        if not self._ids_are_echoed:
+        if self.version is not wire.Version.OURS:
             return  # its answer could be taken for that to the next request
         told, since_s = Told(*wire.encode(thing)), self.clock.monotonic_s() - self.request_timeout_s
         self._told = {told_id: at_s for told_id, at_s in self._told.items() if at_s > since_s}
@@ -258,7 +259,7 @@ class Link:
 
     def _tries(self, kind: int) -> int:
         # a scheduler of version 1 does not know ids: what it may have done must not be asked for twice
-        if kind == ControlRequest.ACTION and self._ids_are_echoed is False:
+        if kind == ControlRequest.ACTION and self.version is wire.Version.ONE:
             return 1
         return 1 + self._retries
 
@@ -294,7 +295,7 @@ class Link:
         if not self._asked:
             return  # late: it was given up on
         if response.id in ("", self._asked):
-            self._ids_are_echoed = bool(response.id)
+            self.version = wire.version_of(self._asked, response)
             self._answer = response
 
     def _take_packet(self, packet: Packet, source: str) -> None:

@@ -74,6 +74,7 @@ class Scope:
         self._between = between
         self._depth = 0
         self._begun: tuple[int, int] | None = None  # what was done when progress was first told, and when
+        self._flagged: dict[int, int] = {}  # by us, and how many control states had been published before
         self.problems = problems or ProblemNames()
         self._holding = Holding(link, self.problems)
         self._asker = Asker(link, self._holding)
@@ -244,11 +245,22 @@ class Scope:
 
     def flag(self, problem: int | str) -> None:
         """Flag a problem, by name or number: control is taken from whoever has it, until the problem is cleared."""
-        self._tell(ControlRequest.ADD_EXP_PRBLM, self.problems.number(problem))
+        number, states = self.problems.number(problem), self._link.view.count("ControlState")
+        self._tell(ControlRequest.ADD_EXP_PRBLM, number)
+        self._flagged[number] = states
 
     def clear(self, problem: int | str) -> None:
         """Remove the flag of a problem; that it was not flagged is no error."""
-        self._tell(ControlRequest.RMV_EXP_PRBLM, self.problems.number(problem))
+        number = self.problems.number(problem)
+        if self._link.version is wire.Version.OURS or self._is_seen_flagged(number):
+            self._tell(ControlRequest.RMV_EXP_PRBLM, number)
+
+    def _is_seen_flagged(self, problem: int) -> bool:
+        """Whether a problem is known to be flagged: a scheduler of version 1 ends over clearing one that is not."""
+        link, states = self._link, self._flagged.get(problem)
+        if states == link.view.count("ControlState"):  # that we have flagged it ourselves is to be published yet
+            link.wait(lambda: link.view.count("ControlState") != states, link.until(SETTLED_WITHIN_S))
+        return self.is_flagged(problem)
 
     def clear_all(self) -> tuple[str, ...]:
         """Remove the flag of every problem that is flagged, and return their names."""

@@ -377,6 +377,34 @@ def test_a_version_1_scheduler_is_never_asked_twice_for_an_action(lab: Lab, scop
     assert sum(request.subject == "x-pulse" for request in lab.requests) == 1
 
 
+def test_a_version_1_scheduler_is_asked_to_clear_only_what_is_flagged(lab: Lab, scope: Scope) -> None:
+    """It ends over clearing a problem that is not set."""
+    lab.echoes_ids = False
+    scope.clear(TIP)
+    scope.flag(TIP)
+    scope.clear(TIP)
+    scope.clear(TIP)
+    assert lab.count(ControlRequest.RMV_EXP_PRBLM) == 1
+    assert not lab.control.problems
+
+
+def test_a_scheduler_of_ours_is_asked_to_clear_what_may_be_flagged_unheard(lab: Lab, scope: Scope) -> None:
+    scope.flag(Problem.THERMAL_DRIFT)
+    scope.clear(TIP)
+    assert lab.count(ControlRequest.RMV_EXP_PRBLM) == 1
+
+
+def test_that_the_microscope_tells_no_state_is_said_once(
+    lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As a translator of version 1 that was there before the scheduler."""
+    lab._inbox = [one for one in lab._inbox if getattr(getattr(one, "packet", None), "envelope", "") != "ScopeStateMsg"]
+    lab.at(20.0, lambda: lab.publish(ScopeStatus(ScopeState.FREE)))
+    scope.set("tip-bias-voltage", "1 V")
+    assert [record.message for record in caplog.records if "has told no state yet" in record.message]
+    assert lab.clock.passed_s == pytest.approx(20.0, abs=1.0)
+
+
 def test_timeouts_are_told_in_words(lab: Lab, scope: Scope) -> None:
     with pytest.raises(NoResponse, match="not finished in time"):
         scope.scan(REGION, timeout_s=50.0)
