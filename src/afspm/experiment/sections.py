@@ -60,6 +60,8 @@ class Control(Section):
     """Whether the tip is retracted when control is left in a dangerous state, where the microscope can."""
     dangerous: tuple[DangerousState, ...] | None = None
     """Those states; None: what the watchdog takes for dangerous by itself."""
+    spectra_by_variable: bool = False
+    """Whether the translator sends the values of a spectrum variable after variable, as some of version 1 do."""
     roles: Roles = Roles()
 
 

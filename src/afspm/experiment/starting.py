@@ -252,7 +252,7 @@ def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
     """The sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m.
 
     control: lease_s, grace_s, malfunction_after_s, stop_scan_on_problem, stop_scan_on_manual, retract, dangerous,
-        roles (name of the role -> names; None: everyone).
+        spectra_by_variable, roles (name of the role -> names; None: everyone).
     limits: see `limits.to_settings`; cache: see `caching.Caching.to_settings`.
     """
     control = resolved.control
@@ -264,6 +264,7 @@ def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
             "stop_scan_on_problem": control.stop_scan_on_problem,
             "stop_scan_on_manual": control.stop_scan_on_manual,
             "retract": control.retract,
+            "spectra_by_variable": control.spectra_by_variable,
             "dangerous": None if control.dangerous is None else list(control.dangerous),
             "roles": {
                 **{role: None if who is None else list(who) for role, who in control.roles},

@@ -87,6 +87,14 @@ class Cache:
             self._recent.append((source_ns, out.time_ns))
         return out, kept
 
+    def pass_over(self, packet: Packet) -> bool:
+        """Take note of a packet of the translator's that is not published; False: we have had it."""
+        if packet.time_ns is None:
+            return True
+        is_new = packet.time_ns not in self._sources
+        self._saw(packet.time_ns)
+        return is_new
+
     def recent(self) -> list[tuple[int, int]]:
         """(translator's time, ours) of the packets published last, for a restarted scheduler's `remember`."""
         return [*self._first_times.items(), *self._recent]

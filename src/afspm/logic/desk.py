@@ -53,6 +53,7 @@ class Desk:
 
     Attributes:
         effects: what is to be done is appended here; the owner gives a new list for every step.
+        ids_known: whether the translator knows the ids of requests; None: that is not known.
 
     Args:
         control: says who is in control.
@@ -88,7 +89,7 @@ class Desk:
         self._frame = frame
         self._asked_by_us: dict[int, OwnEnd] = {}
         self._reading: list[_Reading] = []
-        self._ids_known: bool | None = None
+        self.ids_known: bool | None = None
         # actions that only we know of: a translator of version 1 would do them again, one of ours not, but for one that
         # was done already it must not be moved
         self._sent: deque[tuple[str, str, int]] = deque(maxlen=_SENT_REMEMBERED)
@@ -171,7 +172,7 @@ class Desk:
             return True
         # A translator that knows ids answers what became of it. Setting something twice does no harm either; an
         # action does, so what nobody knows stays unknown.
-        may_send = self._ids_known or request.kind != _ACTION
+        may_send = self.ids_known or request.kind != _ACTION
         if may_send and (self._control().holder == name or reads(request)):
             return False
         reason = f"{UNKNOWN}it was sent once, and is not sent again"
@@ -381,7 +382,7 @@ class Desk:
         is_to_be_saved = command and self.guard.sending(name, sent, now_ns, used)
         if request.id:
             self._once.note(name, request, Fate.PENDING)
-            if request.kind == _ACTION and (self._frame is not None or not self._ids_known):
+            if request.kind == _ACTION and (self._frame is not None or not self.ids_known):
                 self._sent.append((name, request.id, fingerprint(request)))
                 is_to_be_saved = True
             elif mapped is not None:
@@ -406,7 +407,7 @@ class Desk:
         job, end, response = settled.job, settled.end, settled.response
         if end is End.ANSWERED or end is End.LATE:
             if job.request.id:
-                self._ids_known = response.id == job.request.id
+                self.ids_known = response.id == job.request.id
             response.id = job.request.id
             if response.code == _SUCCESS and (job.command or job.request.kind == _PARAM):
                 self._learn(job, response, now_ns)

@@ -85,7 +85,13 @@ class SubscriberJoined:
 
 @dataclass(frozen=True, slots=True)
 class TranslatorUp:
-    """The translator can be asked."""
+    """The translator can be asked.
+
+    Attributes:
+        knows_ids: one of ours does, one of version 1 does not; None: its answers will tell.
+    """
+
+    knows_ids: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +262,9 @@ class Codec(Protocol):
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         """A ParameterMsg out of a response; None if it is not one."""
+
+    def by_point(self, spectrum: bytes | memoryview) -> bytes:
+        """A Spec1d whose values came variable after variable, with its values point by point. Raises AfspmError."""
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
         """The object of a small packet (ScopeStatus, Feedback, ProcessStates …); None if malformed."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from afspm.logic.events import RequestIn
 from afspm.logic.forwarding import Job
 from afspm.logic.watchdog import Watchdog
-from afspm.model import Response, ScopeState
+from afspm.model import Response, ScopeState, ScopeStatus
 
 SETTLED_WITHIN_S = 2.0
 """Real time for which a microscope that tells nothing of a move is waited for after it."""
@@ -33,6 +33,11 @@ class Mover:
     @property
     def busy(self) -> bool:
         return self._waiting is not None
+
+    def is_passing(self, told: object) -> bool:
+        """Whether a state that is told is that of a move before an action. Nobody is told it: the action, which its
+        client knows to be under way, would seem to be over before it began, and be asked for again."""
+        return self.busy and isinstance(told, ScopeStatus) and told.state in (ScopeState.MOVING, ScopeState.FREE)
 
     def begin(self, event: RequestIn, job: Job) -> None:
         """An action waits for a move that has been sent."""

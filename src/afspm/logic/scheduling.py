@@ -98,7 +98,7 @@ class SchedulerCore:
         self._watchdog = Watchdog(settings.watchdog)
         self._trust = Trust(settings.malfunction_after_s)
         self._frame = frame
-        self._intake = Intake(self._cache, frame)
+        self._intake = Intake(self._cache, frame, codec.by_point if settings.spectra_by_variable else None)
         self._catching_up = CatchingUp(settings.catch_up_s)
         self._chronicle = chronicle = Chronicle(settings.rules.problems)
         self._bulletin = Bulletin(codec, self._cache, chronicle, settings.rules.roles, self._save)
@@ -343,6 +343,8 @@ class SchedulerCore:
 
     def _on_translator_up(self, event: TranslatorUp, now_s: float, now_ns: int) -> None:
         self._desk.settle_all(self._forwarder.connected(), now_s, now_ns)
+        if event.knows_ids is not None:
+            self._desk.ids_known = event.knows_ids
         self._desk.errands.begin(now_s)
         self._desk.read_ahead(now_s)
 
@@ -354,13 +356,20 @@ class SchedulerCore:
             self._arbiter.publish(now_s, now_ns)
 
     def _on_packet(self, event: PacketIn, now_s: float, now_ns: int) -> None:
+        message = event.header.message
+        told = self._codec.decode_packet(message, event.packet.payload) if message in _TELLING else None
+        if self._desk.mover.is_passing(told):
+            if self._cache.pass_over(event.packet):
+                self._on_telling(told, now_s, now_ns)
+            return
         taken = self._intake.take(event.packet, event.header, now_ns)
         if taken is None:
             return
         self._effects.append(taken)
-        message = event.header.message
-        if isinstance(taken, Publish) and message in _TELLING:
-            self._on_telling(self._codec.decode_packet(message, event.packet.payload), now_s, now_ns)
+        if self._desk.ids_known is False and (doubt := self._intake.doubted(event.header)) is not None:
+            self._effects.append(doubt)
+        if isinstance(taken, Publish) and told is not None:
+            self._on_telling(told, now_s, now_ns)
 
     def _on_telling(self, told: object, now_s: float, now_ns: int) -> None:
         if isinstance(told, ScopeStatus):

@@ -110,7 +110,7 @@ class Shell:
             elif source is sockets.link:
                 heard = sockets.link.receive()
                 if isinstance(heard, LinkUp):
-                    self._take(events.TranslatorUp())
+                    self._take(events.TranslatorUp(knows_ids=sockets.link.version is wire.Version.OURS))
                 elif heard is not None:
                     self._take(events.TranslatorReply(heard.number, _response(heard)))
             elif source is sockets.subscriber:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.wire.codec import Buffer, decode, encode, header
+from afspm.wire.codec import Buffer, by_point, decode, encode, header
 from afspm.wire.frames import (
     BEAT,
     CLOSE,
@@ -31,6 +31,7 @@ __all__ = [
     "KILL",
     "Buffer",
     "Version",
+    "by_point",
     "decode",
     "decode_orders",
     "decode_packet",

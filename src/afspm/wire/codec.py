@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from google.protobuf.message import Message
@@ -185,6 +186,18 @@ def _decode_spectrum(payload: Buffer) -> model.Spectrum:
         convert.time_ns(message.timestamp) if message.HasField("timestamp") else None,
         message.filename,
     )
+
+
+def by_point(payload: Buffer) -> bytes:
+    """A Spec1d whose values came variable after variable, with its values point by point, as they should be.
+
+    Raises:
+        WireError: the bytes are no Spec1d.
+    """
+    spectrum = _decode_spectrum(payload)
+    points, variables = spectrum.values.shape
+    values = spectrum.values.reshape(variables, points).T
+    return _encode_spectrum(replace(spectrum, values=values))[1]
 
 
 def _spectrum_header(payload: Buffer) -> model.PacketHeader:

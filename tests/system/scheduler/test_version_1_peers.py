@@ -38,7 +38,7 @@ from afspm.supervisor.reporter import Complaint, Reporter
 from afspm.transport.network import Network
 from afspm.transport.port import Killed
 from afspm.transport.zmq_port import ZmqPort
-from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2
+from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
 CLOCK = ExperimentClock.real()
 SUCCESS, NOT_IN_CONTROL = int(ControlResponse.SUCCESS), int(ControlResponse.NOT_IN_CONTROL)
@@ -225,6 +225,23 @@ def test_their_translator_is_sent_what_version_1_has_until_after_the_end(rig: An
     rig.until(lambda: any(isinstance(incoming, Killed) for incoming in ours.found))
     rig.until(lambda: rig.process.poll() is not None, timeout_s=30.0)
     assert len(server.asked) == 3
+
+
+def test_spectra_that_come_variable_after_variable_are_put_in_order(rig: Any, server: Server) -> None:
+    rig.settings = {"control": {"spectra_by_variable": True}}
+    rig.start()
+    ours = rig.component("Ours")
+    rig.until(lambda: ours.ask(ControlRequest.ACTION_SUPPORT, "start-scan").ok)
+    values = np.array([[0.0, 1e-9], [0.1, 2e-9], [0.2, 3e-9]])
+    told = spectroscopy_pb2.Spec1d(type="IV")
+    told.data.CopyFrom(
+        spectroscopy_pb2.SpecData(
+            num_variables=2, data_per_variable=3, names=["bias", "current"], units=["V", "A"], values=values.T.ravel()
+        )
+    )
+    server.publish(told, CLOCK.now_ns())
+    ((_, payload),) = rig.until(lambda: ours.packets("Spec1d"))
+    np.testing.assert_array_equal(wire.decode("Spec1d", payload).values, values)
 
 
 # --- our components and supervisor beside their scheduler ---

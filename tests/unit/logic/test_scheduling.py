@@ -308,6 +308,17 @@ def test_a_silent_translator_is_told_of_and_its_late_answer_is_kept_for_a_repeti
     assert len(lab.forwarded) == 1
 
 
+def test_spectra_of_a_translator_of_version_1_are_doubted_once(lab: Lab) -> None:
+    spectrum = Packet("Spec1d", lab.codec.encode("a spectrum"), lab.now_ns)
+    for knows_ids, expected in ((True, 0), (False, 1), (False, 0)):
+        lab.step(TranslatorUp(knows_ids))
+        lab.later(experiment_s=1.0)
+        packet = Packet("Spec1d", spectrum.payload, lab.now_ns)
+        done = lab.step(PacketIn(packet, PacketHeader("Spec1d", kind="IV")))
+        assert len([one for one in done if isinstance(one, Log) and "spectra_by_variable" in one.text]) == expected
+        assert [one.payload for one in published(done)] == [spectrum.payload]
+
+
 def test_while_the_translator_is_slow_everybody_else_is_served(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")

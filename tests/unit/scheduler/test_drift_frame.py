@@ -9,6 +9,7 @@ import pytest
 from drift_lab import HERE, NS, SHAPE, START_S, Lab, forecast
 
 from afspm import wire
+from afspm.logic.events import Publish
 from afspm.logic.limits import Limit, Limits
 from afspm.model import (
     ControlRequest,
@@ -277,6 +278,8 @@ def test_before_a_scan_the_microscope_is_moved_after_the_sample_and_then_asked(l
     lab.answer(move)
     assert not lab.forwards()  # it would be refused now
     lab.scope_is(ScopeState.FREE)
+    # who waits for the scan would take that for its end, and ask for the next
+    assert not [one for one in lab.effects if isinstance(one, Publish) and one.packet.envelope == "ScopeStateMsg"]
     go = lab.sent()
     assert (go.request.subject, go.request.id) == (names.START_SCAN, "series/life/go")
     lab.answer(go)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -277,3 +278,13 @@ def test_any_frames_are_understood_or_refused(frames: list[bytes]) -> None:
     for read in (wire.decode_request, wire.decode_response, wire.decode_packet):
         with contextlib.suppress(WireError):
             read(frames)
+
+
+@pytest.mark.parametrize("shape", [(5, 2), (2, 5), (1, 3), (4, 1), (0, 2)])
+def test_a_spectrum_that_came_variable_after_variable_is_put_in_order(shape: tuple[int, int]) -> None:
+    points, variables = shape
+    values = np.arange(float(points * variables)).reshape(shape)
+    names = tuple(f"v{n}" for n in range(variables))
+    right = Spectrum((1e-9, 2e-9), "IV", names, ("V",) * variables, values, 1_700_000_000_000_000_001, "a.dat")
+    scrambled = wire.encode(replace(right, values=values.T.copy().reshape(shape)))[1]
+    assert wire.by_point(scrambled) == wire.encode(right)[1]
