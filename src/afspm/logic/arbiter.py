@@ -161,7 +161,7 @@ class Arbiter:
         """The microscope may have been left to itself. Returns what the watchdog wants because of that."""
         cause, former = change.cause, change.before.holder
         if change.was_cleared_by_others(Problem.DEVICE_MALFUNCTION, TRANSLATOR):
-            self._watchdog.seen_to()
+            self._watchdog.put_right()
         if cause is None or (former is None and cause not in (Cause.MANUAL, Cause.ENDED)):
             return []
         if self._desk.switches_feedback_off():

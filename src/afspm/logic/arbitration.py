@@ -197,11 +197,19 @@ SOLVES_NONE = Condition("problems are flagged and it names none", lambda c, a, r
 SOLVES_UNFLAGGED = Condition(
     "it names a problem that is not flagged", lambda c, a, r: bool(a.number) and a.number not in c.problems
 )
+SOLVES_OTHER_THAN_MALFUNCTION = Condition(
+    "device-malfunction is flagged and it names another problem",
+    lambda c, a, r: a.number not in (0, Problem.DEVICE_MALFUNCTION) and Problem.DEVICE_MALFUNCTION in c.problems,
+)
 UNKNOWN_PROBLEM = Condition("the experiment knows no such problem", lambda c, a, r: a.number not in r.problems.values())
 IS_FLAGGED = Condition("it is flagged already", lambda c, a, r: a.number in c.problems)
 NOT_FLAGGED = Condition("it is not flagged", lambda c, a, r: a.number not in c.problems)
 HOLDER_SOLVES_NOTHING = Condition(
     "one is in control that solves no problem", lambda c, a, r: c.holder is not None and not c.solving
+)
+MALFUNCTION_IS_NEW_TO_HOLDER = Condition(
+    "it is device-malfunction and one is in control",
+    lambda c, a, r: a.number == Problem.DEVICE_MALFUNCTION and c.holder is not None,
 )
 HOLDER_SOLVES_IT = Condition(
     "one is in control to solve it", lambda c, a, r: c.holder is not None and c.solving == a.number
@@ -236,6 +244,13 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         _E.REQUEST_CONTROL,
+        SOLVES_OTHER_THAN_MALFUNCTION,
+        _R.WRONG_EXP_PROBLEM,
+        (),
+        "flagged: {problems}; device-malfunction comes first: until that is cleared, control is only for who solves it",
+    ),
+    Row(
+        _E.REQUEST_CONTROL,
         SOLVES_NONE,
         _R.WRONG_EXP_PROBLEM,
         (),
@@ -264,6 +279,14 @@ TABLE: tuple[Row, ...] = (
         _R.SUCCESS,
         (Do.FLAG, Do.TAKE),
         "from now on only who solves a flagged problem may have control",
+        Cause.PROBLEM,
+    ),
+    Row(
+        _E.FLAG,
+        MALFUNCTION_IS_NEW_TO_HOLDER,
+        _R.SUCCESS,
+        (Do.FLAG, Do.TAKE),
+        "nothing else can be solved with a microscope that can't be used, or a tip that was in danger",
         Cause.PROBLEM,
     ),
     Row(_E.FLAG, OTHERWISE, _R.SUCCESS, (Do.FLAG,), "a solver stays in control while its own problem is flagged"),

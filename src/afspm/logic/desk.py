@@ -293,7 +293,9 @@ class Desk:
     def _stays_out(self, control: Control) -> str | None:
         """Why nobody commands, since the tip was left in danger; None: whoever is in control may."""
         if not (self._watchdog.owes_retract and self.forwarder.up):
-            return None
+            if not self._watchdog.left_to_people or control.sees_to_tip:
+                return None
+            return "the tip was in danger; a person brings it back to the surface, then clears device-malfunction"
         if not self._watchdog.put_off:
             return "the tip is being retracted, as it was left in danger"
         if control.sees_to_tip:

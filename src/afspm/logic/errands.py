@@ -38,6 +38,8 @@ class Errands:
     def ended(self, job: Job, end: End, response: Response, now_s: float) -> Log | None:
         """One of these came to its end. Returns what people are to be told if it is not wanted any more."""
         if end is End.LATE:
+            if response.code == ControlResponse.SUCCESS and job.request.kind == ControlRequest.ACTION:
+                self._watchdog.done_late(str(job.request.subject))
             return None
         if job is self._question:
             if response.code == ControlResponse.ACTION_NOT_SUPPORTED:

@@ -221,6 +221,11 @@ class Watchdog:
         if self.owes_retract and self._sent != self._settings.retract:
             self._forget_retract()
 
+    def put_right(self) -> None:
+        """Somebody says that the tip is well again: it may be at the surface, where it can be endangered anew."""
+        self.seen_to()
+        self.danger.tip_is_away(is_away=False)
+
     def hurry(self, now_s: float) -> None:
         """The experiment ends: nothing is waited for any longer than a moment."""
         self._in_haste = True
@@ -278,6 +283,12 @@ class Watchdog:
         else:
             self._retract_later(now_s)
         return Result.FAILED
+
+    def done_late(self, action: str) -> None:
+        """The translator did what nobody waited for any more: a tip withdrawn late is left to people, too."""
+        if action == self._settings.retract:
+            self._left_to_people = True
+            self.seen_to()
 
     def unsent(self, now_s: float) -> None:
         """What `next_action` said could not be sent: the translator is not connected. Again when it is."""

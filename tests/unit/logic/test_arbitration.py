@@ -26,7 +26,7 @@ from afspm.logic.diagram import edges, kind, mermaid
 from afspm.logic.words import is_routine
 from afspm.model import ControlMode, ControlResponse, ProblemNames
 
-TIP, FEEDBACK, NAMED = 1, 3, 40
+TIP, MALFUNCTION, FEEDBACK, NAMED = 1, 2, 3, 40
 RULES = Rules(problems=ProblemNames({"lost-molecule": NAMED}))
 MANUAL, AUTOMATED = int(ControlMode.MANUAL), int(ControlMode.AUTOMATED)
 
@@ -161,6 +161,15 @@ def test_a_second_problem_leaves_control_with_the_solver_of_the_first() -> None:
     assert after(*story, clear("c", FEEDBACK))[0].holder == "corrector"
     control, _ = after(*story, clear("c", TIP))
     assert (control.holder, set(control.problems)) == (None, {FEEDBACK})
+
+
+def test_a_malfunction_takes_control_from_who_solves_something_else_and_comes_first() -> None:
+    story = [flag("c", TIP), request("corrector", TIP), flag("scheduler", MALFUNCTION)]
+    control, row = after(*story)
+    assert (control.holder, row.cause) == (None, Cause.PROBLEM)
+    assert after(*story, request("corrector", TIP))[1].response is ControlResponse.WRONG_EXP_PROBLEM
+    assert after(*story, request("mender", MALFUNCTION))[0].holder == "mender"
+    assert after(*story, clear("person", MALFUNCTION), request("corrector", TIP))[0].holder == "corrector"
 
 
 def test_manual_disengages_the_holder_and_lets_nobody_in_until_automated() -> None:

@@ -33,15 +33,50 @@ def said(lab: Lab, level: str) -> list[str]:
     return [effect.text for effect in lab.effects if isinstance(effect, Log) and effect.level == level]
 
 
-def test_who_solves_a_problem_gets_a_microscope_that_is_safe() -> None:
+def test_who_solves_another_problem_does_not_measure_with_a_tip_that_was_withdrawn() -> None:
     lab = feedback_off()
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
     assert sent(lab) == ["x-retract"]
     lab.take_control("corrector", Problem.TIP_SHAPE_CHANGED)
     assert lab.says("corrector", ACTION, "start-scan") is ControlResponse.NOT_FREE
     lab.answer(lab.forwarded[-1])
-    lab.ask("corrector", ACTION, "start-scan", "corrector/a/2")
-    assert sent(lab) == ["x-retract", "start-scan"]
+    assert lab.says("corrector", ACTION, "start-scan") is ControlResponse.NOT_FREE
+    lab.step(Tick())
+    assert lab.core.control.holder is None
+    tip = int(Problem.TIP_SHAPE_CHANGED)
+    assert lab.says("corrector", ControlRequest.REQUEST_CTRL, tip) is ControlResponse.WRONG_EXP_PROBLEM
+    assert sent(lab) == ["x-retract"]
+
+
+def test_a_tip_brought_back_by_hand_is_withdrawn_again_when_it_is_endangered_again() -> None:
+    lab = in_control(SchedulerSettings())
+    lab.scope_is(ScopeState.COARSE_MOTOR)
+    lab.publish("ZCtrlParameters", Feedback(on=True))
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    lab.answer(lab.forwarded[-1])
+    lab.step(Tick())
+    lab.scope_is(ScopeState.FREE)
+    for problem in (Problem.DEVICE_MALFUNCTION, Problem.TIP_SHAPE_CHANGED):
+        lab.ask("person", ControlRequest.RMV_EXP_PRBLM, int(problem))
+    lab.take_control("experiment")
+    lab.publish("ZCtrlParameters", OFF)
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    assert sent(lab) == ["x-retract", "x-retract"]
+
+
+def test_a_tip_that_is_withdrawn_when_nobody_waits_for_it_any_more_is_left_to_people() -> None:
+    lab = feedback_off(SchedulerSettings(request_timeout_s=1.0, patience_s=1.0))
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    overdue = lab.forwarded[-1]
+    lab.ask("person", ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL))
+    lab.later(1.5)
+    lab.step(Tick())
+    lab.later(1.5)
+    lab.step(Tick())
+    lab.ask("person", ControlRequest.SET_CONTROL_MODE, int(ControlMode.AUTOMATED))
+    lab.answer(overdue)
+    lab.step(Tick())
+    assert Problem.DEVICE_MALFUNCTION in lab.core.control.problems
 
 
 @pytest.mark.parametrize("word", ["false", "0", "0.0", "Off", "no"])
