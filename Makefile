@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test test-samples test-ui test-translators check bench bench-drift soak chaos simulate power-cut clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-translators check bench bench-drift soak chaos simulate power-cut clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -23,13 +23,18 @@ demo-drift: $(SETUP)
 ## all tests: more at a time than there are cores, since many of them wait. Tests and modules stay compiled
 TESTS_AT_A_TIME ?= 8
 COLLECTED := .venv/.tests-collected
+MUTANTS := tests/deterministic/test_mutants.py
 SAMPLES := tests/system/experiment/test_samples_run.py
 test: $(COLLECTED)
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME) --ignore $(SAMPLES)
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME) --ignore $(SAMPLES) --ignore $(MUTANTS)
 
 # asserts are rewritten once, not by each of the processes that run tests; what can't be collected is told by them
 $(COLLECTED): $(SETUP) $(shell find tests -name '*.py')
 	@ls -d tests/*/ | PYTHONDONTWRITEBYTECODE= xargs -P 2 -n 1 $(BIN)/pytest --collect-only -qq > /dev/null 2>&1; touch $@
+
+## decisions broken on purpose, each of which the simulated nights have to find; prints how many they found
+mutants: $(SETUP)
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 $(MUTANTS)
 
 ## every sample in experiments/, shortened, to its end
 test-samples: $(SETUP)

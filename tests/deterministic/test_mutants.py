@@ -15,12 +15,16 @@ from afspm.logic.arbiter import Arbiter
 from afspm.logic.arbitration import Do, Event, Row
 from afspm.logic.cache import Cache
 from afspm.logic.chronicle import Chronicle
+from afspm.logic.danger import Danger
 from afspm.logic.desk import Desk
+from afspm.logic.ending import Ending
 from afspm.logic.forwarding import Forwarder
+from afspm.logic.guard import Guard
 from afspm.logic.lease import Lease
 from afspm.logic.once import OnceTable
 from afspm.logic.scheduling import SchedulerCore
 from afspm.logic.sessions import Hearing, Sessions
+from afspm.logic.watchdog import Watchdog
 from afspm.model import JournalEntries
 from afspm.testing.deterministic.invariants import InvariantViolated
 from afspm.testing.deterministic.night import Fault, Night, Plan, plan
@@ -28,7 +32,7 @@ from afspm.testing.deterministic.night import Fault, Night, Plan, plan
 NIGHTS = 16
 Patch = pytest.MonkeyPatch
 
-_FEW = ("experiment", "classifier", "corrector", "feedback")
+_FEW = ("experiment", "classifier", "corrector", "feedback", "person")
 
 
 def _bad_night(seed: int) -> Plan:
@@ -36,8 +40,11 @@ def _bad_night(seed: int) -> Plan:
     away = [Fault("outage", "experiment", (seed % 10) / 10.0, 60.0)]
     drawn = plan(seed, hours=4.0)
     if seed % 4 == 3:  # few others and slow, so that control stays where it is
-        drawn = replace(drawn, hours=6.0, speed=60.0, cast=(*_FEW, "greedy"), lease_s=900.0)
+        drawn = replace(drawn, hours=8.0, speed=60.0, cast=(*_FEW, "greedy"), lease_s=900.0)
         away += [Fault("outage", holder, ((seed + place) % 10) / 10.0, 60.0) for place, holder in enumerate(_FEW)]
+    if seed % 4 == 1:  # one whose tip is often in danger, at a microscope that can't always withdraw it
+        cast = (*_FEW, "careless", "stranger")
+        drawn = replace(drawn, cast=cast, ends=True, retracts=seed != 13, speed=60.0)
     there = ("scheduler", "translator", *drawn.cast)
     faults = (*(fault for fault in drawn.faults if fault.whom in there), *away)
     slow = replace(drawn, speed=drawn.speed / 2.0)  # in more real time more connections come and go
@@ -219,7 +226,47 @@ def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
     patch.setattr(Cache, "restore", restore)
 
 
+def the_tip_is_never_retracted(patch: Patch) -> None:
+    patch.setattr(Watchdog, "_want_retract", lambda self: None)
+
+
+def a_danger_that_can_not_be_helped_is_never_told(patch: Patch) -> None:
+    patch.setattr(Danger, "untold", lambda self: None)
+
+
+def nobody_is_called_to_a_tip_that_was_retracted(patch: Patch) -> None:
+    patch.setattr(Watchdog, "left_to_people", False)
+
+
+def other_problems_are_solved_with_a_tip_that_is_away(patch: Patch) -> None:
+    _rows(patch, Event.REQUEST_CONTROL, _without(arbitration.SOLVES_OTHER_THAN_MALFUNCTION))
+
+
+def the_end_does_not_wait_for_the_tip(patch: Patch) -> None:
+    patch.setattr(Ending, "is_due", lambda self, now_s: self.by_s is not None)
+
+
+def the_end_never_comes(patch: Patch) -> None:
+    patch.setattr(Ending, "is_due", lambda self, now_s: False)
+
+
+def limits_are_not_checked(patch: Patch) -> None:
+    patch.setattr(Guard, "check", lambda self, *args: None)
+
+
+def everybody_has_every_role(patch: Patch) -> None:
+    patch.setattr(arbitration, "may", lambda role, who: True)
+
+
 MUTANTS = [
+    the_tip_is_never_retracted,
+    a_danger_that_can_not_be_helped_is_never_told,
+    nobody_is_called_to_a_tip_that_was_retracted,
+    other_problems_are_solved_with_a_tip_that_is_away,
+    the_end_does_not_wait_for_the_tip,
+    the_end_never_comes,
+    limits_are_not_checked,
+    everybody_has_every_role,
     answers_are_written_down_once_more,
     every_fiftieth_answer_is_not_written_down,
     changes_of_control_are_not_written_down,

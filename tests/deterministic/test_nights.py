@@ -15,7 +15,7 @@ from afspm.testing.deterministic.night import CAST, FAULTS, Fault, Night, Plan, 
 
 _ALIVE = ProcessCondition.ALIVE
 # together a few thousand experiment hours; more: python -m afspm.testing.longrun
-CHUNKS = [range(first, first + 15) for first in range(0, 135, 15)]
+CHUNKS = [range(first, first + 15) for first in range(0, 150, 15)]
 
 
 @pytest.mark.parametrize("seeds", CHUNKS, ids=lambda seeds: f"seeds-{seeds.start}-{seeds.stop - 1}")
@@ -26,6 +26,17 @@ def test_every_invariant_holds_in_many_nights(seeds: range) -> None:
 
 def test_the_nights_are_a_few_thousand_hours() -> None:
     assert sum(plan(seed).hours_to_the_end for seeds in CHUNKS for seed in seeds) >= 2000.0
+
+
+def test_the_nights_reach_what_protects_the_tip() -> None:
+    """Else the invariants on it hold of nothing."""
+    cast = ("experiment", "classifier", "corrector", "feedback", "person", "careless", "stranger")
+    nights = [Night(Plan(seed, cast=cast, retracts=seed < 3, ends=seed % 2 == 0)) for seed in range(4)]
+    for night in nights:
+        night.run()
+    assert all(night.invariants.tip.dangers for night in nights)
+    assert all(night.invariants.tip.retractions for night in nights[:3])
+    assert [night.scheduler.core.control.ended for night in nights] == [True, False, True, False]
 
 
 def test_a_night_replays_exactly() -> None:

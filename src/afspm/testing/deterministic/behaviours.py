@@ -56,7 +56,8 @@ class Experiment(Client):
         """One scan, to its end or to the loss of control."""
         yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
         count = len(self.scans)
-        set_ = yield from self.ask(ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "1.0", "V"))
+        bias_v = "1.0" if self.timeline.chance(0.95) else "50.0"  # the latter is refused
+        set_ = yield from self.ask(ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE, bias_v, "V"))
         if set_.code != _OK:
             yield from self.sleep(self.some(20.0))
             return
@@ -146,6 +147,34 @@ class Crasher(Experiment):
             self.kill(0 if self.timeline.chance(0.3) else -11)
 
 
+class Careless(Experiment):
+    """Switches the feedback off to measure something, and now and then is not there any more to switch it on.
+
+    Attributes:
+        gone_s: how long (real) its computer is away then.
+    """
+
+    gone_s = 30.0
+
+    def be_away(self, for_s: float) -> None:
+        self.banned = True
+        self.timeline.after(for_s, setattr, self, "banned", False)  # noqa: FBT003
+        self.kill(-11)
+
+    def behave(self) -> Doing:
+        while True:
+            if not (yield from self.regain(Problem.NONE)):
+                continue
+            yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+            yield from self.ask(ControlRequest.PARAM, Parameter(names.FEEDBACK_ON, "off"))
+            yield from self.sleep(self.some(300.0))
+            if self.timeline.chance(0.4):
+                self.be_away(self.gone_s)
+            yield from self.ask(ControlRequest.PARAM, Parameter(names.FEEDBACK_ON, "on"))
+            yield from self.ask(ControlRequest.RELEASE_CTRL)
+            yield from self.sleep(self.some(600.0))
+
+
 class Impostor(Client):
     """Calls itself like another component, and commands, unasked, again and again."""
 
@@ -178,17 +207,54 @@ class Operator(Client):
                 return
 
 
-class Dawn(Operator):
-    """The person who comes in the morning and leaves everything to the components."""
+class Person(Operator):
+    """Sees to a tip that was in danger, at the controller's panel, and says that it is well again.
+
+    Attributes:
+        approach: brings the tip back to the surface.
+        comes_s: how long (experiment) it takes to come.
+        for_people: the problems that only people clear.
+    """
+
+    for_people = (Problem.DEVICE_MALFUNCTION, Problem.THERMAL_DRIFT)
+    approach: Callable[[], None]
+    comes_s = 1200.0
 
     def behave(self) -> Doing:
         while True:
+            yield from self.until(self._is_called)
+            yield from self.sleep(self.some(self.comes_s))
+            yield from self.see_to_tip()
+
+    def see_to_tip(self) -> Doing:
+        for problem in set(self.for_people).intersection(self.control.problems):
+            self.approach()
+            yield from self.ask(ControlRequest.RMV_EXP_PRBLM, int(problem))
+
+    def _is_called(self) -> bool:
+        return not set(self.for_people).isdisjoint(self.control.problems)
+
+
+class Dawn(Person):
+    """The person who comes in the morning, sees to the tip, and leaves everything to the components or ends it.
+
+    Attributes:
+        ends: the experiment is to end.
+    """
+
+    ends = False
+
+    def behave(self) -> Doing:
+        while self.ends:
+            yield from self.ask(ControlRequest.END_EXPERIMENT)
+        while True:
             yield from self.automated()
-            yield from self.until(lambda: self.control.mode is ControlMode.MANUAL)
+            yield from self.see_to_tip()
+            yield from self.until(lambda: self.control.mode is ControlMode.MANUAL or self._is_called())
 
 
 class Stranger(Client):
-    """Asks for whatever comes to its mind, except to end the experiment."""
+    """Asks for whatever comes to its mind, be it allowed or not."""
 
     requests: tuple[tuple[int, Any], ...] = (
         (ControlRequest.RELEASE_CTRL, None),
@@ -197,6 +263,8 @@ class Stranger(Client):
         (ControlRequest.ADD_EXP_PRBLM, 77),
         (ControlRequest.REQUEST_CTRL, 77),
         (ControlRequest.SET_CONTROL_MODE, 0),
+        (ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL)),
+        (ControlRequest.END_EXPERIMENT, None),
         (ControlRequest.ACTION, names.PULSE),
         (ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE)),
         (ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "nan", "V")),

@@ -107,6 +107,13 @@ class Client(Process):
         if self._feed is not None:
             self._feed.cut()
 
+    def fall_silent(self, for_s: float) -> None:
+        """Its connections lose what is sent before they break."""
+        self.cut_s = self.timeline.monotonic_s() + for_s
+        for connection in (self._line, self._feed):
+            if connection is not None:
+                connection.fall_silent(for_s)
+
     def behave(self) -> Doing:
         """What it does, from its start on."""
         raise NotImplementedError

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from afspm.errors import AfspmError
 from afspm.logic.arbitration import Control
@@ -21,6 +20,7 @@ from afspm.logic.events import (
     SaveState,
     SubscriberJoined,
 )
+from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -37,6 +37,7 @@ from afspm.testing.deterministic.codec import TableCodec
 from afspm.testing.deterministic.microscope import FakeMicroscope
 from afspm.testing.deterministic.scheduler import SchedulerHost
 from afspm.testing.deterministic.timeline import Timeline
+from afspm.testing.deterministic.tip_safety import TipSafety
 from afspm.testing.deterministic.written import Written
 
 _SUCCESS, _NO_RESPONSE = int(ControlResponse.SUCCESS), int(ControlResponse.NO_RESPONSE)
@@ -55,22 +56,15 @@ class InvariantViolated(AfspmError):
     code = "invariant"
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """The times that the settings of the scheduler allow, in real or experiment seconds as there."""
-
-    grace_s: float
-    restart_grace_s: float
-    lease_s: float | None
-    answer_s: float
-
-
 class Invariants:
     """Watches the scheduler, the microscope and all components of one simulated night."""
 
-    def __init__(self, timeline: Timeline, bounds: Bounds, microscope: FakeMicroscope, codec: TableCodec) -> None:
+    def __init__(
+        self, timeline: Timeline, settings: SchedulerSettings, microscope: FakeMicroscope, codec: TableCodec
+    ) -> None:
         self._timeline = timeline
-        self._bounds = bounds
+        self._settings = settings
+        self.tip = TipSafety(timeline, settings, microscope, self._must)
         self._microscope = microscope
         self._scheduler_since_s = 0.0
         self.components: list[Client] = []
@@ -85,7 +79,7 @@ class Invariants:
         self._published: dict[int, tuple[str, bytes | memoryview]] = {}
         self._by_source: dict[int, int] = {}
         self._actions: dict[tuple[str, str], str] = {}
-        self.times_are_certain = True
+        self.times_are_certain = self.memory_is_certain = True
         self._open: dict[tuple[str, str], tuple[float, int]] = {}
         self._definite: dict[tuple[str, str], int] = {}
         self._life = 0
@@ -94,6 +88,11 @@ class Invariants:
         self._saved_state: dict[str, bytes] | None = None
         self.written = Written(timeline, codec, self._must, NAME_TAKEN)
         microscope.on_executed = self.executed
+
+    def forgets(self) -> None:
+        """The scheduler may be killed before it could write down what it knows."""
+        self.times_are_certain = self.memory_is_certain = False
+        self.written.is_certain = self.tip.memory_is_certain = False
 
     # --- the scheduler ---
 
@@ -121,6 +120,7 @@ class Invariants:
         self._scheduler_since_s = host.since_s
         self._note(event, effects)
         self.written.stepped(host, event, effects)
+        self.tip.stepped(host, event, effects)
         if isinstance(event, RequestIn):
             self._asked(event, effects)
             if event.name == self._holder and event.request.kind in _FORWARDED:
@@ -150,7 +150,7 @@ class Invariants:
             )
         else:
             self._must(control.solving == 0, f"{control.holder} solves {control.solving}, which is not flagged")
-        if self._holder is not None and control.holder not in (None, self._holder):
+        if self.memory_is_certain and self._holder is not None and control.holder not in (None, self._holder):
             self.fail(f"control went from {self._holder} to {control.holder} without being given up")
         if control.holder != self._holder:
             self._held_since_s = self._timeline.monotonic_s()
@@ -170,7 +170,7 @@ class Invariants:
         holder = host.core.control.holder
         if holder is None or (absent_since_s := self._absent_since_s.get(holder, 0.0)) is None:
             return
-        allowed_s = max(self._bounds.grace_s, self._bounds.restart_grace_s) + _SLACK_S
+        allowed_s = max(self._settings.grace_s, self._settings.restart_grace_s) + _SLACK_S
         since_s = max(absent_since_s, self._held_since_s, host.since_s)
         self._must(
             now_s - since_s <= allowed_s, f"{holder} has been dead for {now_s - since_s:.1f} s and is in control"
@@ -178,7 +178,7 @@ class Invariants:
 
     def _lease(self, host: SchedulerHost) -> None:
         """Nobody keeps control by doing nothing."""
-        lease_s = self._bounds.lease_s
+        lease_s = self._settings.lease_s
         if lease_s is None:
             return
         now_ns = self._timeline.now_ns()
@@ -195,8 +195,8 @@ class Invariants:
         self._must(idle_s <= allowed_s, f"{self._holder} has done nothing for {idle_s:.0f} s, its lease is {lease_s} s")
 
     def _saved(self, host: SchedulerHost) -> None:
-        """What is told is on the disk already."""
-        if host.core.control is self._saved_control and host.disk.state is self._saved_state:
+        """What is told is on the disk already, unless that is full, which is said."""
+        if host.disk.stale or (host.core.control is self._saved_control and host.disk.state is self._saved_state):
             return
         self._saved_control, self._saved_state = host.core.control, host.disk.state
         control = host.core.control.to_dict()
@@ -229,14 +229,15 @@ class Invariants:
             if action in _COUNTED and response.code in (_SUCCESS, _NOT_FREE):
                 times = self._microscope.executed[response.id, int(ControlRequest.ACTION)]
                 told = "done" if response.code == _SUCCESS else "refused"
-                self._must(times == (response.code == _SUCCESS), f"{key} was {told}, it was executed {times} times")
+                as_told = times == (response.code == _SUCCESS) or not self.memory_is_certain
+                self._must(as_told, f"{key} was {told}, it was executed {times} times")
 
     def _answered_in_time(self, host: SchedulerHost) -> None:
         now_s = self._timeline.monotonic_s()
         while self._open:
             key, (since_s, _) = next(iter(self._open.items()))
             since_s = max(since_s, host.since_s)
-            if now_s - since_s <= self._bounds.answer_s + _SLACK_S:
+            if now_s - since_s <= self._settings.request_timeout_s + _SLACK_S:
                 return
             self.fail(f"{key} was accepted {now_s - since_s:.1f} s ago and has no answer")
 
@@ -253,9 +254,10 @@ class Invariants:
 
     def executed(self, request: Request) -> None:
         """The microscope carries out a command."""
+        self.tip.executed(request)
         if request.id:
             count = self._microscope.executed[request.id, request.kind]
-            once = count == 1 or request.kind != ControlRequest.ACTION
+            once = count == 1 or request.kind != ControlRequest.ACTION or not self.memory_is_certain
             self._must(once, f"{request.id} ({request.subject}) was executed {count} times")
 
     # --- packets ---
@@ -274,7 +276,8 @@ class Invariants:
             return  # again after a kill, at its first time
         self._published[packet.time_ns] = (packet.envelope, packet.payload)
         self._must(
-            packet.time_ns > self._last_ns, f"{packet.envelope} is published at {packet.time_ns}, after {self._last_ns}"
+            packet.time_ns > self._last_ns or not self.memory_is_certain,
+            f"{packet.envelope} is published at {packet.time_ns}, after {self._last_ns}",
         )
         self._last_ns = packet.time_ns
 

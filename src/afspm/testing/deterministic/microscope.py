@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from afspm.model import (
     ControlRequest,
     ControlResponse,
+    Feedback,
     Packet,
     Parameter,
     Request,
@@ -49,6 +50,7 @@ class Habits:
         scan_s: how long (experiment) a scan takes.
         tip_breaks: the chance that a scan damages the tip.
         clock_error_s: of its clock; may go back.
+        retracts: whether it has an action that withdraws the tip.
     """
 
     knows_ids: bool = True
@@ -59,6 +61,7 @@ class Habits:
     scan_s: float = 300.0
     tip_breaks: float = 0.1
     clock_error_s: float = 0.0
+    retracts: bool = True
 
 
 class FakeMicroscope(Process):
@@ -67,6 +70,7 @@ class FakeMicroscope(Process):
     Attributes:
         executed: how often each command (client's id, or scheduler's number, and kind) was carried out, in all lives.
         scans_done: in all lives.
+        feedback_on, tip_is_away: the controller's, which outlives its translator.
     """
 
     def __init__(self, timeline: Timeline, codec: TableCodec, habits: Habits) -> None:
@@ -76,6 +80,7 @@ class FakeMicroscope(Process):
         self.on_executed: Callable[[Request], None] = lambda request: None
         self.scans_done = 0
         self.tip_is_good = True
+        self.feedback_on, self.tip_is_away = True, False
         self._codec = codec
         self._ledger: dict[str, Response] = {}  # on its disk
         self._newest_ns = 0
@@ -98,6 +103,7 @@ class FakeMicroscope(Process):
 
     def _tell_what_is_in_force(self) -> None:
         self._publish("ScanParameters2d", "the region")
+        self._publish("ZCtrlParameters", Feedback(on=self.feedback_on))
         self._publish_state(self.state)
 
     # --- as a server ---
@@ -141,15 +147,23 @@ class FakeMicroscope(Process):
         code = self._carry_out(request)
         payload = b""
         if request.kind == ControlRequest.PARAM and code is ControlResponse.SUCCESS:
-            payload = self._codec.encode(Parameter("tip-bias-voltage", "1.0", "V"))
+            assert isinstance(request.subject, Parameter)
+            payload = self._codec.encode(self._in_force(request.subject))
         response = Response(int(code), payload, "" if code is ControlResponse.SUCCESS else f"it is {self.state.name}")
         if self.habits.knows_ids and request.id:
             response.id = request.id
             self._ledger[request.id] = response
         return response
 
+    def _in_force(self, asked: Parameter) -> Parameter:
+        if asked.name == names.FEEDBACK_ON:
+            return Parameter(asked.name, "on" if self.feedback_on else "off")
+        return Parameter(asked.name, asked.value or "1.0", "V")
+
     def _carry_out(self, request: Request) -> ControlResponse:
         subject = request.subject
+        if subject == names.RETRACT and not self.habits.retracts:
+            return ControlResponse.ACTION_NOT_SUPPORTED
         if request.kind == ControlRequest.ACTION_SUPPORT:
             return ControlResponse.SUCCESS
         if request.kind == ControlRequest.PARAM and isinstance(subject, Parameter) and subject.value is None:
@@ -167,9 +181,28 @@ class FakeMicroscope(Process):
             self._begin(_STARTS[subject])
         elif subject == names.PULSE:
             self.tip_is_good = self.tip_is_good or self.timeline.chance(0.7)
+        elif subject == names.RETRACT:
+            self.tip_is_away = True
+        elif isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON:
+            self._switch_feedback(on=subject.value == "on")
         return ControlResponse.SUCCESS
 
     # --- the microscope ---
+
+    @property
+    def endangers_tip(self) -> bool:
+        """True while the tip is at the surface and no feedback holds it."""
+        return not self.feedback_on and not self.tip_is_away
+
+    def approach(self) -> None:
+        """Bring the tip back to the surface, as a person does at the controller's panel."""
+        self.tip_is_away = False
+        self._switch_feedback(on=True)
+
+    def _switch_feedback(self, *, on: bool) -> None:
+        self.feedback_on = on
+        if self.alive:
+            self._publish("ZCtrlParameters", Feedback(on=on))
 
     def _begin(self, state: ScopeState) -> None:
         self._publish_state(state)

@@ -49,8 +49,11 @@ class Pipe:
         self._receiver = receiver
         self._last_s = 0.0
         self.open = True
+        self.silent = False
 
     def send(self, do: Deliver, *args: Any) -> None:
+        if self.silent:
+            return
         timeline = self._timeline
         # mostly quick, now and then slow
         time_s = timeline.monotonic_s() + self._weather.delay_s * timeline.random.random() ** 4
@@ -138,6 +141,11 @@ class ControlLine:
         self._client.take(self._client.line_down, self)
         self._retry()
 
+    def fall_silent(self, for_s: float) -> None:
+        """Lose all that is sent, in one direction or both; neither end hears of that before `for_s` have passed."""
+        _fall_silent(self._timeline, (self._there, self._back))
+        self._timeline.after(for_s, self.cut)
+
     def close(self) -> None:
         """The client is gone for good, or dead."""
         self._closed = True
@@ -217,6 +225,11 @@ class Feed:
         if not self._closed:
             self._timeline.after(self._weather.reconnect_s * (0.5 + self._timeline.random.random()), self._try)
 
+    def fall_silent(self, for_s: float) -> None:
+        """See `ControlLine`."""
+        _fall_silent(self._timeline, (self._there, self._back))
+        self._timeline.after(for_s, self.cut)
+
     def close(self) -> None:
         self._closed = True
         self.cut()
@@ -240,6 +253,12 @@ class Feed:
             back.send(self._listener.received, self, packet)
         back.send(self._listener.caught_up, self)
         self._joined = True
+
+
+def _fall_silent(timeline: Timeline, pipes: Sequence[Pipe | None]) -> None:
+    for pipe in timeline.random.choice((pipes, pipes[:1], pipes[1:])):
+        if pipe is not None:
+            pipe.silent = True
 
 
 def _copy(request: Request) -> Request:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from afspm.logic.arbitration import Cause
+from afspm.logic.arbitration import Cause, Roles, Rules
+from afspm.logic.danger import FEEDBACK_OFF
 from afspm.logic.envelopes import Envelopes
 from afspm.logic.limits import Limit, Limits
 from afspm.logic.liveness import LivenessPolicy
@@ -18,10 +19,11 @@ from afspm.model import Packet, PacketHeader, ScopeState, names
 from afspm.testing.deterministic import behaviours
 from afspm.testing.deterministic.client import Client
 from afspm.testing.deterministic.codec import TableCodec
-from afspm.testing.deterministic.invariants import Bounds, Invariants, InvariantViolated
+from afspm.testing.deterministic.invariants import Invariants, InvariantViolated
 from afspm.testing.deterministic.keeper import Keeper
 from afspm.testing.deterministic.microscope import FakeMicroscope, FakeScan, Habits
 from afspm.testing.deterministic.network import Weather
+from afspm.testing.deterministic.process import Process
 from afspm.testing.deterministic.scheduler import SchedulerHost
 from afspm.testing.deterministic.timeline import GoesInCircles, Timeline
 
@@ -29,6 +31,7 @@ _CALM = 0.15
 """The last part of a night, in which nothing bad happens any more and all must come right again."""
 
 _SETTLED_S = 5.0
+_ENDED_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Fault:
     for_s: float = 0.0
 
 
-FAULTS = ("kill", "outage", "freeze", "cut", "storm", "hang", "clock", "busy")
+FAULTS = ("kill", "outage", "freeze", "cut", "silence", "storm", "hang", "clock", "busy", "full disk", "slow disk")
 CAST = {
     "experiment": behaviours.Experiment,
     "classifier": behaviours.Classifier,
@@ -53,9 +56,15 @@ CAST = {
     "stranger": behaviours.Stranger,
     "listener": behaviours.Listener,
     "old": behaviours.Version1Experiment,
+    "careless": behaviours.Careless,
+    "person": behaviours.Person,
 }
-_TROUBLE = ("greedy", "crasher", "impostor", "operator", "stranger")
-_ALWAYS = ("experiment", "classifier", "corrector", "feedback")
+_TROUBLE = ("greedy", "crasher", "impostor", "operator", "stranger", "careless")
+_ALWAYS = ("experiment", "classifier", "corrector", "feedback", "person")
+_PEOPLE = ("operator", "person", "dawn")
+_JOURNAL_S = 0.1
+_LONGEST_SILENCE_S = 8.0
+"""Heartbeats of the network find a half-open connection by then."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +83,8 @@ class Plan:
         doubles: the chance that a request arrives twice.
         hangs, loses_answer: see `Habits`.
         dies_in_step: see `SchedulerHost`.
+        retracts: see `Habits`.
+        ends: the experiment is ended in the morning, whatever goes on; if not, all must come right.
     """
 
     seed: int
@@ -89,6 +100,8 @@ class Plan:
     loses_answer: float = 0.0
     dies_in_step: float = 0.0
     stop_when: tuple[Cause, ...] = (Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE)
+    retracts: bool = True
+    ends: bool = False
 
     @property
     def length_s(self) -> float:
@@ -102,8 +115,8 @@ class Plan:
 
     @property
     def hours_to_the_end(self) -> float:
-        """Experiment time with the calm."""
-        return (self.length_s + self.calm_s) * self.speed / 3600.0
+        """Experiment time with what comes after."""
+        return (self.length_s + (_ENDED_S if self.ends else self.calm_s)) * self.speed / 3600.0
 
 
 def plan(seed: int, hours: float = 8.0) -> Plan:
@@ -137,6 +150,8 @@ def plan(seed: int, hours: float = 8.0) -> Plan:
         loses_answer=chance.choice((0.0, 0.005)) if bad else 0.0,
         dies_in_step=chance.choice((0.0, 0.0005)) if bad else 0.0,
         stop_when=chance.choice(((), (Cause.PROBLEM,), tuple(Cause))),
+        retracts=chance.random() < 0.8,
+        ends=chance.random() < 0.25,
     )
 
 
@@ -159,16 +174,10 @@ class Night:
         self.timeline = timeline = Timeline(plan.seed, plan.speed)
         self.weather = Weather(doubles=plan.doubles)
         self.codec = self.make_codec()
-        habits = Habits(plan.ids_known, hangs=plan.hangs, loses_answer=plan.loses_answer)
+        habits = Habits(plan.ids_known, hangs=plan.hangs, loses_answer=plan.loses_answer, retracts=plan.retracts)
         self.microscope = self.make_microscope(habits)
         self.settings = _settings(plan)
-        bounds = Bounds(
-            self.settings.grace_s,
-            self.settings.restart_grace_s,
-            self.settings.lease_s,
-            self.settings.request_timeout_s,
-        )
-        self.invariants = Invariants(timeline, bounds, self.microscope, self.codec)
+        self.invariants = Invariants(timeline, self.settings, self.microscope, self.codec)
         self.scheduler = SchedulerHost(
             timeline,
             self.weather,
@@ -182,6 +191,9 @@ class Night:
         self.scheduler.translator = (self.microscope, self.microscope)
         self.components = self._components()
         self.dawn = behaviours.Dawn(timeline, self.weather, self.codec, self.scheduler, "dawn")
+        for person in (self.dawn, *self.components.values()):
+            if isinstance(person, behaviours.Person):
+                person.approach = self.microscope.approach
         self.keeper = Keeper(timeline, [self.microscope, self.scheduler, *self.components.values()], _policy())
         self.teller = self._teller()
 
@@ -246,14 +258,20 @@ class Night:
         for fault in plan.faults:
             timeline.after(fault.when * length_s, self._befall, fault)
         timeline.run_until(length_s)
-        self._calm()
+        if plan.ends:
+            return self._end()
+        self._calm(_TROUBLE)
         timeline.run_until(length_s + 100.0)
         before = self.microscope.scans_done
         timeline.run_until(length_s + calm_s)
         done = self.microscope.scans_done
         self._come_right(done - before)
-        hours = timeline.monotonic_s() * plan.speed / 3600.0
-        return Outcome(hours, done, done - before, self.invariants.checks, self.keeper.given_up)
+        return self._outcome(done - before)
+
+    def _outcome(self, scans_in_calm: int) -> Outcome:
+        hours = self.timeline.monotonic_s() * self.plan.speed / 3600.0
+        scans = self.microscope.scans_done
+        return Outcome(hours, scans, scans_in_calm, self.invariants.checks, self.keeper.given_up)
 
     # --- what befalls them ---
 
@@ -272,16 +290,37 @@ class Night:
             process.later(fault.for_s, setattr, process, "step_age_s", 0.0)
         elif fault.what == "cut" and isinstance(process, Client):
             process.cut()
+        elif fault.what == "silence":
+            self._silence(process, min(fault.for_s, _LONGEST_SILENCE_S))
         elif fault.what in ("cut", "storm"):
             self._storm(fault.for_s)
         elif fault.what == "hang":
             self._hang(fault.for_s)
+        elif fault.what == "full disk":
+            self._full_disk(fault.for_s)
+        elif fault.what == "slow disk":
+            self.scheduler.journal_s = fault.for_s
+            self.timeline.after(fault.for_s, setattr, self.scheduler, "journal_s", _JOURNAL_S)
         elif fault.what == "clock":
             self.invariants.times_are_certain = False
             self.microscope.habits.clock_error_s = self.timeline.random.choice((-100.0, 0.0, 100.0, 10_000.0))
 
+    def _silence(self, process: Process, for_s: float) -> None:
+        """Half-open connections: those of a component, or those between scheduler and translator."""
+        if isinstance(process, Client):
+            process.fall_silent(for_s)
+            return
+        self.invariants.tip.disturbed(for_s + _SETTLED_S)
+        self.scheduler.fall_silent(for_s)
+
+    def _full_disk(self, for_s: float) -> None:
+        self.scheduler.disk.full = True
+        self.invariants.forgets()
+        self.timeline.after(for_s, setattr, self.scheduler.disk, "full", False)  # noqa: FBT003
+
     def _storm(self, for_s: float) -> None:
         """Messages take long, and all connections break at its beginning."""
+        self.invariants.tip.disturbed(for_s + _SETTLED_S)
         self.weather.delay_s = 3.0
         self.invariants.times_are_certain = False  # a restarted scheduler can't wait for what comes that late
         for client in self.components.values():
@@ -292,16 +331,17 @@ class Night:
     def _hang(self, for_s: float) -> None:
         """The translator takes ages."""
         habits = self.microscope.habits
+        self.invariants.tip.disturbed(for_s + _SETTLED_S)
         habits.service_s = for_s
         self.timeline.after(for_s, setattr, habits, "service_s", 0.02)
 
-    def _calm(self) -> None:
+    def _calm(self, leaving: Collection[str] = ()) -> None:
         habits = self.microscope.habits
         self.weather.doubles = habits.hangs = habits.loses_answer = 0.0
         self.scheduler.dies_in_step = 0.0
         self.dawn.start()
         for name, component in self.components.items():
-            component.banned = name in _TROUBLE
+            component.banned = name in leaving
             if component.banned:
                 component.kill()
         self.scheduler.banned = self.microscope.banned = False
@@ -317,16 +357,35 @@ class Night:
             if client.alive and self.scheduler.alive and settled:
                 self.invariants.has_all(client, cached)
 
+    def _end(self) -> Outcome:
+        """End the experiment in the middle of whatever goes on: all leave, and nobody stays behind."""
+        self.dawn.ends = True
+        self._calm()
+        self.timeline.run_until(self.plan.length_s + _ENDED_S)
+        if self.scheduler.alive or not self.scheduler.core.control.ended:
+            self.invariants.fail("the experiment does not end")
+        return self._outcome(0)
+
 
 def _settings(plan: Plan) -> SchedulerSettings:
     limits = Limits(
         {names.TIP_BIAS_VOLTAGE: Limit(low=-10.0, high=10.0, source="night")},
+        {names.PULSE: Limit(only=("corrector", "feedback"), source="night")},
     )
     watchdog = WatchdogSettings(
-        stop_when=frozenset(plan.stop_when), dangerous=frozenset({ScopeState.SPEC.name}), retract=names.RETRACT
+        stop_when=frozenset(plan.stop_when),
+        dangerous=frozenset({ScopeState.SPEC.name, FEEDBACK_OFF}),
+        retract=names.RETRACT,
+        again_s=5.0,
+        longest_s=20.0,
     )
     return SchedulerSettings(
-        lease_s=plan.lease_s, watchdog=watchdog, limits=limits, envelopes=Envelopes(), cache_bytes=20_000
+        rules=Rules(Roles(end=("dawn",), mode=_PEOPLE, clear=_PEOPLE)),
+        lease_s=plan.lease_s,
+        watchdog=watchdog,
+        limits=limits,
+        envelopes=Envelopes(),
+        cache_bytes=20_000,
     )
 
 

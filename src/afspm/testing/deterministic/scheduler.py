@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import marshal
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -31,7 +32,7 @@ from afspm.logic.events import (
     TranslatorUp,
 )
 from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
-from afspm.model import Packet, PacketHeader, Request, Response
+from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, PacketHeader, Request, Response
 from afspm.testing.deterministic.network import ControlLine, ControlServer, Feed, Publisher, Weather
 from afspm.testing.deterministic.process import Alarm, Process
 from afspm.testing.deterministic.timeline import Timeline
@@ -48,17 +49,29 @@ class Disk:
     Attributes:
         state: the parts of what was last saved, by value; written ten times as fast as JSON, since there are a thousand
             saves to a restart.
+        full: nothing can be written.
+        stale: something could not be written, and nothing has been since.
     """
 
     state: dict[str, bytes] | None = None
     journal: tuple[Entry, ...] = ()
+    full: bool = False
+    stale: bool = False
 
     def save(self, state: dict[str, Any]) -> None:
+        self.stale = self.full
+        if not self.full:
+            self._save(state)
+
+    def _save(self, state: dict[str, Any]) -> None:
         self.state = {name: marshal.dumps(part, _BY_VALUE) for name, part in state.items()}
 
-    def keep(self, packet: Packet) -> None:
-        """A packet of the scheduler's own, before it is published."""
-        self.journal = (*self.journal, (packet, None))
+    def keep(self, packet: Packet, source_ns: int | None) -> None:
+        """A packet, before it is published."""
+        if self.full:
+            self.stale = True
+            return
+        self.journal = (*self.journal, (packet, source_ns))
 
     def saved(self) -> dict[str, Any] | None:
         """As it comes out of a JSON file; None if nothing was saved."""
@@ -78,6 +91,10 @@ class Observer(Protocol):
 
 class SchedulerHost(Process):
     """See `afspm.scheduler.shell`, which does the same with sockets.
+
+    Attributes:
+        writes_ahead: a packet is on the disk before it is published, as in the shell. Without that, the translator's
+            newest packets are forgotten by a kill, which is harder on the scheduler.
 
     Args:
         journal_s: how long after a packet the journal is written.
@@ -107,7 +124,8 @@ class SchedulerHost(Process):
         self._weather = weather
         self._header = header
         self._observer = observer
-        self._journal_s = journal_s
+        self.journal_s = journal_s
+        self.writes_ahead = False
         self._connections = 0
         self._forget()
 
@@ -133,6 +151,12 @@ class SchedulerHost(Process):
         self._link = ControlLine(self.timeline, self._weather, self, server, "scheduler", doubling=False)
         self._from_translator = Feed(self.timeline, self._weather, self, publisher)
         self._carry_out(None, self.core.start(self.timeline.monotonic_s(), self.timeline.now_ns()))
+
+    def fall_silent(self, for_s: float) -> None:
+        """The connections to the translator lose what is sent before they break."""
+        if self.alive:
+            self._link.fall_silent(for_s)
+            self._from_translator.fall_silent(for_s)
 
     def ended(self) -> None:
         self._link.close()
@@ -163,8 +187,10 @@ class SchedulerHost(Process):
 
     def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
         connection = self._lines.get(line)
-        if connection is not None:
-            self._step(RequestIn(connection, line.name, request))
+        if self._has_ended and request.kind != TELL_REQUEST:
+            line.answer(Response(int(ControlResponse.FAILURE), b"", HAS_ENDED, request.id))
+        elif connection is not None:
+            self._step(RequestIn(connection, line.name, request), late=True)
 
     # --- as a client of the translator ---
 
@@ -198,6 +224,8 @@ class SchedulerHost(Process):
         self._step(SubscriberJoined(feed, tuple(prefixes), since_ns))
         if feed not in self._feeds:
             self._feeds.append(feed)
+        if self._has_ended:
+            self.later(0.0, feed.kill_signal)  # after the replay: it is over
         return self._replay
 
     def left(self, feed: Feed) -> None:
@@ -210,7 +238,14 @@ class SchedulerHost(Process):
         """What the core wants done that nobody asked for."""
         self._carry_out(None, effects)
 
-    def _step(self, event: Input) -> None:
+    @property
+    def _has_ended(self) -> bool:
+        """The experiment has, and only supervisors are still heard."""
+        return self.core.leave_at_s < math.inf
+
+    def _step(self, event: Input, *, late: bool = False) -> None:
+        if self._has_ended and not (late or isinstance(event, SubscriberJoined)):
+            return
         self._carry_out(event, self.core.step(event, self.timeline.monotonic_s(), self.timeline.now_ns()))
 
     def _carry_out(self, event: Input | None, effects: Sequence[Effect]) -> None:
@@ -234,13 +269,13 @@ class SchedulerHost(Process):
         elif isinstance(effect, Forward):
             self._link.ask(effect.request, effect.number)
         elif isinstance(effect, Publish):
-            if effect.cached and effect.source_ns is None:
-                self.disk.keep(effect.packet)
+            if effect.cached and (effect.source_ns is None or self.writes_ahead):
+                self.disk.keep(effect.packet, effect.source_ns)
             for feed in list(self._feeds):
                 feed.publish(effect.packet)
             if effect.cached and not self._journal_due:
                 self._journal_due = True
-                self.later(self._journal_s * self.timeline.random.random(), self._write_journal)
+                self.later(self.journal_s * self.timeline.random.random(), self._write_journal)
         elif isinstance(effect, Replay):
             self._replay = effect.packets
         elif isinstance(effect, SaveState):
@@ -248,16 +283,18 @@ class SchedulerHost(Process):
         elif isinstance(effect, Kill):
             for feed in self._feeds:
                 feed.kill_signal()
-            self.later(0.0, self.kill, 80)
 
     def _write_journal(self) -> None:
         self._journal_due = False
-        self.disk.journal = tuple(self.core.cached())
+        if not self.disk.full:
+            self.disk.journal = tuple(self.core.cached())
 
     def _plan_tick(self) -> None:
         self._ticking.set(self._wait_s())
 
     def _wait_s(self) -> float | None:
+        if self._has_ended:
+            return max(0.0, self.core.leave_at_s - self.timeline.monotonic_s())
         deadline_s, deadline_ns = self.core.deadline_s(), self.core.deadline_ns()
         waits = [] if deadline_s is None else [deadline_s - self.timeline.monotonic_s()]
         if deadline_ns is not None:
@@ -265,4 +302,7 @@ class SchedulerHost(Process):
         return min(waits, default=None)
 
     def _tick(self) -> None:
-        self._step(Tick())
+        if self.timeline.monotonic_s() >= self.core.leave_at_s:
+            self.kill(80)
+        else:
+            self._step(Tick())
