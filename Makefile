@@ -67,9 +67,10 @@ bench: $(SETUP)
 bench-drift: $(SETUP)
 	@$(BIN)/python -m benchmarks.drift $(if $(QUICK),--quick)
 
-## a million malformed requests and packets
+## malformed requests and packets: make soak MESSAGES=20000
+MESSAGES ?= 1000000
 soak: $(SETUP)
-	@$(BIN)/python -m benchmarks.soak
+	@$(BIN)/python -m benchmarks.soak $(MESSAGES)
 
 ## nights with tip repair in which processes are killed and frozen: make chaos NIGHTS=100 CHAOS_SEED=1
 NIGHTS ?= 20
