@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import sqlite3
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -236,12 +234,6 @@ def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
 def write_synced(path: Path, data: bytes) -> None:
     """Write a file so that it is there as a whole or not at all, after a power cut too. Raises OSError."""
     whole.replace(path, [data], aside=path.with_name(path.name + PART))
-    if sys.platform != "win32":  # there is no folder to wait for there
-        descriptor = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def _stamp(time_ns: int) -> str:

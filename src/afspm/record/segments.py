@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from afspm.model import Packet
+from afspm.record.disk import SYNCER
 
 SUFFIX = ".packets"
 _HEAD = struct.Struct("<4sQIIqqBQ")
@@ -62,13 +63,14 @@ class Segment:
 
     def __init__(self, path: Path, spare: Path | None = None) -> None:
         if spare is not None:
-            spare.rename(path)
+            spare.replace(path)
         self.path = path
         self.size = 0
         self.newest_ns = 0
         self._whole = 0
         self._number = number_of(path)
         self._file = path.open("xb" if spare is None else "r+b", buffering=0)
+        SYNCER.folder_soon(path.parent)
 
     def append(self, written: Written) -> None:
         """Write a packet behind the others. Raises OSError: the disk is full …; it is to be taken back then."""
@@ -80,6 +82,7 @@ class Segment:
             self._write(head)
             self._write(payload)
         self._whole = self.size
+        SYNCER.soon(self._file.fileno())
         self.newest_ns = max(self.newest_ns, written.packet.time_ns or 0)
 
     def take_back(self) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -31,6 +30,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record import circumstances, journal
+from afspm.record.disk import sync_file, sync_folder
 from afspm.record.gathering import Gathering, Taken
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured import MeasuredFiles, insert_packet
@@ -132,7 +132,8 @@ class Store:
     def sync(self) -> None:
         """Wait until what is recorded is on the disk, so that it outlives a power cut. Raises OSError."""
         with suppress(FileNotFoundError), (self._folder / f"{journal.JOURNAL_FILE}-wal").open("rb+") as file:
-            os.fsync(file.fileno())
+            sync_file(file.fileno())
+        sync_folder(self._folder)
 
     def settle(self) -> None:
         """Nothing more is to come: the journal becomes one file that can be read without making others beside it."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from afspm.errors import FileError
+from afspm.record.disk import SYNCER, sync_file, sync_folder
 
 T = TypeVar("T")
 
@@ -53,8 +54,10 @@ def replace(
             file.writelines(parts)
             if synced:
                 file.flush()
-                os.fsync(file.fileno())
+                sync_file(file.fileno())
         _rename(aside, path)
+        if synced:
+            sync_folder(path.parent)
     except OSError:
         with contextlib.suppress(OSError):
             aside.unlink()
@@ -96,10 +99,10 @@ class ToldOnce:
 
     @contextlib.contextmanager
     def trying(self) -> Iterator[None]:
-        """Around what writes, and raises FileError."""
+        """Around what writes, and raises FileError or OSError."""
         try:
             yield
-        except FileError as error:
+        except (FileError, OSError) as error:
             if not self._is_failing:
                 self._log.critical("%s: %s", self._loss, error)
             self._is_failing = True
@@ -118,9 +121,9 @@ class Generations:
     """A small text that is saved too often to wait for the disk each time, and is to outlive a power cut all the same.
 
     Each generation is a line that is appended: that takes ten microseconds, twenty times less than to replace the file,
-    which is done when it has grown to `longest` bytes. What was saved last outlives a kill of any process. A power cut
-    may leave the file damaged, or empty; then there is the generation before, some `period_s` older, which a thread has
-    made sure of.
+    which is done when it has grown to `longest` bytes. What was saved last outlives a kill of any process, and a
+    moment later a power cut (see `disk`). One that comes while the file is begun anew may leave it empty; then there is
+    the generation before, some `period_s` older, which a thread has made sure of.
     """
 
     def __init__(self, path: Path, period_s: float = PERIOD_S, longest: int = LONGEST) -> None:
@@ -162,6 +165,8 @@ class Generations:
             self._let_go()
             replace(self.path, [line], synced=False)
             self._file, self._size = io.FileIO(self.path, "ab"), len(line)
+            SYNCER.soon(self._file.fileno())
+            SYNCER.folder_soon(self.path.parent)
             return
         written = 0
         try:
@@ -175,6 +180,7 @@ class Generations:
             self._let_go()  # a drive that was away is not found again by a file that was open on it
             raise
         self._size += written
+        SYNCER.soon(self._file.fileno())
 
     def _let_go(self) -> None:
         if self._file is not None:

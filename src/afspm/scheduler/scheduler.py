@@ -117,7 +117,6 @@ class Scheduler:
         finally:
             sockets.close()
             shell.close()
-            state.close()
         return ExitCode.ENDED if shell.ended else ExitCode.ORPHAN
 
     def _settings(self, context: SchedulerContext) -> SchedulerSettings:

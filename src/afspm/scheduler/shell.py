@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 from collections.abc import Hashable, Iterable
@@ -11,6 +12,8 @@ from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
 from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, Response
+from afspm.record.disk import DEADLINE_S, SYNCER, Disk
+from afspm.record.whole import ToldOnce
 from afspm.transport.fair_queue import FairQueue
 from afspm.transport.hold_back import STATE, HoldBack
 from afspm.transport.polling import milliseconds
@@ -31,6 +34,7 @@ _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
 """How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
 them do."""
+_CLOSED_WITHIN_S = 5.0
 _MOST_A_TURN = 20
 """Requests that are handled before everything else is looked at again: the component in control waits no longer."""
 _TOO_MANY = "too many requests of this client wait to be answered: ask again once others are"
@@ -73,6 +77,9 @@ class Shell:
         self._clock = clock
         self._state = state
         self._journal = journal
+        self._disk = Disk()
+        self._told = ToldOnce("what is told now would be lost in a crash", log)
+        self._problems: frozenset[str] = frozenset()
         self._complaints = complaints
         self._log = log
         self._requests = FairQueue()
@@ -176,10 +183,13 @@ class Shell:
             self._take(events.Stopped())
 
     def close(self) -> None:
-        """Write down what is cached, unless the experiment is over."""
+        """Write down what is cached, unless the experiment is over, and make sure of what was saved."""
         if not self.ended:
             self._journal.follow(self._core.cached())
-        self._journal.close(ended=self.ended)
+        with contextlib.suppress(OSError):
+            self._disk.run(lambda: self._journal.close(ended=self.ended))
+            self._disk.run(self._state.close)
+        self._disk.close(_CLOSED_WITHIN_S)
 
     # --- what comes in ---
 
@@ -264,6 +274,8 @@ class Shell:
 
     def _carry_out(self, effects: Iterable[events.Effect]) -> None:
         sockets = self._sockets
+        effects = [*effects]
+        self._write_down(effects)
         for effect in effects:
             match effect:
                 case events.Reply():
@@ -271,13 +283,9 @@ class Shell:
                 case events.Forward():
                     sockets.link.send(effect.number, wire.encode_request(effect.request))
                 case events.Publish():
-                    if not self.ended:  # what is said afterwards is of no use to a run that is resumed
-                        self._journal.note(effect.packet, effect.source_ns, cached=effect.cached)
                     self._publish(effect.packet)
                 case events.Replay():
                     self._replay = effect.packets
-                case events.SaveState():
-                    self._state.save(effect.state)
                 case events.Log():
                     self._log.log(_LEVELS.get(effect.level, logging.INFO), "%s", effect.text)
                 case events.Kill():
@@ -303,6 +311,38 @@ class Shell:
     def _release(self, now_s: float = math.inf) -> None:
         for packet in self._hold_back.release(now_s):
             self._sockets.publisher.publish(packet)
+
+    def _write_down(self, effects: list[events.Effect]) -> None:
+        """Write what must outlive a crash before anybody is told; problems that are flagged outlive a power cut, too.
+
+        A disk that is full or hangs must not end the experiment, nor hold it up: that is said, and it goes on.
+        """
+        notes: list[events.Publish] = []
+        saved: events.SaveState | None = None
+        for effect in effects:
+            if isinstance(effect, events.SaveState):
+                saved = effect
+            elif isinstance(effect, events.Publish) and not self.ended:
+                notes.append(effect)
+            elif isinstance(effect, events.Kill):
+                break  # what is said afterwards is of no use to a run that is resumed
+        if saved is None and not notes:
+            return
+
+        def write() -> None:
+            if saved is not None:
+                self._state.save(saved.state)
+            for note in notes:
+                self._journal.note(note.packet, note.source_ns, cached=note.cached)
+
+        with self._told.trying():
+            self._disk.run(write, sum(len(note.packet.payload) for note in notes))
+            if saved is not None and self._has_new_problems(saved.state):
+                SYNCER.now(DEADLINE_S)
+
+    def _has_new_problems(self, state: dict[str, Any]) -> bool:
+        before, self._problems = self._problems, frozenset(state["control"]["problems"])
+        return not self._problems <= before
 
 
 def _id_of(asked: PeerAsked) -> str:

@@ -16,11 +16,14 @@ from typing import TYPE_CHECKING, Literal, TextIO
 from afspm.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.logic.telling import LOGGED_AS
 from afspm.model.words import day_and_time, time_of_day
+from afspm.record.disk import DEADLINE_S
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+CLOCK = ExperimentClock.real()
 MOST_UNSHOWN = 10_000
+_HANGS = "the disk has not answered: log.txt is written once it does, and the run goes on"
 SHOWN_WITHIN_S = 2.0
 COLOURS = ("cyan", "green", "magenta", "blue", "bright_cyan", "bright_green", "bright_magenta", "bright_blue")
 LEVEL_STYLES = {logging.WARNING: "yellow", logging.ERROR: "bold red", logging.CRITICAL: "bold red"}
@@ -58,7 +61,8 @@ class RunLog:
     """Writes every line to `file`, and those of `level` and above to the terminal; `names` are made equally wide.
 
     A terminal that has gone away is no reason to end a measurement, nor is one that takes nothing more to stop it, as
-    somebody has marked text in it or pressed Ctrl-S: what can't be written there is still in the file.
+    somebody has marked text in it or pressed Ctrl-S: what can't be written there is still in the file. Nor is a disk
+    that is full, or hangs: each of the two has a thread of its own.
     """
 
     def __init__(
@@ -70,23 +74,28 @@ class RunLog:
         level: int = logging.INFO,
         names: Iterable[str] = (),
     ) -> None:
-        self._file = file.open("a", encoding="utf-8", errors="replace")
+        self._file = _Shown(*_into(file))
         self._clock = clock
         self._wall = ExperimentClock.real()
         self._level = level
         terminal = terminal or sys.stdout
         self.listener: Callable[[str, int, str], None] = lambda name, level, text: None
         """Called with each line, as `write` is."""
+        self._hangs = False
         self._shown = _Shown(_coloured(terminal) if terminal.isatty() else _plain(terminal))
         self._widest = max(map(len, (LOGGED_AS, *names)))
 
     def write(self, name: str, level: int, text: str) -> None:
         """One line of the process `name`; `level` is that of `logging`."""
         wall_ns = self._wall.now_ns()
-        with contextlib.suppress(OSError, ValueError):  # a full disk must not end the run from here
-            stamp = f"{day_and_time(wall_ns)}.{wall_ns // 1_000_000 % 1000:03d}{self._experiment_time()}"
-            self._file.write(f"{stamp} {logging.getLevelName(level):8} {name:{self._widest}} {text}\n")
-            self._file.flush()
+        stamp = f"{day_and_time(wall_ns)}.{wall_ns // 1_000_000 % 1000:03d}{self._experiment_time()}"
+        self._file.add(stamp, f"{name:{self._widest}}", level, text)
+        self._tell(name, level, text, wall_ns)
+        hung, self._hangs = self._hangs, self._file.hangs(DEADLINE_S)
+        if self._hangs and not hung:
+            self._tell(LOGGED_AS, logging.CRITICAL, _HANGS, wall_ns)
+
+    def _tell(self, name: str, level: int, text: str, wall_ns: int) -> None:
         self.listener(name, level, text)
         if level >= self._level:
             self._shown.add(time_of_day(wall_ns), f"{name:{self._widest}}", level, text)
@@ -99,10 +108,9 @@ class RunLog:
         return f" [{day_and_time(now_ns)}]"
 
     def close(self) -> None:
-        """Show what is left to show, and close the file."""
+        """Write and show what is left, if file and terminal take it."""
         self._shown.close()
-        with contextlib.suppress(OSError):  # what waits for room on a full disk is lost with us
-            self._file.close()
+        self._file.close()
 
 
 def colour_of(name: str) -> str:
@@ -114,13 +122,15 @@ Show = Callable[[str, str, int, str], None]
 
 
 class _Shown:
-    """Shows lines in a thread of its own, which may have to wait for the terminal."""
+    """Shows lines in a thread of its own, which may have to wait for the terminal, or the disk."""
 
-    def __init__(self, show: Show) -> None:
+    def __init__(self, show: Show, finish: Callable[[], None] = lambda: None) -> None:
         self._show = show
+        self._finish = finish
         self._lines: deque[tuple[str, str, int, str]] = deque(maxlen=MOST_UNSHOWN)
         self._changed = threading.Condition()
         self._closing = False
+        self._busy_since_s: float | None = None
         self._thread = threading.Thread(target=self._run, name="terminal", daemon=True)
         self._thread.start()
 
@@ -141,11 +151,31 @@ class _Shown:
         while (line := self._next()) is not None:
             with contextlib.suppress(OSError, ValueError):
                 self._show(*line)
+            self._busy_since_s = None
+        with contextlib.suppress(OSError):  # what waits for room on a full disk is lost with us
+            self._finish()
+
+    def hangs(self, longer_than_s: float) -> bool:
+        """True while one line takes longer than this."""
+        since_s = self._busy_since_s
+        return since_s is not None and CLOCK.monotonic_s() - since_s > longer_than_s
 
     def _next(self) -> tuple[str, str, int, str] | None:
         with self._changed:
             self._changed.wait_for(lambda: self._lines or self._closing)
+            self._busy_since_s = CLOCK.monotonic_s() if self._lines else None
             return self._lines.popleft() if self._lines else None
+
+
+def _into(path: Path) -> tuple[Show, Callable[[], None]]:
+    """Raises OSError: the file can't be opened."""
+    file = path.open("a", encoding="utf-8", errors="replace")
+
+    def show(stamp: str, name: str, level: int, text: str) -> None:
+        file.write(f"{stamp} {logging.getLevelName(level):8} {name} {text}\n")
+        file.flush()
+
+    return show, file.close
 
 
 def _plain(terminal: TextIO) -> Show:
