@@ -16,7 +16,9 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 DEADLINE_S = 0.2
 SYNC_PERIOD_S = 0.1
@@ -28,8 +30,8 @@ MOST_TASKS = 10_000
 class DiskHangs(OSError):
     """The disk has not answered in time."""
 
-    def __init__(self) -> None:
-        super().__init__(f"the disk has not answered within {DEADLINE_S:g} s")
+    def __init__(self, within_s: float = DEADLINE_S) -> None:
+        super().__init__(f"the disk has not answered within {within_s:g} s")
 
 
 class _Task:
@@ -74,7 +76,7 @@ class Disk:
         task = self._put(work, size)
         if task is None or not task.done.acquire(timeout=0.0 if self.hangs else self._deadline_s):
             self.hangs = True
-            raise DiskHangs
+            raise DiskHangs(self._deadline_s)
         if task.error is not None:
             raise task.error
 
@@ -111,6 +113,18 @@ class Disk:
                 if not self._count:
                     self.hangs = False
             task.done.release()
+
+
+def bounded(work: Callable[[], T], within_s: float) -> T:
+    """Do something that takes a disk, once.
+
+    Raises:
+        DiskHangs: not in time; what becomes of it then is not known.
+        Exception: what `work` raises.
+    """
+    found: list[T] = []
+    Disk(within_s).run(lambda: found.append(work()))
+    return found[0]
 
 
 class Syncer:

@@ -9,8 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import InvalidValue
+from afspm.record.disk import DEADLINE_S, Disk
 from afspm.record.whole import Generations, ToldOnce, load, write_whole
 
+SYNCED_WITHIN_S = 5.0
+"""So long a disk is waited for, whose every answer matters. One that hangs is full for all that one knows."""
 _log = logging.getLogger("afspm.memory")
 
 
@@ -20,7 +23,8 @@ class Memory(MutableMapping[str, Any]):
     Args:
         path: the file; None keeps nothing over a restart.
         synced: whether saving waits for the disk, which takes ten milliseconds and more, so that all of it outlives a
-            power cut. If not, what was saved a second before that does. A kill, of any process, it outlives anyway.
+            power cut. If not, the disk is waited for a fifth of a second at most, and what was saved a moment before
+            a power cut outlives that. A kill, of any process, it outlives anyway.
 
     Attributes:
         damage: what was wrong with the file, where the generation before was taken up in its place; "" else.
@@ -32,6 +36,7 @@ class Memory(MutableMapping[str, Any]):
     def __init__(self, path: Path | None, *, synced: bool = True) -> None:
         self._path = path
         self._generations = Generations(path) if path and not synced else None
+        self._disk = Disk(SYNCED_WITHIN_S if synced else DEADLINE_S)
         self._told = ToldOnce("a restart would not know what was done until now", _log)
         self.damage = ""
         self._values: dict[str, Any] = {}
@@ -43,11 +48,11 @@ class Memory(MutableMapping[str, Any]):
     def save(self) -> bool:
         """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
 
-        A disk that is full must not end the experiment: it is said, and the experiment goes on. Whoever does something
+        A disk that is full or hangs must not end the experiment: it is said, and the experiment goes on. Whoever does something
         that must not happen twice looks at what is returned, and doesn't do it.
 
         Returns:
-            Whether it was written: False if the disk is full, or away.
+            Whether it was written: False if the disk is full, or away, or hangs.
 
         Raises:
             InvalidValue: a value is not of JSON's types.
@@ -61,10 +66,10 @@ class Memory(MutableMapping[str, Any]):
 
     def _write(self, text: str) -> bool:
         with self._told.trying():
-            if self._generations is not None:
-                self._generations.save(text.encode())
-            elif self._path is not None:
-                write_whole(self._path, [text.encode(), b"\n"])
+            if (generations := self._generations) is not None:
+                self._disk.run(lambda: generations.save(text.encode()))
+            elif (path := self._path) is not None:
+                self._disk.run(lambda: write_whole(path, [text.encode(), b"\n"]))
             self._saved = text
             return True
         return False

@@ -18,6 +18,7 @@ from afspm.errors import ConfigError
 from afspm.experiment import Role, notifying
 from afspm.logic.telling import LOGGED_AS
 from afspm.record.journal import JOURNAL_FILE
+from afspm.supervisor import summary
 from afspm.supervisor.ending import Why
 
 if TYPE_CHECKING:
@@ -44,19 +45,23 @@ class Ended:
 def follow(
     experiment: Experiment, ended: Ended, starts: Sequence[Start], clock: Clock, log: RunLog, *, with_report: bool
 ) -> None:
-    """Tell whoever [notify] names, and write the report if it is wanted and there is a record: it may take long.
+    """Tell whoever [notify] names, then say what was measured and write the report, which need the disk and may take
+    long.
 
     Of the end of an experiment on several computers that one tells where its scheduler ran.
     """
     notify = experiment.resolved.notify
     if any(start.role is Role.SCHEDULER for start in starts):
         tell(ended, notifying.targets(notify, experiment.folder), notify.on, clock, log)
+    for line in summary.lines(ended.outcome, ended.folder):
+        log.write(LOGGED_AS, logging.INFO, line)
     if with_report:
         report(ended.folder, log)
 
 
 def report(folder: Path, log: RunLog) -> None:
-    """Write the report of a run, in a process of its own, which can neither harm the run nor hold it up for long."""
+    """Write the report of a run that has a record, in a process of its own, which can neither harm the run nor hold it
+    up for long."""
     if not (folder / JOURNAL_FILE).is_file():
         return  # nothing was recorded
     command = [sys.executable, "-P", "-m", "afspm.record.report", str(folder)]

@@ -15,11 +15,12 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
 from afspm.logic.telling import LOGGED_AS
 from afspm.record import ahead
+from afspm.record.disk import bounded
 from afspm.record.facts import ENDED, STATE_DIR, known_facts
 from afspm.record.going_on import locked
 from afspm.runtime.connect import GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
-from afspm.supervisor import aftermath, common_clock, reporting, run_folder, summary
+from afspm.supervisor import aftermath, common_clock, reporting, run_folder
 from afspm.supervisor.aftermath import Ended
 from afspm.supervisor.common_clock import Common
 from afspm.supervisor.log import RunLog
@@ -30,6 +31,8 @@ from afspm.supervisor.task import from_start
 TAKES_WHO_COMES = ""
 """The identity of a run of a real microscope's translator alone, which obeys the scheduler that comes."""
 RUN, HOW, HOMES, FILES, ONLY, WITHOUT = "run", "how", "homes", "files", "only", "without"
+
+WRITTEN_WITHIN_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -107,19 +110,12 @@ def go(
         supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy(), reporter)
         outcome = supervisor.run()
         try:
-            run_folder.write_run(folder, {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()})
+            ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}
+            bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
         except OSError as error:  # a full disk must not keep people from being told of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
-        for line in summary.lines(outcome, folder):
-            log.write(LOGGED_AS, logging.INFO, line)
-        aftermath.follow(
-            experiment,
-            Ended(name, folder, outcome, common.simulated),
-            starts,
-            clock,
-            log,
-            with_report=options.report,
-        )
+        ended = Ended(name, folder, outcome, common.simulated)
+        aftermath.follow(experiment, ended, starts, clock, log, with_report=options.report)
     finally:
         log.close()
     return Run(folder, outcome)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
 from afspm.model.words import lasting
+from afspm.record.disk import DiskHangs, bounded
 from afspm.record.going_on import resume_command
 from afspm.record.run import open_run
 from afspm.supervisor.ending import Why
@@ -16,6 +17,7 @@ from afspm.supervisor.ending import Why
 if TYPE_CHECKING:
     from afspm.supervisor.supervisor import Outcome
 
+COUNTED_WITHIN_S = 20.0
 TABLE = "metadata.csv"  # of the component Metadata
 
 
@@ -30,7 +32,10 @@ def lines(outcome: Outcome, folder: Path) -> list[str]:
             told.append(f"{report.name} was started anew {_times(report.ordered)}, as ordered")
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
-    told += _recorded(folder) or _tabled(folder / TABLE)
+    try:
+        told += bounded(lambda: _recorded(folder) or _tabled(folder / TABLE), COUNTED_WITHIN_S)
+    except DiskHangs as error:
+        told.append(f"what was measured can't be counted: {error}")
     told.append(f"everything is in {folder}")
     if outcome.why is Why.STOPPED:
         told.append(f"{resume_command(folder)} goes on with it")

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from experiment_lab import AfspmRun, Run, require_each_once, require_each_row_once
+
+from afspm.model import ScopeState
+from afspm.runtime.connect import connect
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
@@ -131,3 +135,25 @@ def test_without_a_microscope_the_run_ends_and_says_so(run: Run) -> None:
     one.signal("microscope", signal.SIGKILL)
     assert one.end() == 1, one.output
     one.wait_for("CRITICAL microscope is given up, and the experiment can't go on without it")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")
+def test_an_experiment_whose_disk_hangs_is_steered_and_ended(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs, hook = tmp_path / "runs", Path(__file__).parents[2] / "support" / "hanging_disk"
+    monkeypatch.setenv("PYTHONPATH", str(hook))
+    monkeypatch.setenv("HANGING_FOLDER", str(runs))
+    one = run(scans=10_000)
+    one.wait_for("scan 2 of")
+    with connect(one.folder, "Outside") as scope:
+        switch = runs.with_name("runs.hangs")
+        switch.touch()
+        scope.flag("tip-shape-changed")
+        assert scope.wait_until(lambda: scope.state is not ScopeState.SCANNING, timeout_s=10.0)
+        one.wait_for("CRITICAL", "the disk has not answered")
+        began_s = time.monotonic()
+        one.process.send_signal(signal.SIGINT)
+        one.end()
+    assert time.monotonic() - began_s < 30.0
+    switch.unlink()

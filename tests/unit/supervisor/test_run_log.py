@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import io
 import logging
+import os
+import sys
 import threading
 from pathlib import Path
 
@@ -80,6 +82,28 @@ def test_a_terminal_that_takes_nothing_more_holds_up_nobody(tmp_path: Path, monk
     log.close()
     terminal.goes_on.set()
     assert "line 2" in (tmp_path / "log.txt").read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a pipe that nobody reads stands in for a disk that hangs")
+def test_a_disk_that_hangs_holds_up_nobody_and_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("afspm.supervisor.log.SHOWN_WITHIN_S", 0.01)
+    monkeypatch.setattr("afspm.supervisor.log.DEADLINE_S", 0.05)
+    file, told = tmp_path / "log.txt", threading.Event()
+    os.mkfifo(file)
+    reader = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
+    log = RunLog(file, ExperimentClock.real(), terminal=io.StringIO())
+    log.listener = lambda name, level, text: told.set() if level == logging.CRITICAL else None
+
+    def write() -> None:
+        while not told.wait(0.01):
+            log.write("scheduler", logging.INFO, "x" * 20_000)
+
+    writing = threading.Thread(target=write, daemon=True)
+    writing.start()
+    writing.join(5.0)
+    assert told.is_set()
+    os.close(reader)
+    log.close()
 
 
 def test_a_terminal_shows_the_name_in_its_colour(tmp_path: Path) -> None:
