@@ -48,8 +48,8 @@ class Memory(MutableMapping[str, Any]):
     def save(self) -> bool:
         """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
 
-        A disk that is full or hangs must not end the experiment: it is said, and the experiment goes on. Whoever does something
-        that must not happen twice looks at what is returned, and doesn't do it.
+        A disk that is full or hangs must not end the experiment: it is said, and the experiment goes on. Whoever does
+        something that must not happen twice looks at what is returned, and doesn't do it.
 
         Returns:
             Whether it was written: False if the disk is full, or away, or hangs.
