@@ -142,14 +142,3 @@ def test_a_peer_that_asks_for_replays_again_and_again(rig: Any, friend: Any) -> 
     peer = Raw(rig.publish, b"XSUB")
     peer.say(b"".join(frame(b"\1\0replay/a/%d\0-1\0" % n) for n in range(5000)))
     assert rig.until(lambda: ended(peer))
-
-
-def test_a_flood_of_reads_holds_up_the_component_in_control_no_longer_than_a_few_reads(rig: Any, friend: Any) -> None:
-    assert friend.ask(ControlRequest.REQUEST_CTRL, 0).ok
-    floods = [Raw(rig.serve, b"DEALER") for _ in range(3)]
-    read = (frame(b"", more=True) + frame(b"\7", more=True) + frame(b"start-scan")) * 900
-    for peer in floods:
-        assert peer.say(read)
-    began_s = time.monotonic()
-    assert friend.ask(ControlRequest.REQUEST_CTRL, 0) is not None
-    assert time.monotonic() - began_s < 0.3
