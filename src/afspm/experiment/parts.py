@@ -176,27 +176,21 @@ class _FromPublished:
                     self.parts.became[here] = f"the dashboard, [{other.name}], shows this too"
                     return None
         self.parts.became[here] = f'class = "{ours.ours}"{ours.why and "; "}{ours.why}'
-        settings: dict[str, Any] = {}
-        for key, value in part.settings.items():
-            if key in ours.settings:
-                self._put(settings, ours.settings[key], (part.name, key), value, table)
-            else:
-                settings[key] = value
+        settings = {key: value for key, value in part.settings.items() if key not in ours.settings}
+        for key in filter(ours.settings.__contains__, part.settings):
+            self._put(settings, ours.settings[key], (part.name, key), table)
         return replace(part, class_path=ours.ours, settings=settings)
 
-    def _put(
-        self, settings: dict[str, Any], setting: Setting, here: tuple[str, str], value: Any, table: Mapping[str, Any]
-    ) -> None:
-        if here[1] == "channel_id":
-            value = self.channels.get(value, value)
+    def _put(self, settings: dict[str, Any], setting: Setting, here: tuple[str, str], table: Mapping[str, Any]) -> None:
+        value = table[here[1]]
         try:
-            becomes = setting.becomes(value, table)
+            becomes = setting.becomes(self.channels.get(value, value) if here[1] == "channel_id" else value, table)
+            for name, one in becomes.items():
+                published.put(settings, name, one)
         except (AfspmError, TypeError, ValueError) as error:
             what, hint = (error.what, error.hint) if isinstance(error, AfspmError) else (str(error), "")
             self.findings.error(f"[{here[0]}] {here[1]} = {value!r}: {what}", self.document.place(*here), hint)
             return
-        for name, one in becomes.items():
-            published.put(settings, name, one)
         self.parts.became[here] = ", ".join(f"{name} = {toml(one)}" for name, one in becomes.items()) or setting.why
 
 

@@ -121,11 +121,18 @@ def without_counterpart(path: str) -> str:
 
 
 def put(settings: dict[str, Any], name: str, value: Any) -> None:
-    """Set a setting that may be within tables: put({}, "drift.channel", "Height")."""
-    *tables, last = name.split(".")
+    """Set a setting that may be within tables: put({}, "drift.channel", "Height").
+
+    Raises:
+        InvalidValue: it has another value already.
+    """
+    *tables, key = name.split(".")
     for table in tables:
         settings = settings.setdefault(table, {})
-    settings[last] = value
+        if not isinstance(settings, dict):
+            raise InvalidValue(f"it is {name} here, and {table} is set, too", hint="say one of them")
+    if settings.setdefault(key, value) != value:
+        raise InvalidValue(f"it is {name} here, which is {settings[key]!r} already", hint="say one of them")
 
 
 def last(table: Mapping[str, Any]) -> str:

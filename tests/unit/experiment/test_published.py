@@ -208,6 +208,29 @@ def test_settings_of_the_drift_scheduler_are_those_of_the_paper_s_tracker(write:
     assert (drift["rescan"]["rule"], drift["rescan"]["f_rescan"]) == ("paper", 0.9)
 
 
+@pytest.mark.parametrize(
+    ("ours", "published_line"),
+    [
+        ('tracker = "bank"', "update_weight"),
+        ("tracker = { w_update = 0.5 }", "update_weight"),
+        ('channel = "Phase"', 'channel_id = "channel_id"'),
+    ],
+)
+def test_a_setting_of_ours_beside_the_published_one_is_refused(write: Write, ours: str, published_line: str) -> None:
+    text = DRIFT.replace("display_fit = false", f"drift = {{ {ours} }}")
+    experiment = published(write, text, PICTURE, SERIES)
+    found = [error for error in errors(experiment) if error.place.line == line_of(experiment, published_line)]
+    assert [error.hint for error in found] == ["say one of them"]
+
+
+def test_settings_of_ours_join_the_published_ones(write: Write) -> None:
+    text = DRIFT.replace("display_fit = false", 'drift = { correct_after = "2 h", tracker = { lost_after = 9 } }')
+    experiment = published(write, text, PICTURE, SERIES)
+    assert errors(experiment) == []
+    drift = experiment.resolved.settings["mediator"]["drift"]
+    assert (drift["correct_after"], drift["tracker"]["lost_after"], drift["tracker"]["w_update"]) == (7200.0, 9, 0.8)
+
+
 def test_what_the_drift_scheduler_is_not_told_stays_as_it_is_here(write: Write) -> None:
     plain = DRIFT.split("channel_id")[0] + DRIFT[DRIFT.index("\n[rescanner]") :]
     assert "drift" not in published(write, plain, PICTURE, SERIES).resolved.settings["mediator"]
