@@ -71,7 +71,7 @@ def test_a_sample_runs_to_its_end(afspm_run: Run, tmp_path: Path, name: str) -> 
 
 SHORT_NIGHT = """
 [clock]
-speed = 160.0
+speed = 240.0
 [series]
 every = "5 min"
 duration = "50 min"
