@@ -67,9 +67,10 @@ class Liveness:
         self._frozen = False
 
     def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> None:
-        """A beat came, with for how long the current step has been running and how long one may."""
-        if self._vital is Vital.NOT_CLOSING:
-            return
+        """A beat came, with for how long the current step has been running and how long one may.
+
+        Also after it was said that it closes, which then was not so, or not said by it.
+        """
         longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
         self._vital = Vital.ALIVE
         self._frozen = step_age_s > longest_s

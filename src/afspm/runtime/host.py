@@ -95,7 +95,11 @@ def _beating(launch: Launch, activity: Activity, logger: logging.Logger) -> Iter
         yield
         return
     sender = HeartbeatSender(
-        launch.sockets.heartbeat, launch.beat_period_s, _Watch(activity, logger).age_s, lambda: activity.longest_step_s
+        launch.sockets.heartbeat,
+        launch.beat_period_s,
+        _Watch(activity, logger).age_s,
+        lambda: activity.longest_step_s,
+        launch.beat_token,
     )
     yield
     sender.close()

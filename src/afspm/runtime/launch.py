@@ -3,9 +3,10 @@
 The same line goes to Python components (`python -m afspm.runtime.host`) and to commands in any other
 language. Standard input then stays open: its end means that the parent is gone or wants us to stop.
 
-On the heartbeat socket a process sends `[beat, age, longest]`: the byte 0 (alive) or 1 (closing on purpose),
-for how many seconds the current step has been running (ASCII; 0 when idle) and how long a step may take
-(ASCII). The last two are optional; they tell busy from frozen.
+On the heartbeat socket a process sends `[beat, age, longest, token]`: the byte 0 (alive) or 1 (closing on purpose),
+for how many seconds the current step has been running (ASCII; 0 when idle), how long a step may take (ASCII), and
+`beat_token`. All but the first are optional. The second and third tell busy from frozen; once the fourth has come,
+nobody else can beat for the process.
 """
 
 from __future__ import annotations
@@ -58,6 +59,8 @@ class Launch:
     state_dir: str = ""
     """Where to keep what must survive a restart; empty: nothing is kept."""
     beat_period_s: float = 1.0
+    beat_token: str = ""
+    """To be sent with each heartbeat: the supervisor knows by it who beats."""
     request_timeout_s: float = 5.0
     request_retries: int = 3
     log_level: str = "INFO"
@@ -103,7 +106,7 @@ class Launch:
         return cls(**values, sockets=Sockets(**_fields(Sockets, sockets, "launch line, sockets")))
 
 
-_STRINGS = {"name", "class_", "run", "controller", "run_dir", "state_dir", "log_level"}
+_STRINGS = {"name", "class_", "run", "controller", "beat_token", "run_dir", "state_dir", "log_level"}
 _NUMBERS = {"beat_period_s", "request_timeout_s", "request_retries"}
 _TABLES = {"settings", "clock", "problems"}
 _LISTS = {"subscribe", "envelopes", "messages"}

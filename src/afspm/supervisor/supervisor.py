@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import secrets
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -69,7 +70,6 @@ class Outcome:
 @dataclass
 class _Child:
     task: Task
-    heartbeat: str
     watch: supervision.ChildWatch
     process: ChildProcess | None = None
     lines: LineReader = field(default_factory=LineReader)
@@ -166,14 +166,16 @@ class Supervisor:
         self._wakeup: WakeUp[ChildEvent | signals.Signalled | News] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
         self._reaper = Reaper()
-        self._children = {
-            task.name: _Child(
-                task, self._beats.listen(task.name), supervision.ChildWatch(replace(policy, beats=task.beats))
-            )
-            for task in tasks
-        }
+        self._children = {task.name: self._child(task) for task in tasks}
         self._ending: Ending | None = None
         self._has_told_waiting = False
+
+    def _child(self, task: Task) -> _Child:
+        token = secrets.token_hex(16)
+        address = self._beats.listen(task.name, token=token, needs_token=bool(task.launch.class_))
+        watch = supervision.ChildWatch(replace(self._policy, beats=task.beats))
+        launch = replace(task.launch, beat_token=token, sockets=replace(task.launch.sockets, heartbeat=address))
+        return _Child(replace(task, launch=launch), watch)
 
     def run(self) -> Outcome:
         """Start everything; returns when nothing of it runs any more."""
@@ -342,7 +344,6 @@ class Supervisor:
         if self._ending is not None and not child.rescued:
             return
         task = child.task
-        launch = replace(task.launch, sockets=replace(task.launch.sockets, heartbeat=child.heartbeat))
         child.lines, child.up, child.beat, child.last_error = LineReader(), False, None, ""
         child.starts += 1
         child.started_s = self._clock.monotonic_s()
@@ -350,7 +351,7 @@ class Supervisor:
             child.process = ChildProcess(
                 task.name,
                 task.command,
-                launch.to_json(),
+                task.launch.to_json(),
                 self._wakeup.post,
                 task.environment,
                 task.folder,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hmac
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import zmq
@@ -41,6 +43,7 @@ class HeartbeatSender:
         period_s: real seconds between beats.
         step_age_s: for how long the current step has been running; called in the thread.
         longest_step_s: how long a step may take; called in the thread.
+        token: of the launch line, by which the listener knows that it is we who beat.
 
     Attributes:
         heard: set as soon as somebody listens: what is beaten from then on arrives.
@@ -52,12 +55,14 @@ class HeartbeatSender:
         period_s: float,
         step_age_s: Callable[[], float],
         longest_step_s: Callable[[], float],
+        token: str = "",
     ) -> None:
         # a network of its own: beats stay on this computer, and need no keys
         self._network = Network()
         self._period_ms = max(1, round(period_s * 1000.0))
         self._step_age_s = step_age_s
         self._longest_step_s = longest_step_s
+        self._token = token.encode()
         self._stop: WakeUp[None] = WakeUp()
         self.heard = threading.Event()
         # XPUB, since it sees the listener subscribe: a beat sent before that would be lost
@@ -83,7 +88,7 @@ class HeartbeatSender:
 
     def _send(self, beat: bytes) -> None:
         ages = (self._step_age_s(), self._longest_step_s())
-        self._socket.send_multipart([beat, *(f"{age_s:.3f}".encode() for age_s in ages)])
+        self._socket.send_multipart([beat, *(f"{age_s:.3f}".encode() for age_s in ages), self._token])
 
     def close(self) -> None:
         """Say that we are closing on purpose, and stop. Safe to repeat."""
@@ -94,8 +99,20 @@ class HeartbeatSender:
             self._stop.close()
 
 
+@dataclass
+class _Expected:
+    """Whose beats come at one address, and what they have to show."""
+
+    name: str
+    token: bytes
+    needs_token: bool
+
+
 class HeartbeatListener:
-    """Listens to the heartbeats of several processes, each at an address of its own: nobody can beat for another.
+    """Listens to the heartbeats of several processes, each at an address of its own, by a token of its own.
+
+    Any program of this computer can send to such an address: a beat of a process that knows its token counts with it
+    alone. A program of version 1, which sends none, is believed as it is.
 
     Args:
         wake_up: ends a `poll` under way; taking what was posted is left to its owner.
@@ -103,17 +120,24 @@ class HeartbeatListener:
 
     def __init__(self, wake_up: WakeUp[Any] | None = None, *, network: Network | None = None) -> None:
         self._network = network or Network()
-        self._names: dict[zmq.Socket[bytes], str] = {}
+        self._expected: dict[zmq.Socket[bytes], _Expected] = {}
         self._poller = zmq.Poller()
         if wake_up is not None:
             self._poller.register(wake_up.fileno(), zmq.POLLIN)
 
-    def listen(self, name: str, address: str = "tcp://127.0.0.1:0") -> str:
-        """Begin to listen to the process `name`; returns the address to give to it."""
+    def listen(
+        self, name: str, address: str = "tcp://127.0.0.1:0", *, token: str = "", needs_token: bool = False
+    ) -> str:
+        """Begin to listen to the process `name`; returns the address to give to it.
+
+        Args:
+            token: to be given to it, too.
+            needs_token: it is known to send its token; else it is from its first beat that has it.
+        """
         socket = self._network.socket(zmq.SUB)
         socket.setsockopt(zmq.SUBSCRIBE, b"")
         bound = self._network.bind(socket, address)
-        self._names[socket] = name
+        self._expected[socket] = _Expected(name, token.encode(), needs_token)
         self._poller.register(socket, zmq.POLLIN)
         return bound
 
@@ -122,17 +146,26 @@ class HeartbeatListener:
         timeout_ms = None if timeout_s is None else max(0, math.ceil(timeout_s * 1000.0))
         found = []
         for ready, _ in self._poller.poll(timeout_ms):
-            name = None if isinstance(ready, int) else self._names.get(ready)
-            while name is not None and readable(ready):
+            expected = None if isinstance(ready, int) else self._expected.get(ready)
+            while expected is not None and readable(ready):
                 first, frames = receive_small(ready)
                 self._network.connections.settled({(first and descriptor_of(first)) or -1})
-                beat = read_beat(name, frames)
-                if beat is not None:
+                beat = read_beat(expected.name, frames)
+                if beat is not None and _is_by(expected, frames):
                     found.append(beat)
         return found
 
     def close(self) -> None:
         self._network.close()
+
+
+def _is_by(expected: _Expected, frames: list[bytes]) -> bool:
+    """True for a beat of the process that is expected."""
+    token = frames[3] if len(frames) > 3 else b""
+    if expected.token and hmac.compare_digest(token, expected.token):
+        expected.needs_token = True
+        return True
+    return not expected.needs_token
 
 
 def read_beat(name: str, frames: list[bytes]) -> Heartbeat | None:

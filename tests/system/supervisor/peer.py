@@ -32,6 +32,7 @@ def main() -> int:
         launch.beat_period_s,
         step_age_s,
         lambda: float(settings.get("longest_step_s", 30.0)),
+        launch.beat_token,
     )
     if port := settings.get("call"):  # open as long as we live
         call = socket.create_connection(("127.0.0.1", port))

@@ -76,6 +76,17 @@ def test_who_beats_again_after_it_was_busy_is_alive() -> None:
     assert checked(life, 30.0 + QUICK.silence_s, 10.5, works=True) is Vital.FROZEN, "it is the same step"
 
 
+def test_a_beat_after_closing_takes_it_back() -> None:
+    watch = ChildWatch(Policy(QUICK))
+    watch.begin(0.0)
+    watch.beat(Beat(), 0.5)
+    watch.beat(Beat(closing=True), 1.0)
+    for second in range(2, 20):
+        assert watch.beat(Beat(), float(second)) == []
+    assert watch.tick(21.0) == []
+    assert [type(effect) for effect in watch.tick(30.0)] == [Log, Kill]
+
+
 def test_work_does_not_excuse_from_a_first_beat_or_from_closing() -> None:
     life = Liveness(QUICK, 0.0)
     assert checked(life, 10.0, works=True) is Vital.SLOW_START

@@ -46,6 +46,32 @@ def test_each_process_is_heard_under_its_own_name(open_: Any) -> None:
         names |= {beat.name for beat in listener.poll(0.1)}
 
 
+@pytest.mark.parametrize("needs_token", [True, False])
+def test_nobody_else_can_say_that_a_process_closes_or_lives(open_: Any, needs_token: bool) -> None:
+    """A process that knows its token is known by it: from the beginning, or from its first beat on."""
+    listener = open_(HeartbeatListener())
+    address = listener.listen("Component", token="secret", needs_token=needs_token)
+    sender = open_(HeartbeatSender(address, 0.02, lambda: 0.0, lambda: 30.0, "secret"))
+    found = beats(listener, 1)
+    for token in ("", "guess"):  # each says at its end that it closes
+        stranger = open_(HeartbeatSender(address, 0.005, lambda: 7.0, lambda: 30.0, token))
+        deadline_s = time.monotonic() + 5.0
+        while not stranger.heard.is_set():
+            assert time.monotonic() < deadline_s
+            found += listener.poll(0.01)
+        stranger.close()
+        found += beats(listener, 10)
+    assert all(not beat.closing and beat.step_age_s == 0.0 for beat in found)
+    sender.close()
+    assert beats(listener, 1)[-1].closing
+
+
+def test_a_program_of_version_1_is_heard_without_a_token(open_: Any) -> None:
+    listener = open_(HeartbeatListener())
+    open_(HeartbeatSender(listener.listen("Component", token="secret"), 0.02, lambda: 0.0, lambda: 30.0))
+    assert not beats(listener, 2)[-1].closing
+
+
 def test_waiting_for_beats_ends_when_woken_up(open_: Any) -> None:
     wake_up: WakeUp[str] = open_(WakeUp())
     listener = open_(HeartbeatListener(wake_up))
