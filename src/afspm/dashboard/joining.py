@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from afspm.record.facts import STATE_DIR
 from afspm.runtime.connect import guest_of
 from afspm.runtime.memory import Memory
 from afspm.runtime.messages import register_all
-from afspm.runtime.process import Activity, Context
+from afspm.runtime.process import Activity, Context, new_session
 from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
 
@@ -43,7 +42,7 @@ def join(folder: Path, dashboard: Dashboard, name: str) -> int:
         open_port=lambda: port,
         log=logging.getLogger(f"afspm.{name}"),
         activity=Activity(clock),
-        session=os.urandom(4).hex(),
+        session=new_session(launch.run),
     )
     with _ended_by_ctrl_c(port):
         return dashboard.run_process(context)

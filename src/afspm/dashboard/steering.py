@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from afspm.errors import AfspmError
 from afspm.model.journal import PERSON
 from afspm.runtime.launch import Launch
 from afspm.runtime.link import Link
+from afspm.runtime.process import new_session
 from afspm.transport.network import Network
 from afspm.transport.port import ParentGone
 from afspm.transport.zmq_port import ZmqPort
@@ -95,7 +95,7 @@ class Steering:
         link = Link(
             port,
             name,
-            session=os.urandom(4).hex(),
+            session=new_session(launch.run),
             request_timeout_s=launch.request_timeout_s,
             request_retries=launch.request_retries,
             log=self._log,

@@ -144,13 +144,14 @@ class Experiment:
 
         self.require_valid()
         starts = starting.starts(self, take_address, only, without)
+        knowing = starting.knowing_the_run(self.resolved)
         return [
             replace(
                 start,
                 launch=replace(
                     start.launch,
                     clock=dict(clock or {}),
-                    run=run,
+                    run=run if start.launch.name in knowing else "",
                     simulated=start.launch.simulated or (simulated and start.role is not Role.TRANSLATOR),
                     run_dir=run_dir,
                     state_dir=state_dir,

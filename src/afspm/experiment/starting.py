@@ -46,6 +46,13 @@ def starts(
     return [_start(part, experiment, links[part.name], addresses, chosen) for part in parts]
 
 
+def knowing_the_run(resolved: Resolved) -> set[str]:
+    """The processes that are told the identity of the run: all, unless the scheduler is of another language."""
+    if all(not part.command for part in resolved.with_role(Role.SCHEDULER)):
+        return {part.name for part in resolved.parts.components}
+    return {*resolved.emulators, *(part.name for part in resolved.with_role(Role.TRANSLATOR))}
+
+
 def simulated(experiment: Experiment, only: Collection[str], without: Collection[str]) -> bool:
     """True if the microscope is simulated for certain, where these parts are started on this computer."""
     resolved = experiment.resolved

@@ -18,10 +18,18 @@ from afspm.logic.guard import Guard, is_get
 from afspm.logic.lease import Lease
 from afspm.logic.moves import Mover
 from afspm.logic.once import Fate, OnceTable, fingerprint
-from afspm.logic.sessions import Hearing, Sessions
+from afspm.logic.sessions import Hearing, Sessions, run_of
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import Watchdog, feedback_of
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, component_of
+from afspm.model import (
+    OTHER_RUN_RESPONSE,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Request,
+    Response,
+    component_of,
+)
 
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ACTION_SUPPORT, _SUCCESS = int(ControlRequest.ACTION_SUPPORT), int(ControlResponse.SUCCESS)
@@ -31,6 +39,7 @@ OwnEnd = Callable[[Response, float, int], Iterable[Effect]]
 """Told of the answer to a request of the scheduler's own, with now_s and now_ns; what follows from it."""
 LATE = "late: it had been told that there was no answer"
 """Of an answer of the translator that came after all."""
+_ANOTHER_RUN = "this scheduler is that of another run: two experiments have the same address"
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 
 
@@ -74,6 +83,7 @@ class Desk:
         frame: CoordinateFrame | None = None,
     ) -> None:
         self.effects: list[Effect] = []
+        self._run = settings.run
         self.sessions = Sessions(settings.takeover_s)
         self.forwarder = Forwarder(settings.request_timeout_s, settings.patience_s, settings.longest_queue)
         self.guard = Guard(settings.limits)
@@ -146,6 +156,9 @@ class Desk:
         if event.user is not None and event.user != component_of(name):
             self._refuse(event, f"the key is that of {event.user}, not of {name}")
             return False
+        if self._run and (run := run_of(name, event.request.id)) and run != self._run:
+            self._refuse(event, _ANOTHER_RUN, OTHER_RUN_RESPONSE)
+            return False
         hearing = self.sessions.hear(event.connection, name, event.request.id, now_s)
         if hearing is Hearing.UNCLEAR and name not in self._unclear and event.connection not in self._refused:
             self._unclear[name] = (event, now_s + _UNCLEAR_S)
@@ -153,11 +166,11 @@ class Desk:
             self._refuse(event, _TWO_OF_A_NAME.format(name=name))
         return hearing is Hearing.ACCEPTED
 
-    def _refuse(self, event: RequestIn, why: str) -> None:
+    def _refuse(self, event: RequestIn, why: str, code: int = ControlResponse.FAILURE) -> None:
         if event.connection not in self._refused:
             self._refused.add(event.connection)
             self._log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
-        self._tell(event, Response(int(ControlResponse.FAILURE), b"", why, event.request.id), tells_why=True)
+        self._tell(event, Response(int(code), b"", why, event.request.id), tells_why=True)
 
     def _repeated(self, event: RequestIn, outcome: Fate | Response, now_s: float) -> bool:
         """A request comes again with its id: answer it without doing it again. False: it may be done."""

@@ -16,12 +16,14 @@ chance. Such a newcomer is asked to wait a moment (`Hearing.UNCLEAR`), and has t
 from __future__ import annotations
 
 import math
+import re
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 
 _FORMERS = 8
+_RUN = re.compile("[0-9a-f]{16}")
 
 
 class Hearing(Enum):
@@ -57,6 +59,12 @@ def token_of(name: str, request_id: str) -> str | None:
     if who != name or not 2 <= len(rest) <= 3 or rest[0] == KEYED:
         return None
     return rest[0] if all(map(str.isdigit, rest[1:])) else None  # a number, and perhaps that of an attempt
+
+
+def run_of(name: str, request_id: str) -> str:
+    """The identity of the run in a request id, "<name>/<run>-<life>/<n>"; empty: the id says nothing of it."""
+    run, dash, _ = (token_of(name, request_id) or "").partition("-")
+    return run if dash and _RUN.fullmatch(run) else ""
 
 
 class Sessions:

@@ -18,7 +18,9 @@ from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, WireError
 from afspm.exit_codes import ExitCode
+from afspm.logic.epochs import Allegiance, Epoch
 from afspm.logic.forwarding import NOT_SENT
+from afspm.logic.sessions import run_of
 from afspm.logic.watchdog import feedback_of
 from afspm.microscopes import in_force
 from afspm.microscopes.emulated import EmulatedController, wired_to
@@ -62,6 +64,7 @@ class Translator:
             has switched off.
         controller: the emulator of this run, in whose place nobody else is ever talked to; None: the microscope
             knows where its controller is.
+        run: the identity of the run, whose scheduler alone is obeyed; empty: that which asks first.
     """
 
     def __init__(
@@ -75,6 +78,7 @@ class Translator:
         *,
         retracts: bool = False,
         controller: EmulatedController | None = None,
+        run: str = "",
     ) -> None:
         self.microscope = microscope
         self._controller = controller
@@ -104,6 +108,8 @@ class Translator:
         self._why_lost = self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
+        self._allegiance = Allegiance(run)
+        self._commander, self._told_refused = b"", ""
         self._ended = False
 
     def run(self) -> ExitCode:
@@ -134,7 +140,8 @@ class Translator:
     def handle(self, arrived: RequestReceived | SubscriberJoined) -> None:
         """One thing that came over the network."""
         if isinstance(arrived, RequestReceived):
-            self._on_request(arrived.frames)
+            if not self._refuses(arrived):
+                self._on_request(arrived.frames)
         elif self._connected:
             self._publish_all()
 
@@ -331,6 +338,17 @@ class Translator:
 
     # --- requests ---
 
+    def _refuses(self, arrived: RequestReceived) -> bool:
+        """Answer who is not to be obeyed, and return True; False: it is to be obeyed."""
+        before, epoch = self._commander, Epoch.decode(arrived.epoch)
+        why = self._allegiance.refusal(epoch, _run_in(arrived.frames), lambda: self._port.is_connected(before))
+        if not why:
+            self._commander = arrived.connection if epoch is not None else before
+            return False
+        told, self._told_refused = self._told_refused, why
+        self._reply(Response(ControlResponse.FAILURE, reason=why), logging.DEBUG if told == why else logging.WARNING)
+        return True
+
     def _on_request(self, frames: Sequence[bytes]) -> None:
         if list(frames) == [wire.CLOSE]:
             self._end()
@@ -489,6 +507,12 @@ class Translator:
         return list(range(first, first + count))
 
 
+def _run_in(frames: Sequence[bytes]) -> str:
+    """The run of a component, in the id of its request; empty: it says none."""
+    request_id = frames[2].decode("utf-8", "replace") if len(frames) > 2 else ""
+    return run_of(request_id.partition("/")[0], request_id)
+
+
 def _only_asks(request: Request) -> bool:
     if request.kind == ControlRequest.PARAM:
         return isinstance(request.subject, Parameter) and request.subject.value is None
@@ -521,6 +545,6 @@ def _run_alone(microscope: Microscope, context: Context, make: Callable[..., Tra
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     run_dir = Path(launch.run_dir or ".")
     step = context.activity.step
-    translator = make(microscope, port, memory, run_dir, context.log, step, retracts=launch.retracts)
+    translator = make(microscope, port, memory, run_dir, context.log, step, retracts=launch.retracts, run=launch.run)
     context.tip_in_danger(translator.leaves_danger)
     return translator.run()

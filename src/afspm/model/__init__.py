@@ -5,6 +5,7 @@ from __future__ import annotations
 from afspm.model.control import HAS_ENDED, Parameter, Request, Response
 from afspm.model.enums import (
     CLOCK_REQUEST,
+    OTHER_RUN_RESPONSE,
     RESTART_REQUEST,
     TELL_REQUEST,
     ControlMode,
@@ -39,6 +40,7 @@ from afspm.model.state import ControlState, Feedback, PositionChange, ProbePosit
 __all__ = [
     "CLOCK_REQUEST",
     "HAS_ENDED",
+    "OTHER_RUN_RESPONSE",
     "RESTART_REQUEST",
     "TELL_REQUEST",
     "ControlMode",

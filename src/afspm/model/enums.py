@@ -61,6 +61,9 @@ TELL_REQUEST = 102
 RESTART_REQUEST = 103
 """A request of ours, not in version 1: a process is to be started anew; its subject is the process's name."""
 
+OTHER_RUN_RESPONSE = 100
+"""A response of ours, not in version 1, and only to those who named their run: it is not that of the scheduler."""
+
 _OURS = {CLOCK_REQUEST: "CLOCK", TELL_REQUEST: "TELL", RESTART_REQUEST: "RESTART"}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import os
 import weakref
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from afspm.record.going_on import cut_off
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
 from afspm.runtime.messages import register_all
+from afspm.runtime.process import new_session
 from afspm.runtime.scope import Scope
 from afspm.transport.launching import open_port
 
@@ -51,7 +51,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
         port,
         name,
         source=launch.sockets.subscribe[0],
-        session=os.urandom(4).hex(),
+        session=new_session(launch.run),
         request_timeout_s=launch.request_timeout_s,
         request_retries=launch.request_retries,
         log=logging.getLogger(f"afspm.{name}"),

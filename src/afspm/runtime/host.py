@@ -21,7 +21,7 @@ from afspm.runtime.launch import Launch
 from afspm.runtime.loading import load
 from afspm.runtime.messages import register_all
 from afspm.runtime.parent import Parent, end_within, read_launch_line
-from afspm.runtime.process import DEFAULT_LONGEST_STEP_S, Activity, Context
+from afspm.runtime.process import DEFAULT_LONGEST_STEP_S, Activity, Context, new_session
 from afspm.runtime.stopping import StopRequested
 from afspm.runtime.view import KEPT
 from afspm.transport.heartbeat import HeartbeatSender
@@ -83,7 +83,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: Parent) -> int:
             activity=activity,
             when_stopping=parent.when_gone,
             tip_in_danger=parent.tip_in_danger,
-            session=os.urandom(4).hex(),
+            session=new_session(launch.run),
         )
         return process.run_process(context)
 

@@ -9,8 +9,20 @@ from typing import Any
 
 from afspm import wire
 from afspm.clock import Clock
-from afspm.errors import ExperimentEnded, NoResponse, WireError
-from afspm.model import HAS_ENDED, TELL_REQUEST, ControlRequest, Packet, Request, Response, Told, request_name
+from afspm.errors import ConfigError, ExperimentEnded, NoResponse, WireError
+from afspm.logic.sessions import run_of
+from afspm.model import (
+    CLOCK_REQUEST,
+    HAS_ENDED,
+    OTHER_RUN_RESPONSE,
+    TELL_REQUEST,
+    ControlRequest,
+    Packet,
+    Request,
+    Response,
+    Told,
+    request_name,
+)
 from afspm.runtime.process import Activity
 from afspm.runtime.stopping import StopRequested
 from afspm.runtime.view import KEPT, View
@@ -64,6 +76,7 @@ class Link:
         self.ended = False
         self.stopping = False
         self._left = False
+        self._refused = ""
         self.connections = 0
         self.connected = False
         self.request_timeout_s = request_timeout_s
@@ -120,13 +133,20 @@ class Link:
         self.check()
 
     def check(self) -> None:
-        """Raises ExperimentEnded or StopRequested if it is so; NoResponse if we have left."""
+        """Raises ExperimentEnded or StopRequested if it is so; NoResponse if we have left.
+
+        Raises:
+            ConfigError: the scheduler is that of another run.
+        """
         if self._left:
             raise NoResponse(
                 "the experiment was left, by close()", where=self.name, hint="afspm.connect() joins it again"
             )
         if self.stopping:
             raise StopRequested
+        if self._refused:
+            hint = "end the other experiment, or give this one other addresses"
+            raise ConfigError(self._refused, where=self.name, hint=hint)
         if self.ended:
             raise ExperimentEnded(HAS_ENDED, where=self.name)
 
@@ -279,6 +299,7 @@ class Link:
                 self.connections += 1
                 self.connected = True
                 self._told.clear()  # what was on its way then may be lost, and its answer with it
+                self._show_run()
             case ControlDisconnected():
                 self.connected = False
             case Killed():
@@ -286,7 +307,14 @@ class Link:
             case ParentGone():
                 self.stopping = True
 
+    def _show_run(self) -> None:
+        """Have the scheduler see by the id of a request whether it is of our run. Only one of ours has such runs."""
+        if run_of(self.name, f"{self.name}/{self._session}/0"):
+            self.port.send(wire.encode_request(Request(CLOCK_REQUEST, id=self.next_id())))
+
     def _take_reply(self, response: Response) -> None:
+        if response.code == OTHER_RUN_RESPONSE:
+            self._refused = response.reason
         if response.id in self._told:
             del self._told[response.id]
             if self._untold:

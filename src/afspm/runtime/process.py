@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -71,6 +72,11 @@ class _Waiting(_Block):
 
     def __exit__(self, *_: object) -> None:
         self._activity.since_s = None if self._before is None else self._clock.monotonic_s()
+
+
+def new_session(run: str) -> str:
+    """What tells this life of a process from all others, with the identity of its run (empty: none is known)."""
+    return "-".join(filter(None, [run, os.urandom(4).hex()]))
 
 
 def _never(_: Callable[[], object]) -> None:

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from afspm.clock import Clock
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
+from afspm.logic.epochs import Epoch
 from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
 from afspm.model import ProblemNames
 from afspm.scheduler.codec import WireCodec
@@ -98,7 +99,7 @@ class Scheduler:
         core = self._core(context)
         _restore(core, state, journal)
         complaints = Complaints(log, clock)
-        sockets = SchedulerSockets(launch, complaints, since_ns=core.newest_source_ns)
+        sockets = SchedulerSockets(launch, complaints, since_ns=core.newest_source_ns, epoch=_epoch(context))
         stopping = threading.Event()
 
         def stop() -> None:
@@ -133,6 +134,11 @@ class Scheduler:
     def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> Shell:
         """What is around them."""
         return Shell(core, sockets, *others)
+
+
+def _epoch(context: SchedulerContext) -> bytes:
+    run = context.launch.run
+    return Epoch(run, context.clock.now_ns()).encode() if run else b""
 
 
 def _restore(core: Core, state: StateFile, journal: Journal) -> None:

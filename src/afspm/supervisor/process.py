@@ -66,6 +66,7 @@ class ChildProcess:
     Args:
         environment: what it gets besides our own; hidden: what it does not get of that.
         has_tip: it may have a tip to see to when we are killed.
+        may_begin: awaited before the launch line is given to it; None: it may at once.
 
     Raises:
         AfspmError: the program can't be started.
@@ -82,8 +83,10 @@ class ChildProcess:
         hidden: Collection[str] = (),
         *,
         has_tip: bool = False,
+        may_begin: threading.Event | None = None,
     ) -> None:
         self.name = name
+        self._may_begin = may_begin
         self._tell = tell
         ours = {key: value for key, value in os.environ.items() if key not in hidden}
         try:
@@ -121,6 +124,8 @@ class ChildProcess:
     def _feed_and_wait(self, first_line: str, readers: list[threading.Thread]) -> None:
         # here and not in __init__: a child that doesn't read must not block the supervisor
         assert self._popen.stdin is not None
+        if self._may_begin is not None:
+            self._may_begin.wait()
         with contextlib.suppress(OSError, ValueError):  # gone already: its exit says so
             self._popen.stdin.write(first_line.encode() + b"\n")
             self._popen.stdin.flush()

@@ -129,7 +129,7 @@ def _guest(run: Run) -> Launch:
     """The launch line of whoever joins."""
     recorded = run.facts.get(GUEST)
     guest = Launch.from_json(json.dumps(recorded)) if isinstance(recorded, dict) else Launch("guest")
-    return replace(guest, keys=None, simulated=run.simulated, sample_coordinates=run.frame is Frame.SAMPLE)
+    return replace(guest, keys=None, run="", simulated=run.simulated, sample_coordinates=run.frame is Frame.SAMPLE)
 
 
 @contextmanager

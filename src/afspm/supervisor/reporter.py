@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from afspm.clock import Clock, ExperimentClock
 from afspm.errors import AfspmError, WireError
 from afspm.logic.telling import LONGEST
 from afspm.model import (
+    OTHER_RUN_RESPONSE,
     TELL_REQUEST,
     ControlResponse,
     LogLine,
@@ -29,6 +29,7 @@ from afspm.model import (
     Told,
 )
 from afspm.runtime.launch import Launch
+from afspm.runtime.process import new_session
 from afspm.transport.launching import open_port
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort
@@ -55,13 +56,18 @@ class Ordered:
 
 
 @dataclass(frozen=True, slots=True)
+class SchedulerThere:
+    """The scheduler of this run has answered: components may ask it."""
+
+
+@dataclass(frozen=True, slots=True)
 class Complaint:
     """The scheduler can't be told."""
 
     text: str
 
 
-News = Ordered | Complaint
+News = Ordered | Complaint | SchedulerThere
 
 
 class Reporter:
@@ -89,7 +95,7 @@ class Reporter:
         self._closing = False
         self._port: ZmqPort | None = None
         self._thread = threading.Thread(target=self._run, name="reporter", daemon=True)
-        self._talk = _Talk(launch.name)
+        self._talk = _Talk(launch.name, launch.run)
         self._states_s = self._lines_s = -math.inf
         self._complaints: set[str] = set()
 
@@ -137,6 +143,7 @@ class Reporter:
             port = open_port(self._launch, ExperimentClock.real())
         except AfspmError as error:
             self._complain(str(error))
+            self.post(SchedulerThere())  # or not: there is no asking
             return
         try:
             self._port = port
@@ -203,6 +210,9 @@ class Reporter:
             talk.connected = False
         elif isinstance(incoming, ReplyReceived) and talk.is_answer(incoming.response):
             talk.asked = None
+            if not talk.answered and incoming.response.code != OTHER_RUN_RESPONSE:
+                talk.answered = True
+                self.post(SchedulerThere())
             self._answered(incoming.response)
 
     def _answered(self, response: Response) -> None:
@@ -227,11 +237,11 @@ class Reporter:
 class _Talk:
     """The question that is open, of which there is one at a time."""
 
-    def __init__(self, name: str) -> None:
-        self.connected = False
+    def __init__(self, name: str, run: str) -> None:
+        self.connected = self.answered = False
         self.asked: Request | None = None
         self.asked_s = -math.inf
-        self._name, self._session, self._count = name, os.urandom(4).hex(), 0
+        self._name, self._session, self._count = name, new_session(run), 0
 
     def ask(self, thing: ProcessStates | LogLines) -> None:
         self._count += 1

@@ -18,12 +18,13 @@ from afspm.supervisor.reporter import Reporter
 _LONGEST = 60
 
 
-def reporter(experiment: Experiment, starts: Sequence[Start], clock: Clock) -> Reporter | None:
+def reporter(experiment: Experiment, starts: Sequence[Start], clock: Clock, run: str = "") -> Reporter | None:
     """One for what is started here; None where the scheduler can't be asked, or is perhaps none of ours."""
     scheduler = next((start for start in starts if start.role is Role.SCHEDULER), None)
     here = re.sub(r"[^\w.-]+", "-", platform.node())[:_LONGEST] or "computer"
     if scheduler is None:
         launch = experiment.asking([start.launch.name for start in starts])
+        launch = launch and replace(launch, run=run)
         here = f"{here}-{os.getpid()}"  # there may be several parts on one computer
     else:
         launch = _local(scheduler)
@@ -38,4 +39,4 @@ def _local(scheduler: Start) -> Launch | None:
     address, keys = connectable(launch.sockets.serve), launch.keys
     if keys is not None and "folder" in keys:
         keys = {"folder": keys["folder"], address: launch.name}
-    return Launch(SUPERVISOR, sockets=Sockets(control=address), keys=keys)
+    return Launch(SUPERVISOR, sockets=Sockets(control=address), keys=keys, run=launch.run)

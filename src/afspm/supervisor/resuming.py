@@ -25,6 +25,7 @@ from afspm.supervisor import edited
 from afspm.supervisor import run as running
 from afspm.supervisor.common_clock import Common, new_identity
 from afspm.supervisor.ending import Why
+from afspm.supervisor.ports import require_free
 from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, Options, Run
 
 _OVER = {Why.EXPERIMENT_ENDED.name.lower(), Why.ALL_DONE.name.lower()}
@@ -101,6 +102,7 @@ def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -
     with locked(folder):
         _wait_until_gone(facts, folder)
         common = _common(experiment, options, facts, folder)
+        require_free(running.addresses_of(running.dry_run(experiment, options)))
         names = [*facts.get("processes", ()), *found.added]
         return running.go(experiment, options, common, folder, found.name, terminal, names)
 

@@ -24,7 +24,7 @@ from afspm.supervisor import aftermath, common_clock, reporting, run_folder
 from afspm.supervisor.aftermath import Ended
 from afspm.supervisor.common_clock import Common
 from afspm.supervisor.log import RunLog
-from afspm.supervisor.ports import FreePorts
+from afspm.supervisor.ports import FreePorts, require_free
 from afspm.supervisor.supervisor import Outcome, Supervisor
 from afspm.supervisor.task import from_start
 
@@ -75,6 +75,7 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     # whatever is wrong is told before a folder is made
     first = _starts(experiment, options, own, FreePorts())
     names = [start.launch.name for start in first]
+    require_free(addresses_of(first))
     common = _common(experiment, first, own, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, now())
     with locked(folder):
@@ -106,7 +107,7 @@ def go(
         if {start.launch.name for start in starts} & set(experiment.recorders):
             ahead.expect_record(folder / STATE_DIR)
         log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
-        reporter = reporting.reporter(experiment, starts, clock)
+        reporter = reporting.reporter(experiment, starts, clock, common.run)
         supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy(), reporter)
         outcome = supervisor.run()
         try:
@@ -119,6 +120,16 @@ def go(
     finally:
         log.close()
     return Run(folder, outcome)
+
+
+def addresses_of(starts: Sequence[Start]) -> dict[str, str]:
+    """The addresses that are bound here, with the names of who will."""
+    return {
+        address: start.launch.name
+        for start in starts
+        for address in (start.launch.sockets.publish, start.launch.sockets.serve)
+        if address is not None
+    }
 
 
 def facts_to_resume(experiment: Experiment, starts: Sequence[Start], options: Options) -> dict[str, object]:

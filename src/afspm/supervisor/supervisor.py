@@ -9,6 +9,7 @@ import logging
 import math
 import secrets
 import signal
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -24,7 +25,7 @@ from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed, describe_exit
 from afspm.supervisor.reaper import Reaper
-from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter
+from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter, SchedulerThere
 from afspm.supervisor.standing import Standing
 from afspm.supervisor.task import Task
 from afspm.supervisor.vital_signs import VitalSigns
@@ -37,6 +38,7 @@ _LEVELS = {Why.STOPPED: logging.INFO, Why.LOST: logging.CRITICAL}
 
 
 LOOK_S = 0.1  # between two looks at how it is with the processes, for those who are told
+BEGIN_ANYWAY_S = 15.0  # after which components no longer wait for the scheduler to answer
 START_AT_THE_END_S = 15.0  # what is started again at the end has so long to come up, and to hear what it missed
 
 
@@ -168,6 +170,9 @@ class Supervisor:
         self._reaper = Reaper()
         self._children = {task.name: self._child(task) for task in tasks}
         self._ending: Ending | None = None
+        self._scheduler_is_there = threading.Event()
+        if reporter is None or all(task.role is not Role.SCHEDULER for task in tasks):
+            self._scheduler_is_there.set()  # or nobody here can tell
         self._has_told_waiting = False
 
     def _child(self, task: Task) -> _Child:
@@ -239,6 +244,8 @@ class Supervisor:
                     self._on_signal(event)
                 case Ordered():
                     self._on_ordered(event.name)
+                case SchedulerThere():
+                    self._scheduler_is_there.set()
                 case Complaint():
                     self._log.write(LOGGED_AS, logging.WARNING, event.text)
 
@@ -314,6 +321,7 @@ class Supervisor:
         """Do what the time has come for."""
         self._wall.look()
         now_s = self._clock.monotonic_s()
+        self._begin_anyway(now_s)
         for child in self._children.values():
             child.look(now_s, self._policy.liveness)
         if self._ending is not None:
@@ -326,6 +334,17 @@ class Supervisor:
                 self._end(Why.LOST, "everything is given up")
             else:
                 self._end(Why.ALL_DONE, "all is done")
+
+    def _begin_anyway(self, now_s: float) -> None:
+        """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
+        if not self._scheduler_is_there.is_set() and any(
+            child.task.role is Role.SCHEDULER and child.up and now_s - child.started_s >= BEGIN_ANYWAY_S
+            for child in self._children.values()
+        ):
+            self._scheduler_is_there.set()
+            self._log.write(
+                LOGGED_AS, logging.WARNING, "the scheduler does not answer; the components begin all the same"
+            )
 
     def _carry_out(self, child: _Child, effects: Sequence[supervision.Effect]) -> None:
         for effect in effects:
@@ -357,6 +376,7 @@ class Supervisor:
                 task.folder,
                 task.hidden,
                 has_tip=task.role is Role.TRANSLATOR,
+                may_begin=self._scheduler_is_there if task.role is Role.COMPONENT else None,
             )
             self._reaper.watch(child.process.pid, has_tip=task.role is Role.TRANSLATOR)
             self._log.write(child.name, logging.DEBUG, f"started, process {child.process.pid}")
@@ -373,6 +393,7 @@ class Supervisor:
             self._log.write(LOGGED_AS, logging.CRITICAL, told)
 
     def _end(self, why: Why, text: str) -> None:
+        self._scheduler_is_there.set()
         if self._ending is None:
             now_s = self._clock.monotonic_s()
             self._ending = Ending.begin(why, text, now_s)

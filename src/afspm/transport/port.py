@@ -7,7 +7,7 @@ real one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from afspm.clock import Clock
@@ -107,10 +107,18 @@ class Port(Protocol):
 
 @dataclass(slots=True)
 class RequestReceived:
-    """A request for a server to answer, as frames for `wire.decode_request`; `user` is whose keys it came with."""
+    """A request for a server to answer, as frames for `wire.decode_request`.
+
+    Attributes:
+        user: whose keys it came with.
+        epoch: of the scheduler that asks; empty: it tells none.
+        connection: that it came by.
+    """
 
     frames: Sequence[bytes]
     user: str | None = None
+    epoch: bytes = b""
+    connection: bytes = field(default=b"", compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +150,9 @@ class ServerPort(Protocol):
 
         None: not at all, as if the answer was lost (a fault that a simulated microscope may be told to have).
         """
+
+    def is_connected(self, connection: bytes) -> bool:
+        """Whether the connection of a scheduler that told its epoch is still there."""
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
         """Publish; the time is the experiment's, made strictly increasing.

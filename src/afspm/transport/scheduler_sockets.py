@@ -25,13 +25,14 @@ class SchedulerSockets:
 
     Args:
         since_ns: up to which the translator's packets are known.
+        epoch: put before each request to the translator; empty: none.
 
     Raises:
         TransportError: an address can't be used.
         ConfigError: one is missing.
     """
 
-    def __init__(self, launch: Launched, complaints: Complaints, *, since_ns: int) -> None:
+    def __init__(self, launch: Launched, complaints: Complaints, *, since_ns: int, epoch: bytes = b"") -> None:
         sockets = launch.sockets
         if sockets.publish is None or sockets.serve is None or sockets.control is None or not sockets.subscribe:
             raise ConfigError(
@@ -42,7 +43,7 @@ class SchedulerSockets:
         self._wake_up: WakeUp[None] = WakeUp()
         self.publisher = Publisher(self._network, sockets.publish, _nothing)
         self.router = Router(self._network, sockets.serve, complaints)
-        self.link = TranslatorLink(self._network, sockets.control, complaints)
+        self.link = TranslatorLink(self._network, sockets.control, complaints, epoch)
         self.subscriber = Subscriber(
             self._network, launch.name, sockets.subscribe[0], None, complaints, since_ns=since_ns, filtered=False
         )

@@ -33,18 +33,24 @@ class LinkReply(NamedTuple):
 
 
 class TranslatorLink:
-    """Asks the translator, ours or of version 1: a REP socket gives back the number that stands before the empty frame,
-    so that a late answer is never taken for another's.
+    """Asks the translator, ours or of version 1.
+
+    A REP socket gives back what stands before the empty frame: a number, so that a late answer is never taken for
+    another's, and our epoch, by which a translator of ours obeys us alone.
 
     Before anything else it is asked, in a way that all understand, whether it is one of ours. One of version 1 is sent
-    no ids and no requests that it would end over.
+    no ids, no epoch and no requests that it would end over.
+
+    Args:
+        epoch: of the scheduler; empty: it has none.
 
     Attributes:
         version: of the translator that is there now.
     """
 
-    def __init__(self, network: Network, address: str, complaints: Complaints) -> None:
+    def __init__(self, network: Network, address: str, complaints: Complaints, epoch: bytes = b"") -> None:
         self._complaints = complaints
+        self._before = [epoch, b""] if epoch else [b""]
         self._address = address
         self.touched = True
         self.version = Version.UNKNOWN
@@ -62,21 +68,23 @@ class TranslatorLink:
             if not is_of_version_1(frames[0][0]):
                 return False
             frames = as_version_1(frames)
-        return send(self.socket, [b"%d" % number, b"", *frames])
+        before = self._before if self.version is Version.OURS else [b""]
+        return send(self.socket, [b"%d" % number, *before, *frames])
 
     def receive(self) -> LinkReply | LinkUp | None:
         """The next answer; None: there is none, or it is malformed."""
         self.touched = True
         _, frames = receive_small(self.socket)
-        if not frames:
+        if not frames or frames == [b""]:  # an empty one: the translator has looked whether we are there
             return None
         if frames[0] == _VERSION:
             self.version = Version.OURS if frames[2:] == [*ANSWER] else Version.ONE
             return LinkUp()
-        if len(frames) < 3 or frames[1] or not frames[0].isdigit() or len(frames[0]) > _LONGEST_NUMBER:
+        before, content = _parted(frames)
+        if not content or before[1:] not in ([], self._before[:-1]) or not before[0].isdigit():
             self._complaints.say(f"dropped a malformed answer from {self._address}")
             return None
-        return LinkReply(int(frames[0]), frames[2:])
+        return LinkReply(int(before[0][:_LONGEST_NUMBER]), content)
 
     def follow(self) -> list[LinkDown]:
         """The translator's going. One that comes is asked for its version; `receive` tells its answer."""
@@ -93,3 +101,11 @@ class TranslatorLink:
     def close(self) -> None:
         self.monitor.close()
         self.socket.close()
+
+
+def _parted(frames: list[bytes]) -> tuple[list[bytes], list[bytes]]:
+    """What stands before the first empty frame, and behind it; both are empty where there is none."""
+    if b"" not in frames[1:]:
+        return [], []
+    at = frames.index(b"", 1)
+    return frames[:at], frames[at + 1 :]

@@ -53,6 +53,7 @@ class ZmqServerPort:
         # A name belongs to its newest connection, else who connects anew before the old connection is found dead is
         # never heard. And what it says is never freed: the library keeps the queues of those that it does not hear.
         self._socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # so that it can be seen who is there
         self.serve_address = network.bind(self._socket, serve)
         self._poller = poller(self._wake_up)
         self._poller.register(self._socket, self._request, self)
@@ -104,16 +105,29 @@ class ZmqServerPort:
             elif parts[start:] == [*QUESTION] and property_of(first, "Socket-Type") == "DEALER":
                 self.reply(ANSWER)  # a REQ socket is that of a scheduler of version 1, which passes on what it is asked
             else:
-                return [RequestReceived(parts[start:], user)]
+                epoch = parts[start - 2] if start > 3 else b""
+                return [RequestReceived(parts[start:], user, epoch, parts[0])]
         return []
 
     def reply(self, frames: Sequence[bytes] | None) -> None:
         asker, self._asker = self._asker, None
         if asker is not None and frames is not None:
-            self.touched = True
             if self._asked_by_version_1 is not None:
                 frames = answer_as_version_1(self._asked_by_version_1, frames)
-            send(self._socket, [*asker, *frames])
+            self._send([*asker, *frames])
+
+    def is_connected(self, connection: bytes) -> bool:
+        return self._send([connection, b""])
+
+    def _send(self, frames: list[bytes]) -> bool:
+        """False if the peer is gone, or takes nothing."""
+        self.touched = True
+        try:
+            return send(self._socket, frames)
+        except zmq.ZMQError as error:
+            if error.errno != zmq.EHOSTUNREACH:
+                raise
+            return False
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
         if self._publisher is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import tempfile
 import threading
@@ -24,10 +23,12 @@ from afspm.record.facts import STATE_DIR
 from afspm.runtime.component import Component
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
+from afspm.runtime.process import new_session
 from afspm.supervisor import common_clock, run_folder
 from afspm.supervisor.common_clock import Common
 from afspm.supervisor.log import RunLog
-from afspm.supervisor.ports import FreePorts
+from afspm.supervisor.ports import FreePorts, require_free
+from afspm.supervisor.run import addresses_of
 from afspm.testing.translators.bench import Bench
 from afspm.testing.translators.processes import Processes
 from afspm.testing.translators.support import Support, find_out
@@ -169,6 +170,7 @@ def _bench(
     clock = common.clock
     folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
     own, starts = _starts(experiment, options, common, folder)
+    require_free(addresses_of(starts))
     log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
     stack.callback(log.close)
     run_folder.write_experiment(folder, experiment.expanded(secrets=False))
@@ -244,7 +246,7 @@ def _link(port: Port, own: Launch, log: logging.Logger) -> Link:
         port,
         NAME,
         source=own.sockets.subscribe[0],
-        session=os.urandom(4).hex(),
+        session=new_session(own.run),
         request_timeout_s=own.request_timeout_s,
         request_retries=own.request_retries,
         log=log,
