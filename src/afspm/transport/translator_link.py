@@ -81,10 +81,12 @@ class TranslatorLink:
             self.version = Version.OURS if frames[2:] == [*ANSWER] else Version.ONE
             return LinkUp()
         before, content = _parted(frames)
-        if not content or before[1:] not in ([], self._before[:-1]) or not before[0].isdigit():
+        number = before[0] if before else b""
+        is_ours = before[1:] in ([], self._before[:-1]) and number.isdigit() and len(number) <= _LONGEST_NUMBER
+        if not content or not is_ours:
             self._complaints.say(f"dropped a malformed answer from {self._address}")
             return None
-        return LinkReply(int(before[0][:_LONGEST_NUMBER]), content)
+        return LinkReply(int(number), content)
 
     def follow(self) -> list[LinkDown]:
         """The translator's going. One that comes is asked for its version; `receive` tells its answer."""
