@@ -77,6 +77,11 @@ class Liveness:
         self._step_began_s, self._longest_s = now_s - step_age_s, longest_s  # where it had no step, one may begin now
         self._deadline_s = now_s + self._policy.silence_s
 
+    def waits(self, now_s: float) -> None:
+        """It may not begin yet: the time that its start may take counts from now."""
+        if self._vital is Vital.STARTING:
+            self._deadline_s = now_s + self._policy.start_s
+
     def closing(self, now_s: float) -> None:
         """It says that it is closing on purpose."""
         self._vital = Vital.NOT_CLOSING

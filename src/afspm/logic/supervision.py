@@ -128,6 +128,11 @@ class ChildWatch:
             self._liveness.beat(now_s, beat.step_age_s or 0.0, beat.longest_step_s)
         return self.tick(now_s)
 
+    def waits(self, now_s: float) -> None:
+        """It is there, and may not begin yet."""
+        if self._liveness is not None:
+            self._liveness.waits(now_s)
+
     def exited(self, code: int, now_s: float, how: str = "") -> list[Effect]:
         """It ended, with an exit code or, below zero, by a signal; `how` says it for people."""
         how = how or f"exit code {code}"

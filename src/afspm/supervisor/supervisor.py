@@ -337,7 +337,12 @@ class Supervisor:
 
     def _begin_anyway(self, now_s: float) -> None:
         """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
-        if not self._scheduler_is_there.is_set() and any(
+        if self._scheduler_is_there.is_set():
+            return
+        for child in self._children.values():
+            if child.task.role is Role.COMPONENT:
+                child.watch.waits(now_s)
+        if any(
             child.task.role is Role.SCHEDULER and child.up and now_s - child.started_s >= BEGIN_ANYWAY_S
             for child in self._children.values()
         ):

@@ -18,6 +18,7 @@ from afspm.transport.wakeup import WakeUp
 from afspm.wire.version import ANSWER, QUESTION, answer_as_version_1
 
 _WITH_ID = 3  # frames of a request
+_WITHOUT_EPOCH = 3  # frames up to the empty one: connection, number; the epoch comes behind them
 
 
 class ZmqServerPort:
@@ -96,7 +97,9 @@ class ZmqServerPort:
             if start == len(parts):
                 continue  # somebody says its name, as to a scheduler
             self._asker = parts[:start]
-            self._asked_by_version_1 = int.from_bytes(parts[start][:1]) if len(parts) - start < _WITH_ID else None
+            epoch = parts[start - 2] if start > _WITHOUT_EPOCH else b""
+            is_of_version_1 = not epoch and len(parts) - start < _WITH_ID
+            self._asked_by_version_1 = int.from_bytes(parts[start][:1]) if is_of_version_1 else None
             user = user_of(first) if self._network.keys is not None else None
             allowed = self._allowed is None or self._network.keys is None or user == self._allowed
             if not allowed:
@@ -105,7 +108,6 @@ class ZmqServerPort:
             elif parts[start:] == [*QUESTION] and property_of(first, "Socket-Type") == "DEALER":
                 self.reply(ANSWER)  # a REQ socket is that of a scheduler of version 1, which passes on what it is asked
             else:
-                epoch = parts[start - 2] if start > 3 else b""
                 return [RequestReceived(parts[start:], user, epoch, parts[0])]
         return []
 

@@ -32,8 +32,9 @@ from afspm.supervisor.reporter import Reporter
 from afspm.supervisor.task import HOST, Task
 from afspm.transport import keys
 from afspm.transport.network import Network
-from afspm.transport.port import ControlConnected, PacketReceived, ReplyReceived
+from afspm.transport.port import ControlConnected, PacketReceived, ReplyReceived, RequestReceived
 from afspm.transport.zmq_port import ZmqPort
+from afspm.transport.zmq_server import ZmqServerPort
 
 CLOCK = ExperimentClock.real()
 Condition = ProcessCondition
@@ -189,6 +190,26 @@ def test_a_supervisor_whose_scheduler_is_not_there_works_and_ends_as_ever(run_ta
     running.terminal.wait_for("CRITICAL", "one is given up")
     _, two = running.stop().reports
     assert two.last_exit == "ended as it was asked to"
+
+
+def test_components_begin_once_their_own_scheduler_has_answered(run_tasks: RunTasks) -> None:
+    address = FreePorts().address()
+    asking = Launch("supervisor:lab", sockets=Sockets(control=address))
+    tasks = (peer("scheduler", Role.SCHEDULER), peer("one"), peer("microscope", Role.TRANSLATOR))
+    running = run_tasks(*tasks, reporter=Reporter(asking, CLOCK, "lab"))
+    running.terminal.wait_for(" microscope ", "life 1")
+    os.kill(running.pid("microscope"), signal.SIGKILL)
+    running.terminal.wait_for(" microscope ", "life 1", count=2)  # whoever was started with it has long had time
+    assert not any(" one " in line and "life 1" in line for line in running.terminal.lines)
+    port = ZmqServerPort(Network(), CLOCK, serve=address, publish=None)
+    try:
+        asked = None
+        while not isinstance(asked, RequestReceived):
+            asked = next(iter(port.poll(DEADLINE_S)), None)
+        port.reply(wire.encode_response(Response(0, id=wire.decode_request(asked.frames).id)))
+        running.terminal.wait_for(" one ", "life 1")
+    finally:
+        port.close()
 
 
 def test_a_key_that_is_missing_is_told_and_nothing_else_is_the_matter(tmp_path: Path, run_tasks: RunTasks) -> None:

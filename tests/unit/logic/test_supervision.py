@@ -109,6 +109,16 @@ def test_a_start_may_take_longer_than_a_beat() -> None:
     assert checked(life, 10.0, 9.9) is Vital.SLOW_START
 
 
+def test_a_process_that_may_not_begin_yet_is_not_late() -> None:
+    life = Liveness(QUICK, 0.0)
+    life.waits(8.0)
+    assert checked(life, 17.9) is Vital.STARTING
+    assert checked(life, 18.0, 17.9) is Vital.SLOW_START
+    life.beat(19.0)
+    life.waits(20.0)
+    assert checked(life, 22.0, 19.0) is Vital.SILENT, "it has begun"
+
+
 def test_after_its_last_beat_it_has_to_be_gone_soon() -> None:
     life = Liveness(QUICK, 0.0)
     life.beat(1.0)
