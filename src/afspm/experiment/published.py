@@ -166,10 +166,19 @@ def _within(value: Any, *keys: str) -> Any:
 
 
 def _estimator(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
-    descriptor = str(_within(value, "descriptor_type") or "BRIEF").rpartition(".")[2].lower()
-    if descriptor not in ("brief", "orb", "sift"):
-        raise InvalidValue(f"there is no estimator {descriptor!r}", hint="drift.estimator is brief, orb or sift")
-    return {"drift.estimator": descriptor}
+    """The published drift model: a descriptor and a transform, by the names of enumerations, fitted by RANSAC."""
+    given = {"descriptor_type": "BRIEF", "transform_type": "TRANSLATION", "fitting": "RANSAC"}
+    given |= {key: item for key, item in dict(value).items() if key != "class"}
+    known = {key: str(given.pop(key)).rpartition(".")[2].lower() for key in ("descriptor_type", "transform_type")}
+    if str(given.pop("fitting")).rpartition(".")[2] != "RANSAC" or given:
+        what = ", ".join(given) or "another fitting than RANSAC"
+        raise InvalidValue(f"{what} is not taken over", hint="drift.estimator has settings of its own")
+    return {
+        "drift.estimator.class": known["descriptor_type"],
+        "drift.estimator.transform": known["transform_type"],
+        "drift.tracker.class": "paper",
+        "drift.tracker.transform": known["transform_type"],
+    }
 
 
 def _oldest(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:

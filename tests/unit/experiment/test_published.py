@@ -208,6 +208,38 @@ def test_settings_of_the_drift_scheduler_are_those_of_the_paper_s_tracker(write:
     assert (drift["rescan"]["rule"], drift["rescan"]["f_rescan"]) == ("paper", 0.9)
 
 
+MODEL = """
+[model]
+class = "afspm.components.drift.drift.create_drift_model"
+descriptor_type = "afspm.components.drift.drift.DescriptorType.ORB"
+transform_type = "EUCLIDEAN"
+"""
+
+
+def test_the_published_drift_model_is_an_estimator(write: Write) -> None:
+    text = MODEL + DRIFT.replace("display_fit = false", 'drift_model = "model"')
+    experiment = published(write, text, PICTURE, SERIES)
+    assert errors(experiment) == []
+    drift = experiment.resolved.settings["mediator"]["drift"]
+    assert drift["estimator"] == {"class": "orb", "transform": "euclidean"}
+    assert drift["tracker"]["transform"] == "euclidean"
+
+
+@pytest.mark.parametrize("line", ['descriptor_type = "SURF"', "scan_res = [128, 128]", 'fitting = "LEAST_SQUARES"'])
+def test_a_drift_model_that_is_not_here_is_refused(write: Write, line: str) -> None:
+    model = (
+        MODEL.replace('transform_type = "EUCLIDEAN"', line)
+        if "descriptor" not in line
+        else f"""
+[model]
+class = "afspm.components.drift.drift.create_drift_model"
+{line}
+"""
+    )
+    text = model + DRIFT.replace("display_fit = false", 'drift_model = "model"')
+    assert errors(published(write, text, PICTURE, SERIES))
+
+
 @pytest.mark.parametrize(
     ("ours", "published_line"),
     [
