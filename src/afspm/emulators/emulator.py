@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 LONGEST_WAIT_S = 60.0
+_AGAIN_S = 1.0
+"""After an error that nobody foresaw, `tick` is called again after so long, experiment time."""
 FAREWELL_S = 0.5
 """So long, real time, a controller stays there when the experiment has ended: the translator stops the tip first."""
 
@@ -125,6 +127,9 @@ class Emulator(ABC):
     def serve(self, timeout_s: float) -> None:
         """Wait up to so many real seconds for clients or `woken`, and answer what has come.
 
+        Answer each request on its own, with an error of the vendor's where anything is raised: what gets as far as the
+        base is logged, and that client goes without an answer.
+
         Raises:
             Crashed: to vanish without an answer.
         """
@@ -143,6 +148,10 @@ class Emulator(ABC):
     def close(self) -> None:
         """Listen no more. Also called if `open` failed."""
 
+    def abandon(self) -> None:
+        """Give up what goes on, after `tick` or `serve` has raised an error. Extend it where more than the rig is busy."""
+        self.rig.abandon()
+
     # -- what is there for it
 
     def run(self, clock: Clock, folder: Path, log: logging.Logger, listening: Callable[[str], None]) -> None:
@@ -159,11 +168,11 @@ class Emulator(ABC):
         self.faults = Faults(self._faults, self.fault_kinds, clock.now_s())
         folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()
-        self.rig.wake = self.woken.post
+        self.rig.wake, self.rig.log = self.woken.post, log
         try:
             listening(self.open())
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
-                self.serve(self._wait_s())
+                self._survive(self.serve, self._wait_s())
                 self.woken.take()
         finally:
             self.close()
@@ -252,10 +261,25 @@ class Emulator(ABC):
         self._wake()
         port.close()
 
+    def _survive(self, do: Callable[[float], Any], argument: float) -> Any:
+        """Call it; an error that nobody foresaw ends what goes on, not the emulator: nothing that a client sends may.
+
+        Raises:
+            Crashed: as it was told to.
+        """
+        try:
+            return do(argument)
+        except Crashed:
+            raise
+        except Exception:
+            self.log.exception("the emulated %s gave up what it was doing, after an error of its own", self.vendor)
+            self.abandon()
+            return self.clock.now_s() + _AGAIN_S
+
     def _wait_s(self) -> float:
         """Real seconds until something happens by itself."""
         now_s = self.clock.now_s()
-        times = (self.tick(now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
+        times = (self._survive(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
         due_s = min((at_s for at_s in times if at_s is not None), default=math.inf)
         leave_in_s = self._leave_at_s - self.clock.monotonic_s()
         return max(0.0, min(LONGEST_WAIT_S, leave_in_s, self.clock.real_s(due_s - now_s)))

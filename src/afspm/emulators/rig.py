@@ -6,6 +6,7 @@ its own. Lengths in m in tip coordinates, angles in rad counter-clockwise, times
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
@@ -15,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.emulators.running import Drawn, InAir, Occupied, RunningScan, RunningSpectrum, noise_in_air
-from afspm.errors import AfspmError
+from afspm.emulators.running import RETRACE, Drawn, InAir, NotDrawn, Occupied, RunningScan, RunningSpectrum, noise_in_air
+from afspm.errors import AfspmError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
+from afspm.simulation.feedback import Loop
 from afspm.simulation.scanning import Course
 
 Doing = RunningScan | RunningSpectrum | Occupied
@@ -48,6 +50,7 @@ class Rig:
         engaged: whether the tip is at the sample; if not, all that is measured is noise.
         scan, spectrum: the last one that was started, also when it is over; None before the first.
         wake: called, from any thread, when something ends that no time was known for.
+        log: told of errors that nobody foresaw.
         world: the physics, for whoever judges what came of it (`world.truth`).
     """
 
@@ -72,10 +75,13 @@ class Rig:
         self.scan: RunningScan | None = None
         self.spectrum: RunningSpectrum | None = None
         self.wake: Callable[[], None] = lambda: None
+        self.log = logging.getLogger(__name__)
         self._background = background
         self._doing: Doing | None = None
         self._probe_m = self._came_from_m = (0.0, 0.0)
         self._scans = self._spectra = 0
+        self._noise = np.random.default_rng((seed, 3))
+        self._signals: Mapping[str, float] = {}
 
     # -- what goes on
 
@@ -110,6 +116,30 @@ class Rig:
             return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
         return self._probe_m
 
+    def signals(self, now_s: float) -> Mapping[str, float]:
+        """What each channel shows now, with its noise: along the line during a scan, else where the tip stands."""
+        random = self._noise
+        if not self.engaged:
+            kinds = {name: unit for name, unit in self._units.items() if not name.endswith(RETRACE)}
+            return {name: float(noise_in_air(random, (), unit)) for name, unit in kinds.items()}
+        scan = self.scan
+        if scan is not None and scan.drawing and self._signals:
+            return self._signals  # the world is one thread's at a time
+        self._wait_for_picture()
+        if scan is not None and scan is self._doing and scan.running(now_s):
+            self._signals = scan.signals(now_s)
+        else:
+            place = self.probe_at(now_s)
+            self._signals = self.world.at_rest(
+                place, now_s, self.feedback, self.bias_v, slope=self.slope, random=random
+            )
+        return self._signals
+
+    def hold(self, z_m: float) -> None:
+        """Leave z there while the feedback is off. Raises InvalidValue."""
+        self._wait_for_picture()
+        self.world.hold(z_m)
+
     @property
     def probe_m(self) -> tuple[float, float]:
         """Where the probe was sent, (x, y); spectra, pulses and crashes happen there."""
@@ -138,7 +168,7 @@ class Rig:
         )
         draw = self._drawer(scan)
         if self._background:
-            self._in_background(draw, drawn)
+            self._in_background(draw, scan)
         else:
             drawn.set_result(draw())
         self._scans += 1
@@ -168,6 +198,11 @@ class Rig:
         self._doing = self.spectrum
         return self.spectrum
 
+    def abandon(self) -> None:
+        """Give up whatever goes on; what it has of a scan's lines stays."""
+        self.stop_scan()
+        self._doing = None
+
     def stop_spectrum(self) -> None:
         """Break the spectrum off, if one is running: it is gone."""
         if isinstance(self._doing, RunningSpectrum) and self._doing.running(self.clock.now_s()):
@@ -177,8 +212,9 @@ class Rig:
         """Move the tip; the way takes its time. A move under way is turned to the new place.
 
         Raises:
-            RigBusy: with something else than a move.
+            RigBusy: with something else than a move. InvalidValue: no place.
         """
+        _finite("a place for the probe", *xy_m)
         now_s = self.clock.now_s()
         if self.doing(now_s) != "move":
             self._free_now_s()
@@ -201,6 +237,8 @@ class Rig:
 
     def crash(self, depth_m: float, speed_m_s: float) -> str:
         """Drive the tip into the sample where the probe is, and out again: as `pulse`."""
+        if not min(depth_m, speed_m_s) > 0.0:
+            raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="deeper and faster than nothing")
         now_s = self._free_now_s()
         outcome = self.world.crash(self._probe_m, depth_m, speed_m_s, now_s) if self.engaged else "unchanged"
         self.occupy("crash", 2.0 * depth_m / speed_m_s)
@@ -226,7 +264,8 @@ class Rig:
         self.occupy("approach", self.approach_s)
 
     def occupy(self, what: str, lasts_s: float) -> None:
-        """Be busy with anything else for so long. Raises RigBusy."""
+        """Be busy with anything else for so long. Raises RigBusy, InvalidValue."""
+        _finite("a time to be busy", lasts_s)
         now_s = self._free_now_s()
         self._doing = Occupied(what, now_s, now_s + lasts_s)
 
@@ -249,6 +288,8 @@ class Rig:
     def _drawer(self, scan: RunningScan) -> Callable[[], Drawn]:
         direction, slope = ("up" if scan.upwards else "down"), self.slope
         course = Course(scan.region, scan.shape, scan.line_s, scan.start_s, direction)
+        Loop.of(self.world.settings.feedback, scan.feedback)
+        _finite("bias and slope", scan.bias_v, *slope)
         if not self.engaged:
             air = InAir(self._units, course, (self.seed, 1, scan.number))
             return lambda: air
@@ -263,13 +304,21 @@ class Rig:
             slope=slope,
         )
 
-    def _in_background(self, draw: Callable[[], Drawn], drawn: Future[Drawn]) -> None:
+    def _in_background(self, draw: Callable[[], Drawn], scan: RunningScan) -> None:
         def work() -> None:
             try:
-                drawn.set_result(draw())
-            except BaseException as error:
-                drawn.set_exception(error)
+                drawn = draw()
+            except Exception:
+                self.log.exception("scan %d can't be simulated: it was broken off", scan.number)
+                drawn, scan.stopped_s = NotDrawn(self._units, scan.shape), scan.start_s
+            scan._drawn.set_result(drawn)
             self.wake()
 
         # not an executor's thread: those are waited for when the process ends
         Thread(target=work, daemon=True, name="simulated scan").start()
+
+
+def _finite(what: str, *values: float) -> None:
+    """Raises InvalidValue unless all are."""
+    if not all(map(math.isfinite, values)):
+        raise InvalidValue(f"{what}: {', '.join(map(str, values))}", hint="finite")

@@ -15,6 +15,8 @@ from afspm.simulation.scanning import Course
 
 Channels = dict[str, tuple[str, Array]]
 """Channel -> (unit, values [y, x], both ascending)."""
+RETRACE = " Retrace"
+"""What the name of a channel ends with that is recorded on the way back."""
 
 
 class Drawn(Protocol):
@@ -59,6 +61,7 @@ class RunningScan:
     bias_v: float
     stopped_s: float | None = None
     _drawn: Future[Drawn] = field(default_factory=Future, repr=False)
+    _whole: Channels | None = field(default=None, repr=False)
     _paused_since_s: float | None = None
     _paused_s: float = 0.0
 
@@ -110,6 +113,20 @@ class RunningScan:
         """
         drawn = self._drawn.result()
         return drawn.channels(None if until_s is None else self._scanned_until_s(until_s))
+
+    def signals(self, now_s: float) -> dict[str, float]:
+        """What each channel shows now; on the way back, those that are recorded there show that."""
+        if self._whole is None:
+            self._whole = self._drawn.result().channels()
+        rows, columns = self.shape
+        lines = (self._scanned_until_s(now_s) - self.start_s) / self.line_s
+        line = min(max(int(lines), 0), rows - 1)
+        along = 2.0 * min(max(lines - line, 0.0), 1.0)
+        column = min(int(columns * min(along, 2.0 - along)), columns - 1)
+        row = line if self.upwards else rows - 1 - line
+        forward = {name: data for name, data in self._whole.items() if not name.endswith(RETRACE)}
+        shown = {name: self._whole.get(f"{name}{RETRACE}", data) if along > 1.0 else data for name, data in forward.items()}
+        return {name: float(values[row, column]) for name, (_, values) in shown.items()}
 
     def pause(self, now_s: float) -> None:
         """Stay on the line until `resume`."""
@@ -182,6 +199,18 @@ class InAir:
             values[missing] = np.nan
             found[name] = (unit, values)
         return found
+
+
+@dataclass(frozen=True)
+class NotDrawn:
+    """A scan that could not be simulated: not one line."""
+
+    units: Mapping[str, str]
+    shape: tuple[int, int]
+
+    def channels(self, until_s: float | None = None) -> Channels:
+        """NaN."""
+        return {name: (unit, np.full(self.shape, np.nan)) for name, unit in self.units.items()}
 
 
 def noise_in_air(random: np.random.Generator, shape: tuple[int, ...], unit: str) -> Array:

@@ -101,6 +101,19 @@ def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Gene
     return Measured(channels, float(z[-1, -1]), float(np.maximum(-gap, 0.0).mean()))
 
 
+def at_rest(course: Course, felt_m: Felt, setup: Setup, random: np.random.Generator) -> dict[str, float]:
+    """Measure at the single pixel of a course, where the tip stands and the feedback has settled."""
+    loop = setup.loop
+    height = felt_m.height_m[0] + _tilt(course, (setup.scanner.tilt_x, setup.scanner.tilt_y))
+    z = height + (0.0 if loop.engages else loop.settings.range_m / 2)
+    if not loop.on and setup.held_z_m is not None:
+        z = np.full(height.shape, setup.held_z_m)
+    noise = setup.noise.white_m * random.standard_normal(height.shape)
+    channels = {"Height": ("m", z + noise - _tilt(course, setup.slope))}
+    channels.update(_signals(z - height, felt_m, course, setup, random))
+    return {name: float(values[0, 0]) for name, (_, values) in channels.items()}
+
+
 def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
     """The surface as the tips of the scan feel it at every pixel, without feedback and noise."""
     trace, retrace = (_sample_positions(course, setup, part) for part in (0.25, 0.75))

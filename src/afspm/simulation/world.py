@@ -22,7 +22,7 @@ from afspm.simulation.drift import Compensation, Drift
 from afspm.simulation.feedback import Loop
 from afspm.simulation.fields import Array
 from afspm.simulation.marks import Mark
-from afspm.simulation.measuring import Setup, measure
+from afspm.simulation.measuring import Felt, Setup, at_rest, feel, measure
 from afspm.simulation.scanning import Course, SimulatedScan
 from afspm.simulation.settings import build, nearest
 from afspm.simulation.surfaces import Relief, surface_from
@@ -41,6 +41,8 @@ from afspm.simulation.tip import (
 from afspm.simulation.world_settings import WorldSettings, read_settings
 
 STATE_VERSION = 1
+_POINT_M = 1e-12
+_SAME_PLACE_M = 20e-12
 
 
 class World:
@@ -65,6 +67,7 @@ class World:
         self._at_m = (0.0, 0.0)
         self._came_from_m, self._came_s = (0.0, 0.0), start_s
         self._held_z_m: float | None = None
+        self._felt_at_rest: tuple[Any, Felt] | None = None
         self._advance(start_s)
 
     @classmethod
@@ -128,6 +131,48 @@ class World:
             "pressed_m": measured.pressed_m,
         }
         return SimulatedScan(course, drift, truth, measured.channels)
+
+    def at_rest(
+        self,
+        position_m: tuple[float, float],
+        t_s: float,
+        feedback: Feedback | None = None,
+        bias_v: float = 0.1,
+        *,
+        slope: tuple[float, float] = (0.0, 0.0),
+        random: np.random.Generator,
+    ) -> dict[str, float]:
+        """What each channel shows while the tip stands at a place: nothing comes of having looked.
+
+        With the feedback off, z is where `hold` or the last scan has left it.
+
+        Args:
+            random: for the noise, so that what is measured otherwise stays the same.
+
+        Raises:
+            InvalidValue: feedback without sense, or what is not finite.
+        """
+        if not all(map(math.isfinite, (bias_v, *slope, *position_m))):
+            raise InvalidValue(f"bias {bias_v} V, slope {slope} and position {position_m} must be finite")
+        loop = Loop.of(self.settings.feedback, feedback)
+        course = Course(Region(position_m, (_POINT_M, _POINT_M)), (1, 1), 1e-3, t_s)
+        setup = self._setup(loop, bias_v, slope, t_s)
+        tip = self._tips.at(t_s)
+        where = [round(at_m / _SAME_PLACE_M) for at_m in (*self._on_sample(position_m, t_s), self.seen_drift_m(t_s)[2])]
+        key = (where, tip, len(self._marks))
+        if self._felt_at_rest is None or self._felt_at_rest[0] != key:
+            self._felt_at_rest = key, feel(course, [(t_s, tip)], setup)
+        return at_rest(course, self._felt_at_rest[1], setup, random)
+
+    def hold(self, z_m: float) -> None:
+        """Leave z there while the feedback is off.
+
+        Raises:
+            InvalidValue: no place.
+        """
+        if not math.isfinite(z_m):
+            raise InvalidValue(f"z can't be held at {z_m} m")
+        self._held_z_m = z_m
 
     def spectrum(
         self,

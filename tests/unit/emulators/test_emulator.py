@@ -86,3 +86,28 @@ def test_those_of_afspm_say_what_they_are(name: str) -> None:
     assert issubclass(found, Emulator)
     assert found.vendor
     assert all(found.fault_kinds.values())
+
+
+def test_an_error_that_nobody_foresaw_ends_what_goes_on_and_not_the_emulator(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Clumsy(Tiny):
+        def _answer(self, asked: str) -> None:
+            super()._answer(asked)
+            if asked == "scan":
+                raise ZeroDivisionError("of a request")
+
+        def tick(self, now_s: float) -> float | None:
+            scan = self.rig.scan
+            if scan is not None and scan.stopped_s is not None and not self.ended:
+                self.ended.append(scan.stopped_s)
+                raise ZeroDivisionError("of the end of a scan")
+            return None
+
+    clumsy = Clumsy(port=0)
+    with clumsy.running(tmp_path) as address:
+        assert ask(address, "scan", "hello") == ["1 scan", "1"]
+    assert [record.exc_info[1].args[0] for record in caplog.records if record.exc_info] == [  # type: ignore[index,union-attr]
+        "of a request",
+        "of the end of a scan",
+    ]

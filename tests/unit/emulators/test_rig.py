@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -195,3 +196,83 @@ def test_it_follows_the_sample_with_the_velocity_that_it_is_told(rig: Rig, clock
     world.compensate((0.0, 0.0), 1200.0)
     elsewhere = world.scan(rig.region, (8, 16), 0.5, 1300.0, rig.feedback, 0.1).channels()["Height"][1]
     assert np.corrcoef(ours.ravel(), elsewhere.ravel())[0, 1] < 0.999
+
+
+def test_a_tip_at_rest_shows_what_a_scan_shows_there_and_looking_changes_nothing(rig: Rig, clock: Any) -> None:
+    rig.region, rig.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
+    rig.move_probe((30e-9, -20e-9))
+    clock.t_s += 10.0
+    shown = [rig.signals(clock.t_s) for _ in range(20)]
+    scanned = rig.start_scan().channels()
+    looked_at = {name: np.array([signals[name] for signals in shown]) for name in shown[0]}
+    assert set(looked_at) == {name for name in scanned if not name.endswith("Retrace")}
+    for name, values in looked_at.items():
+        assert len(set(values)) == 20, "it has noise"
+        near = scanned[name][1][3:6, 3:6]
+        assert abs(values.mean() - near.mean()) < 5 * near.std() + 3 * values.std()
+    unseen = World.from_settings({}, 3, 1000.0)
+    unseen.scan(rig.region, (9, 9), 0.5, clock.t_s, rig.feedback, 0.1)
+    assert rig.world.state() == unseen.state()
+
+
+def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(rig: Rig, clock: Any) -> None:
+    scan = rig.start_scan()
+    picture = scan.channels()
+    clock.t_s = scan.start_s + 2 * rig.line_s + rig.line_s * 0.25 * 1.01
+    assert rig.signals(clock.t_s)["Height"] == picture["Height"][1][2, 8]
+    clock.t_s = scan.start_s + 2 * rig.line_s + rig.line_s * 0.999
+    assert rig.signals(clock.t_s)["Height"] == picture["Height Retrace"][1][2, 0]
+    rig.withdraw()
+    assert abs(rig.signals(clock.t_s)["Current"]) < 1e-13
+
+
+def test_with_the_feedback_off_the_current_follows_where_z_is_held(clock: Any) -> None:
+    rig = Rig({"feedback": {"mode": "current", "setpoint": 1e-10}}, 3, clock)
+    z_m = np.mean([rig.signals(clock.t_s)["Height"] for _ in range(50)])
+    rig.feedback = replace(rig.feedback, on=False)
+    rig.hold(float(z_m))
+    at = float(np.mean([rig.signals(clock.t_s)["Current"] for _ in range(50)]))
+    rig.hold(float(z_m) + 0.1e-9)
+    above = float(np.mean([rig.signals(clock.t_s)["Current"] for _ in range(50)]))
+    decay_m = rig.world.settings.feedback.decay_m
+    assert np.log(at / above) == pytest.approx(0.1e-9 / decay_m, abs=0.3)
+
+
+@pytest.mark.parametrize("size_m", [1e-300, 1e300])
+def test_a_frame_that_can_not_be_simulated_is_a_scan_broken_off(clock: Any, size_m: float) -> None:
+    rig = Rig({}, 3, clock)
+    rig.region, rig.shape = Region((0.0, 0.0), (size_m, size_m)), (16, 16)
+    scan = rig.start_scan()
+    picture = scan.channels()
+    rig.start_scan() if not scan.running(clock.t_s) else rig.stop_scan()
+    assert set(picture) == set(rig.channels)
+    if size_m > 1.0:
+        assert scan.stopped_s == scan.start_s
+        assert np.isnan(picture["Height"][1]).all()
+
+
+def test_what_makes_no_sense_is_refused_before_anything_begins(rig: Rig, clock: Any) -> None:
+    for change in (
+        {"feedback": replace(rig.feedback, setpoint=-1.0)},
+        {"feedback": replace(rig.feedback, integral_gain=-1.0)},
+        {"slope": (math.nan, 0.0)},
+        {"bias_v": math.inf},
+        {"line_s": 0.0},
+    ):
+        before = {name: getattr(rig, name) for name in change}
+        for name, value in change.items():
+            setattr(rig, name, value)
+        with pytest.raises(InvalidValue):
+            rig.start_scan()
+        for name, value in before.items():
+            setattr(rig, name, value)
+    rig.engaged = False
+    for begin in (
+        lambda: rig.move_probe((math.nan, 0.0)),
+        lambda: rig.pulse(1.0, math.nan),
+        lambda: rig.crash(1e-9, 0.0),
+    ):
+        with pytest.raises(InvalidValue):
+            begin()
+    assert not rig.busy(clock.t_s)
+    assert rig.scan is None
