@@ -67,10 +67,12 @@ bench: $(SETUP)
 bench-drift: $(SETUP)
 	@$(BIN)/python -m benchmarks.drift $(if $(QUICK),--quick)
 
-## malformed requests and packets: make soak MESSAGES=20000
+## malformed requests and packets, and random calls of every emulated controller: make soak MESSAGES=20000 CALLS=5000
 MESSAGES ?= 1000000
+CALLS ?= 50000
 soak: $(SETUP)
 	@$(BIN)/python -m benchmarks.soak $(MESSAGES)
+	@$(BIN)/python -m benchmarks.fuzz $(CALLS)
 
 ## nights with tip repair in which processes are killed and frozen: make chaos NIGHTS=100 CHAOS_SEED=1
 NIGHTS ?= 20

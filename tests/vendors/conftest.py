@@ -9,4 +9,5 @@ import pytest
 
 # vendor_bench is shared by the folders of the vendors
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[2]))  # `benchmarks` has the fuzzers, which serve here too
 pytest.register_assert_rewrite("vendor_bench")

@@ -149,7 +149,7 @@ class Emulator(ABC):
         """Listen no more. Also called if `open` failed."""
 
     def abandon(self) -> None:
-        """Give up what goes on, after `tick` or `serve` has raised an error. Extend it where more than the rig is busy."""
+        """Give up what goes on, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
         self.rig.abandon()
 
     # -- what is there for it

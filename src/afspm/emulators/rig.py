@@ -16,7 +16,16 @@ from typing import Any
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.emulators.running import RETRACE, Drawn, InAir, NotDrawn, Occupied, RunningScan, RunningSpectrum, noise_in_air
+from afspm.emulators.running import (
+    RETRACE,
+    Drawn,
+    InAir,
+    NotDrawn,
+    Occupied,
+    RunningScan,
+    RunningSpectrum,
+    noise_in_air,
+)
 from afspm.errors import AfspmError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
@@ -24,6 +33,9 @@ from afspm.simulation.feedback import Loop
 from afspm.simulation.scanning import Course
 
 Doing = RunningScan | RunningSpectrum | Occupied
+_MOST_AVERAGED = 32  # of more sweeps the noise is no less
+_FASTEST_DRIFT_M_S = 1e-6
+_SMALLEST_M, _LARGEST_M, _LONGEST_PIXEL = 1e-12, 200e-6, 1e4
 _FEW = (2, 2)  # pixels: enough to see which channels there are
 
 
@@ -118,22 +130,26 @@ class Rig:
 
     def signals(self, now_s: float) -> Mapping[str, float]:
         """What each channel shows now, with its noise: along the line during a scan, else where the tip stands."""
-        random = self._noise
+        scan, place = self.scan, self.probe_at(now_s)
         if not self.engaged:
-            kinds = {name: unit for name, unit in self._units.items() if not name.endswith(RETRACE)}
-            return {name: float(noise_in_air(random, (), unit)) for name, unit in kinds.items()}
-        scan = self.scan
+            return self._noise_alone()
         if scan is not None and scan.drawing and self._signals:
             return self._signals  # the world is one thread's at a time
         self._wait_for_picture()
         if scan is not None and scan is self._doing and scan.running(now_s):
             self._signals = scan.signals(now_s)
         else:
-            place = self.probe_at(now_s)
-            self._signals = self.world.at_rest(
-                place, now_s, self.feedback, self.bias_v, slope=self.slope, random=random
-            )
+            try:
+                self._signals = self.world.at_rest(
+                    place, now_s, self.feedback, self.bias_v, slope=self.slope, random=self._noise
+                )
+            except InvalidValue:  # nothing is met with such a feedback
+                self._signals = self._noise_alone()
         return self._signals
+
+    def _noise_alone(self) -> dict[str, float]:
+        kinds = {name: unit for name, unit in self._units.items() if not name.endswith(RETRACE)}
+        return {name: float(noise_in_air(self._noise, (), unit)) for name, unit in kinds.items()}
 
     def hold(self, z_m: float) -> None:
         """Leave z there while the feedback is off. Raises InvalidValue."""
@@ -180,20 +196,25 @@ class Rig:
         if self.scan is not None:
             self.scan.stop(self.clock.now_s())
 
-    def start_spectrum(self, kind: str) -> RunningSpectrum:
-        """Take a curve of a kind ("IV", "force") where the probe is.
+    def start_spectrum(self, kind: str, sweeps: int = 1) -> RunningSpectrum:
+        """Take a curve of a kind ("IV", "force") where the probe is, the mean of so many.
 
         Raises:
             RigBusy. InvalidValue: there is no such kind.
         """
         now_s = self._free_now_s()
-        names, units, values = self.world.spectrum(kind, self._probe_m, now_s, self.feedback, self.bias_v)
+        taken = [
+            self.world.spectrum(kind, self._probe_m, now_s, self.feedback, self.bias_v)
+            for _ in range(max(1, min(sweeps, _MOST_AVERAGED)))
+        ]
+        names, units, _ = taken[0]
+        values = np.mean([values for _, _, values in taken], axis=0)
         self._spectra += 1
         if not self.engaged:
             random = np.random.default_rng((self.seed, 2, self._spectra))
             for column, unit in list(enumerate(units))[1:]:  # the first is what is swept
                 values[:, column] = noise_in_air(random, values.shape[:1], unit)
-        end_s = now_s + self.world.spectrum_s(kind)
+        end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = RunningSpectrum(self._spectra, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
         return self.spectrum
@@ -228,6 +249,11 @@ class Rig:
         if self.doing(now_s) == "move":
             self._probe_m, self._doing = self.probe_at(now_s), None
 
+    def stop(self, what: str) -> None:
+        """Be free, if it is busy with what `occupy` was told."""
+        if self.doing(self.clock.now_s()) == what:
+            self._doing = None
+
     def pulse(self, voltage_v: float, duration_s: float) -> str:
         """A bias pulse where the probe is: "cured", "worsened" or "unchanged"."""
         now_s = self._free_now_s()
@@ -245,7 +271,13 @@ class Rig:
         return outcome
 
     def follow(self, velocity_m_per_s: tuple[float, float]) -> None:
-        """From now on the scanner moves along with the sample by itself, with this velocity (x, y)."""
+        """From now on the scanner moves along with the sample by itself, with this velocity (x, y).
+
+        Raises:
+            InvalidValue: faster than any drift.
+        """
+        if not max(map(abs, velocity_m_per_s)) <= _FASTEST_DRIFT_M_S:
+            raise InvalidValue(f"a drift of {velocity_m_per_s} m/s", hint=f"at most {_FASTEST_DRIFT_M_S} m/s")
         self._wait_for_picture()
         self.world.compensate(velocity_m_per_s, self.clock.now_s())
 
@@ -286,6 +318,7 @@ class Rig:
             wait([self.scan._drawn])
 
     def _drawer(self, scan: RunningScan) -> Callable[[], Drawn]:
+        _scannable(scan)
         direction, slope = ("up" if scan.upwards else "down"), self.slope
         course = Course(scan.region, scan.shape, scan.line_s, scan.start_s, direction)
         Loop.of(self.world.settings.feedback, scan.feedback)
@@ -316,6 +349,19 @@ class Rig:
 
         # not an executor's thread: those are waited for when the process ends
         Thread(target=work, daemon=True, name="simulated scan").start()
+
+
+def _scannable(scan: RunningScan) -> None:
+    """Raises InvalidValue: no scanner has such a frame; simulating it takes minutes, or more memory than there is."""
+    pixels = [size_m / count for size_m, count in zip(scan.region.size_m, scan.shape[::-1], strict=True)]
+    reach = all(_SMALLEST_M <= size_m <= _LARGEST_M for size_m in scan.region.size_m)
+    if not (reach and max(pixels) <= _LONGEST_PIXEL * min(pixels)):
+        raise InvalidValue(
+            f"a frame of {scan.region.size_m} m with {scan.shape[1]} x {scan.shape[0]} pixels can't be simulated",
+            hint=f"{_SMALLEST_M} to {_LARGEST_M} m, pixels less than {_LONGEST_PIXEL:g} times as long as wide",
+        )
+    if scan.start_s + scan.shape[0] * scan.line_s <= scan.start_s:
+        raise InvalidValue(f"a line of {scan.line_s} s can't be simulated", hint="a time that is not nothing")
 
 
 def _finite(what: str, *values: float) -> None:

@@ -95,6 +95,10 @@ class RunningScan:
         rows = self.shape[0]
         return max(0, min(done, rows - 1 if self.drawing and done >= rows else rows))
 
+    def passes(self, now_s: float) -> int:
+        """How many lines are complete, forward and backward each counted."""
+        return int((self._scanned_until_s(now_s) - self.start_s) / (self.line_s / 2) + 1e-9)
+
     def tip_m(self, now_s: float) -> tuple[float, float]:
         """Where the tip is: on its way along the line and back."""
         lines = (self._scanned_until_s(now_s) - self.start_s) / self.line_s
@@ -125,7 +129,9 @@ class RunningScan:
         column = min(int(columns * min(along, 2.0 - along)), columns - 1)
         row = line if self.upwards else rows - 1 - line
         forward = {name: data for name, data in self._whole.items() if not name.endswith(RETRACE)}
-        shown = {name: self._whole.get(f"{name}{RETRACE}", data) if along > 1.0 else data for name, data in forward.items()}
+        shown = {
+            name: self._whole.get(f"{name}{RETRACE}", data) if along > 1.0 else data for name, data in forward.items()
+        }
         return {name: float(values[row, column]) for name, (_, values) in shown.items()}
 
     def pause(self, now_s: float) -> None:

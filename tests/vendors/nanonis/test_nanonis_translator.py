@@ -339,10 +339,10 @@ def test_drift_compensation_is_switched_on_by_a_rate_and_off_by_none(bench: Make
     peer = made.start()
     peer.until(FREE)
     assert peer.set("x-drift-rate-x", "2", "pm/s").ok
-    on, x, y, *_ = made.emulator.panel.registers["drift"]
+    on, x, y, *_ = made.emulator.panel.registers.get("Piezo.DriftComp")
     assert (on, x, y) == (1, pytest.approx(2e-12), 0.0)
     assert peer.set("x-drift-rate-x", 0).ok
-    assert made.emulator.panel.registers["drift"][0] == 0
+    assert made.emulator.panel.registers.get("Piezo.DriftComp")[0] == 0
 
 
 def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
@@ -353,7 +353,7 @@ def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
     )
     peer.until(FREE)
     assert peer.set("x-tip-lift", "2", "nm").ok
-    assert made.emulator.panel.registers["ZCtrl.TipLift"] == (pytest.approx(2e-9),)
+    assert made.emulator.panel.registers.get("ZCtrl.TipLift") == (pytest.approx(2e-9),)
     assert peer.act("x-home").ok
     response = peer.act("x-wrong")
     assert response.code == ControlResponse.ACTION_ERROR
@@ -401,7 +401,7 @@ def test_every_release(bench: Make, release: str) -> None:
     assert scanned(peer)
     assert "release " in peer.get("x-controller")
     assert peer.set("x-drift-rate-y", "1", "pm/s").ok
-    assert made.emulator.panel.registers["drift"][2] == pytest.approx(1e-12)
+    assert made.emulator.panel.registers.get("Piezo.DriftComp")[2] == pytest.approx(1e-12)
 
 
 def test_a_session_folder_that_has_another_name_over_there(bench: Make) -> None:

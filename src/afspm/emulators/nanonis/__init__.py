@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
-from afspm.emulators.nanonis import on_curves, on_scans, on_signals, on_tip, panel, wire
+from afspm.emulators.nanonis import logger, on_curves, on_patterns, on_scans, on_signals, on_tip, panel, wire
 from afspm.emulators.nanonis.answers import Later, Nope, Results, answer
 from afspm.emulators.nanonis.panel import Panel
 from afspm.emulators.nanonis.server import Connection, Server
@@ -19,17 +20,36 @@ from afspm.units import Length
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
 """By the year of the software: the first that has what the protocol has from then on."""
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
-_ANSWERING: Final = (on_curves, on_scans, on_signals, on_tip)
+_ANSWERING: Final = (on_curves, on_patterns, on_scans, on_signals, on_tip)
 """What answers to the functions, by having been imported."""
+_LOGS_EVERY_S: Final = 0.005
+"""Real time between two looks at what the TCP Logger has to send."""
 _OTHER_NAME: Final = "Util.RTFreqGet"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request.
+
+    Attributes:
+        name: of the function as the protocol has it; sent: as the client has written it, which is echoed.
+    """
+
+    name: str
+    sent: str
+    wants_answer: bool
 
 
 @dataclass(frozen=True)
 class Waiting:
     """A reply that comes when something has happened."""
 
-    name: str
+    asked: Asked
     later: Later
+
+    @property
+    def name(self) -> str:
+        return self.asked.name
 
 
 @dataclass(frozen=True)
@@ -47,6 +67,7 @@ class NanonisEmulator(Emulator):
         release: of its software: a year of `RELEASES`, or the number itself.
         port: the first that it listens on; 0: any free.
         ports: how many, one after the other; where any is free, each is any.
+        logger_port: of the TCP Logger's stream; 0: any free one.
         one_each: whether a port serves one client at a time, as the real one's do.
         session_path: what it calls its session folder, e.g. "D:\\\\Data"; left out: what the folder is called here.
         range_m: of its scanner in x and y.
@@ -56,7 +77,7 @@ class NanonisEmulator(Emulator):
     """
 
     vendor = "Nanonis"
-    usual: ClassVar[Mapping[str, Any]] = {"port": 6501, "ports": 4}
+    usual: ClassVar[Mapping[str, Any]] = {"port": 6501, "ports": 4, "logger_port": logger.USUAL_PORT}
     fault_kinds: ClassVar[Mapping[str, str]] = {
         "no-reply": "a request is not answered",
         "slow": "a reply comes later, by the duration",
@@ -80,6 +101,7 @@ class NanonisEmulator(Emulator):
         *,
         release: str | int = "2025",
         ports: int = 1,
+        logger_port: int = 0,
         one_each: bool = False,
         session_path: str = "",
         range_m: Length = 100e-6,
@@ -90,6 +112,7 @@ class NanonisEmulator(Emulator):
         super().__init__(**settings)
         self.release = _release(release)
         self._ports = ports
+        self.logger_port = logger_port
         self._one_each = one_each
         self._session_path = session_path
         self._range_m = range_m
@@ -101,7 +124,15 @@ class NanonisEmulator(Emulator):
     def open(self) -> str:
         """Listen on all ports."""
         ports = [self.port + i if self.port else 0 for i in range(self._ports)]
-        self._server = Server(LOOPBACK, ports, one_each=self._one_each, wakes=self.woken, on_bytes=self._answer_all)
+        self._server = Server(
+            LOOPBACK,
+            ports,
+            stream_port=self.logger_port,
+            one_each=self._one_each,
+            wakes=self.woken,
+            on_bytes=self._answer_all,
+        )
+        self.logger_port = self._server.stream_port
         self.panel = Panel(
             self.rig,
             self.faults,
@@ -120,11 +151,24 @@ class NanonisEmulator(Emulator):
 
     def tick(self, now_s: float) -> float | None:
         """Scans end, files are written, and who has waited for that is answered."""
-        times = [self.panel.advance(now_s)]
+        times = [self.panel.advance(now_s), self._log_signals(now_s)]
         for connection in self._server.connections:
             times.append(self._go_on(connection, now_s))
             self._answer_all(connection)
         return min((at_s for at_s in times if at_s is not None), default=None)
+
+    def _log_signals(self, now_s: float) -> float | None:
+        """Send what the TCP Logger has to; returns when there is more."""
+        readers, panel = self._server.readers, self.panel
+        panel.logger.unread = [len(reader.sending) for reader in readers]
+        if not panel.logger.running:
+            return None
+        for counter in panel.logger.due(now_s):
+            values = panel.signal_values([panel.slots[slot] for slot in panel.logger.slots], now_s)
+            for reader in readers:
+                if len(reader.sending) < logger.MOST_WAITING:
+                    self._server.send(reader, panel.logger.frame(counter, values))
+        return max(panel.logger.next_s(), now_s + panel.experiment_s(_LOGS_EVERY_S))
 
     def _go_on(self, connection: Connection, now_s: float) -> float | None:
         """Send what was waited for, if it is there; returns when to look again."""
@@ -135,13 +179,22 @@ class NanonisEmulator(Emulator):
             connection.waits_for = None
             self._server.send(connection, waits.content)
         elif isinstance(waits, Waiting):
-            results = waits.later.ready(now_s)
-            if results is None and now_s >= waits.later.until_s:
-                results = waits.later.timed_out
-            if results is None:
-                return None if math.isinf(waits.later.until_s) else waits.later.until_s
-            connection.waits_for = None
-            self._reply(connection, waits.name, results)
+            with self._refusing(connection, waits.asked):
+                return self._settled(connection, waits, now_s)
+        return None
+
+    def _settled(self, connection: Connection, waits: Waiting, now_s: float) -> float | None:
+        """Reply if what was waited for has happened, or not in time; returns when to look again."""
+        later = waits.later
+        results = later.ready(now_s)
+        if results is None and now_s >= later.until_s:
+            results = later.timed_out
+            later.gave_up()
+        if results is None:
+            again_s = min(later.until_s, later.next_s(now_s))
+            return None if math.isinf(again_s) else again_s
+        connection.waits_for = None
+        self._reply(connection, waits.asked, results)
         return None
 
     def close(self) -> None:
@@ -165,31 +218,48 @@ class NanonisEmulator(Emulator):
                 return
             if request is None:
                 return
-            name, wants_answer, body = request
-            self._answer(connection, name, body, wants_answer, now_s)
+            sent, wants_answer, body = request
+            asked = Asked(wire.known_as(sent) or sent, sent, wants_answer)
+            with self._refusing(connection, asked):
+                self._answer(connection, asked, body, now_s)
 
-    def _answer(self, connection: Connection, name: str, body: bytes, wants_answer: bool, now_s: float) -> None:
+    @contextmanager
+    def _refusing(self, connection: Connection, asked: Asked) -> Iterator[None]:
+        """Answer with an error where something can't be: all that a client asks passes through here."""
+        try:
+            yield
+        except (Nope, RigBusy, InvalidValue, wire.Unreadable) as error:
+            self._refuse(connection, asked, str(error))
+        except Crashed:
+            raise
+        except Exception as error:
+            self.log.exception("%s failed", asked.name)
+            self._refuse(connection, asked, str(error))
+
+    def _refuse(self, connection: Connection, asked: Asked, reason: str) -> None:
+        connection.waits_for = None
+        if asked.wants_answer:
+            text = f"Error in command: {asked.sent.lower()}: {reason}"
+            body = wire.error_body(asked.name, text, self.release, bare=self._bare_errors)
+            self._send(connection, asked.sent, body)
+
+    def _answer(self, connection: Connection, asked: Asked, body: bytes, now_s: float) -> None:
+        name = asked.name
         if self.faults.strikes("crash", now_s):
             raise Crashed(f"at {name}")
         known = wire.functions().get(name)
-        try:
-            if known is None or known.since > self.release:
-                raise Nope(f"the function {name} is not known")
-            if self.faults.strikes("error", now_s):
-                raise Nope("an emulated error")
-            if name.endswith(_ACTS) and self.faults.strikes("refused", now_s):
-                raise Nope("it is not possible now")
-            arguments = wire.arguments(name, body, self._wire_release(now_s))
-            zeros = tuple(wire.ZEROS[code] for code, _ in known.results)
-            found = answer(self.panel, name, arguments, zeros)
-        except (Nope, RigBusy, InvalidValue, wire.Unreadable) as error:
-            if wants_answer:
-                self._send(connection, name, wire.error_body(name, str(error), self.release, bare=self._bare_errors))
-            return
+        if known is None or known.since > self.release:
+            raise Nope(f"the function {name} is not known")
+        if self.faults.strikes("error", now_s):
+            raise Nope("an emulated error")
+        if name.endswith(_ACTS) and self.faults.strikes("refused", now_s):
+            raise Nope("it is not possible now")
+        self.panel.client = connection.memory
+        found = answer(self.panel, name, wire.arguments(name, body, self._wire_release(now_s)))
         if isinstance(found, Later):
-            connection.waits_for = Waiting(name, found)
-        elif wants_answer:
-            self._reply(connection, name, found)
+            connection.waits_for = Waiting(asked, found)
+        else:
+            self._reply(connection, asked, found)
 
     def _wire_release(self, now_s: float) -> int:
         """The release by which the fields go."""
@@ -197,7 +267,9 @@ class NanonisEmulator(Emulator):
             return min(RELEASES.values()) if self.release > min(RELEASES.values()) else max(RELEASES.values())
         return self.release
 
-    def _reply(self, connection: Connection, name: str, results: Results) -> None:
+    def _reply(self, connection: Connection, asked: Asked, results: Results) -> None:
+        if not asked.wants_answer:
+            return
         now_s = self.clock.now_s()
         encoding = "utf-8"
         if self.faults.strikes("not-utf8", now_s):
@@ -205,9 +277,9 @@ class NanonisEmulator(Emulator):
             results = tuple(f"{value}\u00b5" if isinstance(value, str) else value for value in results)
         if any(isinstance(value, float) for value in results) and self.faults.strikes("nan", now_s):
             results = tuple(math.nan if isinstance(value, float) else value for value in results)
-        codes = wire.functions()[name].results
-        padded = (*results, *(wire.ZEROS[code] for code, _ in codes[len(results) :]))
-        self._send(connection, name, wire.body(name, padded, self._wire_release(now_s), encoding))
+        fields = wire.functions()[asked.name].results
+        padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
+        self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
 
     def _send(self, connection: Connection, name: str, body: bytes) -> None:
         """A reply, or what goes wrong with it."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Final
+
+import numpy as np
 
 from afspm.emulators.nanonis.panel import Panel
 
@@ -24,32 +26,28 @@ class Later:
     Attributes:
         ready: gives the results once it has.
         until_s: or at that time, experiment seconds, with `timed_out`.
+        gave_up: called when that time has come first.
+        next_s: when to look again, where nothing else tells.
     """
 
     ready: Callable[[float], Results | None]
     until_s: float = math.inf
     timed_out: Results = ()
+    gave_up: Callable[[], None] = lambda: None
+    next_s: Callable[[float], float] = lambda now_s: math.inf
 
 
 Answer = Results | Later
 Handler = Callable[..., Answer]
 HANDLERS: Final[dict[str, Handler]] = {}
 _NAMED: Final[set[Handler]] = set()
-REGISTERS_AT_FIRST: Final[dict[str, Results]] = {
-    "ZCtrl.SwitchOffDelay": (0.05,),
-    "ZCtrl.ZPos": (0.0,),
-    "BiasSpectr.Timing": (0.05, 0.0, 0.005, math.inf, 0.002, 0.001, 0.005, 0.2),
-    "BiasSpectr.AdvProps": (1, 1, 0, 0),
-    "ZSpectr.Range": (0.0, 120e-9),
-    "Bias.Calibr": (1.0, 0.0),
-    "Piezo.Sens": (3.8e-9, 3.8e-9, 0.9e-9),
-    "TipShaper.Props": (0.1, 0, 0.0, -1e-9, 0.1, 0.0, 0.1, 1e-9, 0.1, 0.1, 1),
-    "Util.RTFreq": (20e3,),
-    "Util.AcqPeriod": (0.02,),
-    "Util.RTOversampl": (10,),
-    "FolMe.Oversampl": (10, 0.01),
-    "SafeTip.Props": (0, 1, 1e-9),
-}
+_STORED: Final = (
+    "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
+    "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util",
+)  # fmt: skip
+"""The modules that are there: what is set in them is got again at least."""
+_MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
+"""A slew rate that is not limited is infinite."""
 
 
 def answers(*names: str) -> Callable[[Handler], Handler]:
@@ -64,31 +62,41 @@ def answers(*names: str) -> Callable[[Handler], Handler]:
     return marked
 
 
-def answer(panel: Panel, name: str, arguments: list[Any], zeros: Results) -> Answer:
+def answer(panel: Panel, name: str, arguments: list[Any]) -> Answer:
     """What is done and replied.
 
-    Args:
-        zeros: results where nothing else is known.
-
     Raises:
-        Nope, RigBusy.
+        Nope, RigBusy, InvalidValue.
     """
+    _refuse_no_numbers(name, arguments)
     handler = HANDLERS.get(name)
     if handler is not None:
         return handler(panel, *([name] if handler in _NAMED else []), *arguments)
-    register = name.removesuffix("Set").removesuffix("Get")
+    if name.partition(".")[0] not in _STORED:
+        raise Nope("Module not available")
     if name.endswith("Set"):
-        panel.registers[register] = tuple(arguments)
+        try:
+            panel.registers.set(name, arguments)
+        except ValueError as error:
+            raise Nope(str(error)) from error
         return ()
     if name.endswith("Get"):
-        at_first = REGISTERS_AT_FIRST.get(register, zeros)
-        kept = panel.registers.get(register, ())
-        return (*kept, *at_first[len(kept) :])  # some tell more than can be set
-    return zeros
+        return panel.registers.got(name, arguments)
+    raise Nope("it is not part of this emulator")
+
+
+def _refuse_no_numbers(name: str, arguments: Iterable[Any]) -> None:
+    """(!) How the real one takes NaN is not known."""
+    for argument in arguments:
+        if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":
+            values = np.asarray(argument)
+            if np.isnan(values).any() or (np.isinf(values).any() and name not in _MAY_BE_INFINITE):
+                raise Nope("a value is not a number")
 
 
 def deadline_s(panel: Panel, timeout_ms: int) -> float:
-    return math.inf if timeout_ms < 0 else panel.clock.now_s() + timeout_ms / 1000
+    """Experiment time at which a client's patience ends, which is counted in real time."""
+    return math.inf if timeout_ms < 0 else panel.clock.now_s() + panel.experiment_s(timeout_ms / 1000)
 
 
 def chosen(number: int, *choices: Any) -> Any:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from afspm.emulators.nanonis.answers import Answer, Later, Nope, Results, answers, chosen
-from afspm.emulators.nanonis.panel import MODULES, Panel, curve_columns
+from afspm.emulators.nanonis.panel import MODULES, MOST_POINTS, Panel, curve_columns
 from afspm.emulators.running import RunningSpectrum
 
 
 @answers("BiasSpectr.Open", "ZSpectr.Open")
 def _open(panel: Panel, name: str) -> Answer:
-    panel.registers[name] = (1,)
+    panel.opened.add(name.partition(".")[0])
     return ()
 
 
 def _module(panel: Panel, name: str) -> str:
     module = name.split(".")[0]
-    if f"{module}.Open" not in panel.registers:
+    if module not in panel.opened:
         raise Nope(f"the module {module} is not open")
     return module
 
@@ -39,8 +39,8 @@ def _start_curve(panel: Panel, name: str, get_data: int, base_name: str) -> Answ
 
 
 def _curve_data(curve: RunningSpectrum) -> Results:
-    """A row for each channel."""
-    return curve_columns(curve), curve.values.T, [*curve.position_m]
+    """A row for each channel; then the fixed parameters, and what else was set."""
+    return curve_columns(curve), curve.values.T, [*curve.position_m, float(curve.values[0, 0])]
 
 
 @answers("BiasSpectr.Stop", "ZSpectr.Stop")
@@ -54,37 +54,41 @@ def _stop_curve(panel: Panel, name: str) -> Answer:
 def _bias_props_set(
     panel: Panel, save_all: int, sweeps: int, backward: int, points: int, z_off_m: float, autosave: int, dialog: int
 ) -> Answer:
-    return _props_set(panel, "BiasSpectr", backward, points, autosave)
+    return _props_set(panel, "BiasSpectr", points, sweeps, (backward, autosave, save_all, dialog))
 
 
 @answers("ZSpectr.PropsSet")
 def _z_props_set(
     panel: Panel, backward: int, points: int, sweeps: int, autosave: int, dialog: int, save_all: int
 ) -> Answer:
-    return _props_set(panel, "ZSpectr", backward, points, autosave)
+    return _props_set(panel, "ZSpectr", points, sweeps, (backward, autosave, save_all, dialog))
 
 
-def _props_set(panel: Panel, module: str, backward: int, points: int, autosave: int) -> Answer:
+def _props_set(panel: Panel, module: str, points: int, sweeps: int, switches: tuple[int, int, int, int]) -> Answer:
     sweep = panel.sweeps[_module(panel, module)]
-    on = 1
-    changed = (chosen(backward, sweep.backward, on, 0), chosen(autosave, sweep.saves, on, 0))
-    if points < 0 or points == 1:
-        raise Nope(f"a spectrum of {points} points")
-    sweep.backward, sweep.saves = map(bool, changed)
-    sweep.points = points or sweep.points
+    if not (points == 0 or 2 <= points <= MOST_POINTS) or sweeps < 0:
+        raise Nope(f"a spectrum of {points} points, {sweeps} sweeps")
+    before = (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog)
+    on = True
+    now = [chosen(switch, was, on, not on) for switch, was in zip(switches, before, strict=True)]
+    sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog = now
+    sweep.points, sweep.sweeps = points or sweep.points, sweeps or sweep.sweeps
     return ()
 
 
 @answers("BiasSpectr.PropsGet", "ZSpectr.PropsGet")
 def _curve_props_get(panel: Panel, name: str) -> Answer:
     module = _module(panel, name)
-    sweep = panel.sweeps[module]
-    fixed, parameters, channels = ["X (m)", "Y (m)"], ["Sweep Start (V)"], ["Current (A)"]
+    sweep, channels = panel.sweeps[module], _channel_names(panel, module)
+    fixed, backward, saves, saves_all, dialog = (
+        ["X (m)", "Y (m)"],
+        *map(int, (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog)),
+    )
     if module == "BiasSpectr":
         points = sweep.points or panel.rig.world.settings.iv.points
-        return 0, 1, int(sweep.backward), points, channels, parameters, fixed
+        return saves_all, sweep.sweeps, backward, points, channels, ["Sweep Start (V)"], fixed, saves, dialog
     points = sweep.points or panel.rig.world.settings.force.points
-    return int(sweep.backward), points, parameters, fixed, 1, 0
+    return backward, points, channels, ["Sweep Start (m)"], fixed, sweep.sweeps, saves, dialog, saves_all
 
 
 @answers("BiasSpectr.LimitsSet")
@@ -99,7 +103,20 @@ def _limits_get(panel: Panel) -> Answer:
     return panel.sweeps["BiasSpectr"].limits or (-range_v, range_v)
 
 
+@answers("BiasSpectr.ChsSet", "ZSpectr.ChsSet")
+def _curve_channels_set(panel: Panel, name: str, indexes: list[int]) -> Answer:
+    module = _module(panel, name)
+    if not indexes or not all(0 <= index < len(panel.signals) for index in indexes):
+        raise Nope("there are no such channels")
+    panel.sweeps[module].channels = list(dict.fromkeys(indexes))
+    return ()
+
+
 @answers("BiasSpectr.ChsGet", "ZSpectr.ChsGet")
 def _curve_channels(panel: Panel, name: str) -> Answer:
-    indexes = panel.registers.get(f"{_module(panel, name)}.Chs", ([0],))[0]
-    return indexes, [panel.signals[index] for index in indexes]
+    module = _module(panel, name)
+    return panel.curve_channels(module), _channel_names(panel, module)
+
+
+def _channel_names(panel: Panel, module: str) -> list[str]:
+    return [panel.signals[index] for index in panel.curve_channels(module)]

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.nanonis.answers import Answer, Later, Nope, answers, chosen, deadline_s
+from afspm.emulators.nanonis.answers import Answer, Later, Nope, Results, answers, chosen, deadline_s
 from afspm.emulators.nanonis.panel import Panel
+from afspm.simulation.scanning import MOST_PIXELS
+
+_WAITED: Final = "waited"
+"""What is remembered of a client: how many scans had ended, and when, before it waits for the next end."""
+_PASTES: Final = (0, 1, 2)
 
 
 @answers("Scan.Action")
@@ -19,13 +24,16 @@ def _action(panel: Panel, action: int, direction: int) -> Answer:
             panel.rig.stop_scan()
             panel.advance(now_s)
         panel.begin_scan(bool(direction))
+        panel.client[_WAITED] = panel.ends, now_s
     elif action == 1:
         panel.rig.stop_scan()
     elif action == 2 and scan is not None:
         scan.pause(now_s)
     elif action == 3 and scan is not None:
         scan.resume(now_s)
-    elif action not in (2, 3, 4, 5, 6):
+    elif action == 6:
+        panel.rig.move_probe(panel.frame[:2])
+    elif action not in (2, 3, 4, 5):
         raise Nope(f"{action} is no action")
     return ()
 
@@ -38,11 +46,44 @@ def _scan_status(panel: Panel) -> Answer:
 
 @answers("Scan.WaitEndOfScan")
 def _wait_end_of_scan(panel: Panel, timeout_ms: int) -> Answer:
-    """Of the next end: one that has been is none."""
+    """Of the next end: one that has been is none.
+
+    A client's pause since it has begun the scan, or since its last wait has timed out, is taken to last as long in
+    experiment time as it does in real time, as if the clock went no faster.
+    """
     if panel.scanning is None and panel.faults.lasts("ends-at-once", panel.clock.now_s()):
         return 0, ""
-    ends = panel.ends
-    return Later(lambda _: (0, panel.last_path) if panel.ends > ends else None, deadline_s(panel, timeout_ms), (1, ""))
+    client, ends = panel.client, panel.ends
+    ends_before, since_s = client.pop(_WAITED, (ends, 0.0))
+    pause_s = panel.clock.real_s(panel.clock.now_s() - since_s)
+    if ends > ends_before and panel.ended_s > since_s + pause_s:
+        return 0, panel.last_path
+
+    def gave_up() -> None:
+        client[_WAITED] = panel.ends, panel.clock.now_s()
+
+    until_s = deadline_s(panel, timeout_ms)
+    return Later(lambda _: (0, panel.last_path) if panel.ends > ends else None, until_s, (1, ""), gave_up)
+
+
+@answers("Scan.WaitEndOfLine")
+def _wait_end_of_line(panel: Panel, timeout_ms: int) -> Answer:
+    """Of a line forward (0) or backward (1), its number counted from 1."""
+    scan = panel.rig.scan
+    timed_out = (1, 0, 0, 0)
+    if scan is None or not scan.running(panel.clock.now_s()):
+        return timed_out
+    passes = scan.passes(panel.clock.now_s())
+    first_pass = 1
+
+    def ready(now_s: float) -> Results | None:
+        over = scan.passes(now_s) > passes or not scan.running(now_s)
+        return (0, passes // 2 + 1, passes % 2, first_pass) if over else None
+
+    def next_s(now_s: float) -> float:
+        return now_s + scan.line_s / 2
+
+    return Later(ready, deadline_s(panel, timeout_ms), timed_out, next_s=next_s)
 
 
 @answers("Scan.FrameSet")
@@ -60,7 +101,7 @@ def _frame_get(panel: Panel) -> Answer:
 
 @answers("Scan.BufferSet")
 def _buffer_set(panel: Panel, channels: list[int], pixels: int, lines: int) -> Answer:
-    if not all(0 <= channel < 128 for channel in channels) or pixels < 1 or lines < 0:
+    if not all(0 <= channel < 128 for channel in channels) or not 1 <= pixels <= MOST_PIXELS or lines < 0:
         raise Nope("no such channel or number of pixels")
     panel.set_buffer(channels, pixels, lines)
     return ()
@@ -77,7 +118,7 @@ def _speed_set(panel: Panel, *speed: Any) -> Answer:
     forward, backward, forward_s, backward_s, keep, ratio = speed
     keeps_time = panel.speed[4] if keep == 0 else keep - 1
     width = panel.frame[2]
-    if min(forward, backward, forward_s, backward_s) <= 0.0 or keep > 2:
+    if not min(forward, backward, forward_s, backward_s) > 0.0 or keep > 2:
         raise Nope("no such speed")
     if keeps_time:
         forward, backward = width / forward_s, width / backward_s
@@ -99,9 +140,11 @@ def _props_set(
     panel.continuous = bool(chosen(continuous, panel.continuous, 1, 0))
     panel.bouncy = bool(chosen(bouncy, panel.bouncy, 1, 0))
     panel.autosave = chosen(autosave, panel.autosave, "all", "next", "off")
-    panel.series, panel.comment = series or panel.series, comment
+    panel.series, panel.comment = panel.name(series) or panel.series, comment
     if rest:
         panel.modules = rest[0]
+    if rest[1:]:
+        panel.autopaste = chosen(rest[1], panel.autopaste, *_PASTES)
     return ()
 
 
@@ -111,7 +154,7 @@ def _props_get(panel: Panel) -> Answer:
     table = [["Setpoint"] for _ in panel.modules]
     autosave = {"all": 0, "next": 1, "off": 2}[panel.autosave]
     flags = int(panel.continuous), int(panel.bouncy), autosave
-    return *flags, panel.series, panel.comment, panel.modules, counts, table, 3
+    return *flags, panel.series, panel.comment, panel.modules, counts, table, panel.autopaste
 
 
 @answers("Scan.FrameDataGrab")

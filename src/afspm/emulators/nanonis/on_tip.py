@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
-from afspm.emulators.nanonis.answers import REGISTERS_AT_FIRST, Answer, Nope, answers, chosen, until_free
+from afspm.emulators.nanonis.answers import Answer, Nope, answers, chosen, until_free
 from afspm.emulators.nanonis.panel import Panel
+
+_STEEPEST_DEG: Final = 45.0
+_TRACKED_S: Final = 60.0
 
 
 @answers("FolMe.XYPosSet")
@@ -47,7 +51,7 @@ def _stop_move(panel: Panel) -> Answer:
 
 @answers("ZCtrl.OnOffSet")
 def _z_on_off_set(panel: Panel, on: int) -> Answer:
-    delay_s = panel.registers.get("ZCtrl.SwitchOffDelay", REGISTERS_AT_FIRST["ZCtrl.SwitchOffDelay"])[0]
+    delay_s = panel.registers.get("ZCtrl.SwitchOffDelay")[0]
     panel.set_z_controller(panel.clock.now_s(), on=bool(on), off_delay_s=delay_s)
     return ()
 
@@ -66,7 +70,22 @@ def _z_status(panel: Panel) -> Answer:
 def _z_position_set(panel: Panel, z_m: float) -> Answer:
     if panel.z_controller == "on":
         raise Nope("the Z-Controller is on")
-    panel.registers["ZCtrl.ZPos"] = (z_m,)
+    panel.rig.hold(z_m)
+    return ()
+
+
+@answers("ZCtrl.ZPosGet")
+def _z_position_get(panel: Panel) -> Answer:
+    return (panel.z_m(panel.clock.now_s()),)
+
+
+@answers("ZCtrl.Home")
+def _home(panel: Panel) -> Answer:
+    """(!) Whether the real one refuses that while its controller is on is not known: here it is switched off."""
+    relative, home_m = (*panel.registers.get("ZCtrl.HomeProps"), 0, 0.0)[:2]
+    z_m = panel.z_m(panel.clock.now_s())
+    panel.set_z_controller(panel.clock.now_s(), on=False)
+    panel.rig.hold(home_m + (z_m if relative else 0.0))
     return ()
 
 
@@ -147,23 +166,28 @@ def _bias_get(panel: Panel) -> Answer:
 def _pulse(panel: Panel, wait: int, width_s: float, bias_v: float, hold: int, absolute: int) -> Answer:
     relative = 1
     panel.rig.pulse(bias_v + (panel.rig.bias_v if absolute == relative else 0.0), width_s)
+    panel.pulse_holds = hold == 1 if hold else panel.pulse_holds
     return until_free(panel, wait)
 
 
 @answers("TipShaper.Start")
 def _shape(panel: Panel, wait: int, timeout_ms: int) -> Answer:
-    props = panel.registers.get("TipShaper.Props", REGISTERS_AT_FIRST["TipShaper.Props"])
-    lift_m, lift_s = props[3:5]
+    props = panel.registers.get("TipShaper.Props")
+    lift_m, lift_s, restore = props[3], props[4], props[10]
     if lift_m < 0.0:
         panel.rig.crash(-lift_m, -lift_m / max(lift_s, 1e-6))
     else:
         panel.rig.occupy("shaper", lift_s)
+    if not restore:
+        panel.set_z_controller(panel.clock.now_s(), on=False)
     return until_free(panel, wait, timeout_ms)
 
 
 @answers("Piezo.TiltSet")
 def _tilt_set(panel: Panel, x_deg: float, y_deg: float) -> Answer:
-    panel.registers["Piezo.Tilt"] = (x_deg, y_deg)
+    if not max(abs(x_deg), abs(y_deg)) < _STEEPEST_DEG:
+        raise Nope("that is no tilt")
+    panel.registers.put("Piezo.Tilt", x_deg, y_deg)
     panel.rig.slope = (math.tan(math.radians(x_deg)), math.tan(math.radians(y_deg)))
     return ()
 
@@ -175,32 +199,60 @@ def _range(panel: Panel) -> Answer:
 
 @answers("Piezo.RangeSet")
 def _range_set(panel: Panel, *range_m: float) -> Answer:
+    if not min(range_m) > 0.0:
+        raise Nope("that is no range")
     panel.range_m = (range_m[0], range_m[1], range_m[2])
     return ()
 
 
 @answers("Piezo.DriftCompSet")
 def _drift_set(panel: Panel, on: int, *rest: float) -> Answer:
-    was_on, *_ = panel.registers.get("drift", (0,))
+    was_on, *_ = (*panel.registers.get("Piezo.DriftComp"), 0)
     x, y, z, *limit = rest
     now_on = chosen(on, was_on, 1, 0)
     panel.rig.follow((x, y) if now_on else (0.0, 0.0))
-    panel.registers["drift"] = (now_on, x, y, z, limit[0] if limit else 10.0)
+    panel.registers.put("Piezo.DriftComp", now_on, x, y, z, limit[0] if limit else 10.0)
     return ()
 
 
 @answers("Piezo.DriftCompGet")
 def _drift_get(panel: Panel) -> Answer:
-    on, x, y, z, limit = panel.registers.get("drift", (0, 0.0, 0.0, 0.0, 10.0))
+    on, x, y, z, limit = panel.registers.get("Piezo.DriftComp") or (0, 0.0, 0.0, 0.0, 10.0)
     return on, x, y, z, 0, 0, 0, limit
+
+
+@answers("AtomTrack.QuickCompStart", "AtomTrack.DriftComp")
+def _compensate(panel: Panel, *which: int) -> Answer:
+    """The drift that tracking an atom would have found is compensated from now on; a tilt there is none of."""
+    drift = 1
+    if which in ((), (drift,)):
+        now_s = panel.clock.now_s()
+        moved_m = panel.rig.world.drift_m([now_s - _TRACKED_S, now_s])
+        x, y, z = ((moved_m[1] - moved_m[0]) / _TRACKED_S).tolist()
+        return _drift_set(panel, 1, x, y, z)
+    return ()
 
 
 @answers("Motor.StartMove")
 def _motor(panel: Panel, direction: int, steps: int, group: int, wait: int) -> Answer:
+    """(!) Whether the real one refuses that during a scan or a withdrawal is not known; here it does."""
     if direction > 5:
         raise Nope(f"{direction} is no direction")
-    where = list(panel.registers.get("Motor.Pos", (0.0, 0.0, 0.0)))
-    where[direction // 2] += (-1 if direction % 2 else 1) * steps * 1e-7
-    panel.registers["Motor.Pos"] = tuple(where)
-    panel.rig.occupy("motor", steps * 0.001)
+    panel.start_motor(direction // 2, -steps if direction % 2 else steps)
     return until_free(panel, wait)
+
+
+@answers("Motor.StopMove")
+def _stop_motor(panel: Panel) -> Answer:
+    panel.stop_motor(panel.clock.now_s())
+    return ()
+
+
+@answers("Motor.PosGet")
+def _motor_position(panel: Panel, group: int, timeout_ms: int) -> Answer:
+    return panel.motor_at_m(panel.clock.now_s())
+
+
+@answers("AutoApproach.Open")
+def _open_approach(panel: Panel) -> Answer:
+    return ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 from typing import Any, Final
@@ -13,9 +13,12 @@ import numpy as np
 from afspm.clock import Clock
 from afspm.emulators.faults import Faults
 from afspm.emulators.nanonis import files
+from afspm.emulators.nanonis.logger import Logger
+from afspm.emulators.nanonis.registers import Registers
 from afspm.emulators.nanonis.sweeps import Sweep
 from afspm.emulators.rig import Rig
-from afspm.emulators.running import RunningScan, RunningSpectrum
+from afspm.emulators.running import RETRACE, RunningScan, RunningSpectrum
+from afspm.errors import InvalidValue
 from afspm.model import Region
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -33,9 +36,23 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
 }
 MODULES: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
 _PIXELS_AT_ONCE: Final = 16
-_SIGNALS: Final = {"Current": 0, "Height": 14, "Phase": 16, "Amplitude": 17}
+MOST_POINTS: Final = 1 << 16
+"""Of a spectrum."""
+CURRENT: Final = 0
+_BIAS: Final = 24
+_SIGNALS: Final = {"Current": CURRENT, "Height": 14, "Phase": 16, "Amplitude": 17}
+_OF_CURVES: Final = {"Deflection": (20, "m"), "Force": (21, "N"), "dI/dV": (22, "S")}
+"""Signals of spectra alone, with their units."""
+_SLOTS: Final = 24
+_NO_FILE_NAME: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in range(32)}
+_LONGEST_NAME: Final = 200
+_STEP_M: Final = 100e-9
+_STEP_S: Final = 1e-3
 _NAMES: Final = {"Height": "Z"}
-_COLUMNS: Final = {"Bias": "Bias calc", "Z": "Z rel"}
+_SWEPT: Final = {"Bias": "Bias calc", "Z": "Z rel"}
+_CURVE_CHANNELS: Final = {"BiasSpectr": (CURRENT, 22), "ZSpectr": (20, 21)}
+"""What the simulated curves have."""
+_Z_AVERAGED: Final = 20
 _EXPERIMENTS: Final = {"IV": "bias spectroscopy", "force": "Z spectroscopy"}
 _BASE_NAMES: Final = {"IV": "Bias-Spectroscopy", "force": "Z-Spectroscopy"}
 
@@ -60,7 +77,11 @@ class Panel:
         frame: x, y, width, height in m, angle clockwise in degrees.
         speed: forward, backward in m/s and s a line, whether the time is kept (and not the speed), their ratio.
         autosave: "all", "next" or "off".
-        ends: how many scans have ended; `last_path` where the last was saved.
+        ends: how many scans have ended; `ended_s` when the last, `last_path` where it was saved.
+        slots: the signals in the 24 slots of the Signals Manager.
+        logger: the TCP Logger.
+        client: what is remembered of the client that asks just now.
+        pulse_holds: whether the z controller is on hold during a pulse.
         z_controller: "off", "on" or "safe"; `z_follows_s` is when it follows what was set.
     """
 
@@ -78,6 +99,7 @@ class Panel:
     ) -> None:
         self.rig, self.faults, self.clock = rig, faults, clock
         self.folder, self.session_path = folder, session_path or str(folder)
+        self._root, self._root_path = self.folder, self.session_path
         self.range_m = (range_m, range_m, 2e-6)
         self.signals = _signal_names(rig.channels)
         self.channels = sorted(_SIGNALS[name] for name in rig.channels if name in _SIGNALS)
@@ -92,14 +114,22 @@ class Panel:
         self.curve_name, self.curves_ended = "", 0
         self.sweeps = {module: Sweep() for module in MODULES}
         self.curve_names = dict(_BASE_NAMES)
-        self.ends, self.last_path = 0, ""
+        self.ends, self.ended_s, self.last_path = 0, -math.inf, ""
+        self.slots = [*_SIGNALS.values(), _BIAS, *(n for n in range(128) if n not in (*_SIGNALS.values(), _BIAS))][
+            :_SLOTS
+        ]
+        self.logger = Logger()
+        self.client: dict[str, Any] = {}
+        self.opened: set[str] = set()
+        self.autopaste, self.pulse_holds = 2, True
+        self._motor_m, self._motor_walks = (0.0, 0.0, 0.0), (0, 0, 0.0)
         self.z_controller = "on" if rig.feedback.on else "off"
         self.z_follows_s = 0.0
         self.own_speed, self.own_speed_m_s = True, rig.move_speed_m_s
-        self.registers: dict[str, tuple[Any, ...]] = {}
+        self.registers = Registers()
         self._late: list[tuple[float, Path, bytes]] = []
         self._starts: tuple[float, bool] | None = None
-        self._saved = {".sxm": 0, ".dat": 0}
+        self._saved: dict[tuple[str, str], int] = {}
         self.release, self.rows_as_recorded = release, rows_as_recorded
 
     # --- what happens by itself ---
@@ -117,7 +147,7 @@ class Panel:
         due = [late for late in self._late if late[0] <= now_s]
         self._late = [late for late in self._late if late[0] > now_s]
         for _, path, content in due:
-            path.write_bytes(content)
+            self._write(path, content)
         starts = [] if self._starts is None else [self._starts[0]]
         return min((*starts, *(late[0] for late in self._late)), default=None)
 
@@ -157,7 +187,7 @@ class Panel:
         path = self.save_scan(ended, now_s) if finished and self._saves(now_s) else ""
         if not (path and self.faults.strikes("stale-name", now_s)):
             self.last_path = path
-        self.ends += 1
+        self.ends, self.ended_s = self.ends + 1, ended.scan.end_s
         if finished and self.continuous:
             self.start_scan(ended.scan.upwards != self.bouncy)
 
@@ -170,8 +200,31 @@ class Panel:
     def start_curve(self, module: str, base_name: str) -> None:
         """Raises RigBusy."""
         kind = MODULES[module]
-        self.curve_names[kind] = base_name or self.curve_names[kind]
-        self.curve = self.sweeps[module].of(self.rig.start_spectrum(kind))
+        self.curve_names[kind] = self.name(base_name) or self.curve_names[kind]
+        sweep = self.sweeps[module]
+        curve = sweep.of(self.rig.start_spectrum(kind, sweep.sweeps))
+        self.curve = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
+
+    def _recorded(self, curve: RunningSpectrum, channels: list[int]) -> RunningSpectrum:
+        """The channels that were chosen; one that the simulated curve does not have does not change during it."""
+        names, units, columns = [curve.names[0]], [curve.units[0]], [curve.values[:, 0]]
+        for index in channels:
+            having = [k for k, name in enumerate(curve.names) if _curve_signal(name) == index]
+            for k in having:
+                names.append(curve.names[k])
+                units.append(curve.units[k])
+                columns.append(curve.values[:, k])
+            if not having:
+                name, unit = _name_and_unit(self.signals[index])
+                names.append(name)
+                units.append(unit)
+                columns.append(np.full(len(curve.values), self.signal_values([index], curve.start_s)[0]))
+        return replace(curve, names=tuple(names), units=tuple(units), values=np.stack(columns, axis=1))
+
+    def curve_channels(self, module: str) -> list[int]:
+        """The indexes of the signals that a module records."""
+        chosen = self.sweeps[module].channels
+        return list(_CURVE_CHANNELS[module]) if chosen is None else chosen
 
     def stop_curve(self) -> None:
         if self.curve is not None:
@@ -215,14 +268,20 @@ class Panel:
         """It follows after the delay; switched on it brings a withdrawn tip back."""
         self.z_controller = "on" if on else "off"
         self.z_follows_s = now_s + (0.0 if on else off_delay_s)
+        if not on and self.rig.feedback.on and self.rig.engaged and self.scanning is None:
+            lift_m = (*self.registers.get("ZCtrl.TipLift"), 0.0)[0]
+            self.rig.hold(float(np.mean([self.z_m(now_s) for _ in range(_Z_AVERAGED)])) + lift_m)
         self.rig.feedback = replace(self.rig.feedback, on=on)
         if on:
             self.rig.engaged = True
 
     def z_status(self, now_s: float) -> int:
         """Off 1, on 2, hold 3, switching off 4, safe tip 5, withdrawing 6."""
-        if self.rig.doing(now_s) == "approach" and not self.rig.engaged:
+        doing = self.rig.doing(now_s)
+        if doing == "approach" and not self.rig.engaged:
             return 6
+        if self.z_controller == "on" and (doing in ("crash", "shaper") or (doing == "pulse" and self.pulse_holds)):
+            return 3
         if self.z_controller == "off" and now_s < self.z_follows_s:
             return 4
         return {"off": 1, "on": 2, "safe": 5}[self.z_controller]
@@ -230,6 +289,65 @@ class Panel:
     def z_is_on(self, now_s: float) -> bool:
         """As the real-time part has it."""
         return self.z_status(now_s) in (2, 4)
+
+    def set_session_path(self, path: str) -> None:
+        """A folder within that of the session at the start. Raises InvalidValue."""
+        root = self._root_path.rstrip("\\/")
+        folders = path[len(root) :].replace("\\", "/").strip("/").split("/")
+        if path.rstrip("\\/") != root and not path.startswith((f"{root}/", f"{root}\\")):
+            raise InvalidValue(f"Session Path not valid: {path!r}", hint=f"{root}, or a folder in it")
+        folder = self._root
+        for name in filter(None, folders):
+            folder = folder / self.name(name)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self.session_path = folder, path
+
+    def name(self, text: str) -> str:
+        """What part of a file's name may be. Raises InvalidValue: Windows, where Nanonis runs, can't have it."""
+        if not _NO_FILE_NAME.isdisjoint(text) or len(text) > _LONGEST_NAME or text.strip(". ") != text:
+            raise InvalidValue(f"{text!r} can't be part of a file's name")
+        return text
+
+    def experiment_s(self, real_s: float) -> float:
+        """How long that is in experiment time."""
+        return real_s / self.clock.real_s(1.0)
+
+    # --- what is measured ---
+
+    def signal_values(self, indexes: Sequence[int], now_s: float) -> list[float]:
+        """Of signals, all of the same moment; those that nothing is connected to are zero."""
+        shown = self.rig.signals(now_s)
+        values = {_SIGNALS[name]: value for name, value in shown.items() if name in _SIGNALS}
+        values |= {_SIGNALS["Height"]: self._z_m(shown["Height"]), _BIAS: self.rig.bias_v}
+        return [values.get(index, 0.0) for index in indexes]
+
+    def z_m(self, now_s: float) -> float:
+        """Where the tip is in z."""
+        return self._z_m(self.rig.signals(now_s)["Height"])
+
+    def _z_m(self, shown_m: float) -> float:
+        """A tip that is withdrawn is at the upper end."""
+        return shown_m if self.rig.engaged else self.range_m[2] / 2 + shown_m
+
+    def start_motor(self, axis: int, steps: int) -> None:
+        """Walk along X, Y or Z (0, 1, 2). Raises RigBusy."""
+        now_s = self.clock.now_s()
+        at_m = self.motor_at_m(now_s)
+        self.rig.occupy("motor", abs(steps) * _STEP_S)
+        self._motor_m, self._motor_walks = at_m, (axis, steps, now_s)
+
+    def stop_motor(self, now_s: float) -> None:
+        """Stay where the motor has come to."""
+        self._motor_m, self._motor_walks = self.motor_at_m(now_s), (0, 0, now_s)
+        self.rig.stop("motor")
+
+    def motor_at_m(self, now_s: float) -> tuple[float, float, float]:
+        """Where the motor has come to, of all the steps that it was told."""
+        axis, steps, since_s = self._motor_walks
+        walked = math.copysign(min(abs(steps), (now_s - since_s) / _STEP_S), steps)
+        at_m = list(self._motor_m)
+        at_m[axis] += int(walked) * _STEP_M
+        return at_m[0], at_m[1], at_m[2]
 
     # --- pictures and files ---
 
@@ -239,13 +357,12 @@ class Panel:
         found = {}
         for channel, (unit, values) in drawn.items():
             if channel in _SIGNALS:
-                back = drawn.get(f"{channel} Retrace", (unit, values))[1]
+                back = drawn.get(f"{channel}{RETRACE}", (unit, values))[1]
                 found[_SIGNALS[channel]] = (_NAMES.get(channel, channel), unit, values, back)
         nothing = np.zeros(scanning.scan.shape)
         for index in scanning.channels:
             if index not in found:
-                name, _, unit = self.signals[index].removesuffix(")").rpartition(" (")
-                found[index] = (name, unit, nothing, nothing)
+                found[index] = (*_name_and_unit(self.signals[index]), nothing, nothing)
         return {index: found[index] for index in scanning.channels}
 
     def save_scan(self, ended: Scanning, now_s: float) -> str:
@@ -279,8 +396,7 @@ class Panel:
             [(index, *image) for index, image in images.items()],
             self._settings(ended, images),
         )
-        self._save(name, files.sxm(saved), now_s)
-        return path
+        return path if self._save(name, files.sxm(saved), now_s) else ""
 
     def told_path(self, name: str) -> str:
         """How a file of the session is called on the controller's computer."""
@@ -323,28 +439,37 @@ class Panel:
     def _next_name(self, base: str, digits: int, suffix: str) -> str:
         """The next number of which there is no file yet."""
         while True:
-            self._saved[suffix] += 1
-            name = f"{base}{self._saved[suffix]:0{digits}d}{suffix}"
+            number = self._saved[base, suffix] = self._saved.get((base, suffix), 0) + 1
+            name = f"{base}{number:0{digits}d}{suffix}"
             if not (self.folder / name).exists():
                 return name
 
-    def _save(self, name: str, content: bytes, now_s: float) -> None:
+    def _save(self, name: str, content: bytes, now_s: float) -> bool:
+        """Save it, as well as the faults allow. Returns whether a file can be told of."""
         path = self.folder / name
         if self.faults.strikes("file-missing", now_s):
-            return
+            return True
         late, half = self.faults.strikes("file-late", now_s), self.faults.strikes("half-file", now_s)
         if late or half:
             self._late.append((now_s + (late or half).duration_s, path, content))  # type: ignore[union-attr]
-        if not late:
-            path.write_bytes(content[: len(content) // 2] if half else content)
+        return bool(late) or self._write(path, content[: len(content) // 2] if half else content)
+
+    def _write(self, path: Path, content: bytes) -> bool:
+        try:
+            path.write_bytes(content)
+        except OSError as error:
+            self.rig.log.warning("%s can't be written: %s", path, error)
+            return False
+        return True
 
 
 def curve_columns(curve: RunningSpectrum) -> list[str]:
-    """As Nanonis names them: "Current [bwd] (A)"."""
+    """As Nanonis names them: "Current [bwd] (A)"; what is swept comes first, and has a name of its own."""
     columns = []
     for name, unit in zip(curve.names, curve.units, strict=True):
-        forward = name.removesuffix(" Retrace")
-        columns.append(f"{_COLUMNS.get(forward, forward)}{'' if forward == name else ' [bwd]'} ({unit})")
+        forward = name.removesuffix(RETRACE)
+        called = forward if columns else _SWEPT.get(forward, forward)
+        columns.append(f"{called}{'' if forward == name else ' [bwd]'} ({unit})")
     return columns
 
 
@@ -353,5 +478,18 @@ def _signal_names(units: Mapping[str, str]) -> list[str]:
     signals = [f"Input {number + 1} (V)" for number in range(128)]
     for name, index in _SIGNALS.items():
         signals[index] = f"{_NAMES.get(name, name)} ({units.get(name, 'V')})"
-    signals[24] = "Bias (V)"
+    for name, (index, unit) in _OF_CURVES.items():
+        signals[index] = f"{name} ({unit})"
+    signals[_BIAS] = "Bias (V)"
     return signals
+
+
+def _name_and_unit(signal: str) -> tuple[str, str]:
+    name, _, unit = signal.removesuffix(")").rpartition(" (")
+    return name, unit
+
+
+def _curve_signal(column: str) -> int | None:
+    """The index of the signal of a simulated curve's column."""
+    name = column.removesuffix(RETRACE)
+    return _SIGNALS.get(name) if name in _SIGNALS else _OF_CURVES.get(name, (None,))[0]

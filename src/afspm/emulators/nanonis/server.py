@@ -20,6 +20,7 @@ class Connection:
         received: what has not been answered yet; sending: what has not been sent yet.
         waits_for: what the reply to the current request is waiting for; nothing else is answered meanwhile.
         closing: nothing more is answered; it ends once all has been sent.
+        memory: what the controller remembers of the client.
     """
 
     socket: socket.socket
@@ -27,6 +28,7 @@ class Connection:
     sending: bytearray = field(default_factory=bytearray)
     waits_for: Any = None
     closing: bool = False
+    memory: dict[str, Any] = field(default_factory=dict)
 
 
 class Server:
@@ -34,38 +36,56 @@ class Server:
 
     Args:
         ports: to listen on; 0: any free one.
+        stream_port: whoever connects there only reads; 0: any free one, None: there is none.
         one_each: a port serves one client at a time; another waits until that has gone.
         wakes: something with a `fileno` that ends `poll`.
         on_bytes: called with a connection that has more in `received`.
     """
 
     def __init__(
-        self, host: str, ports: list[int], *, one_each: bool, wakes: Any, on_bytes: Callable[[Connection], None]
+        self,
+        host: str,
+        ports: list[int],
+        *,
+        stream_port: int | None = None,
+        one_each: bool,
+        wakes: Any,
+        on_bytes: Callable[[Connection], None],
     ) -> None:
         self._one_each = one_each
+        self._stream: socket.socket | None = None
         self._on_bytes = on_bytes
         self._selector = selectors.DefaultSelector()
         self._listeners: list[socket.socket] = []
         self._of: dict[Connection, socket.socket] = {}
         self._selector.register(wakes, selectors.EVENT_READ, None)
         try:
-            for port in ports:
-                listener = socket.create_server((host, port))
-                listener.settimeout(0)
-                self._listeners.append(listener)
-                self._selector.register(listener, selectors.EVENT_READ, listener)
+            self._listeners = [self._listener(host, port) for port in ports]
+            if stream_port is not None:
+                self._stream = self._listener(host, stream_port)
         except OSError:
             self.close()
             raise
 
     @property
     def ports(self) -> list[int]:
-        """That are listened on."""
+        """That are listened on for requests."""
         return [int(listener.getsockname()[1]) for listener in self._listeners]
 
     @property
+    def stream_port(self) -> int:
+        """That of the stream; 0 without one."""
+        return 0 if self._stream is None else int(self._stream.getsockname()[1])
+
+    @property
     def connections(self) -> list[Connection]:
-        return list(self._of)
+        """Of the clients that ask."""
+        return [connection for connection, listener in self._of.items() if listener is not self._stream]
+
+    @property
+    def readers(self) -> list[Connection]:
+        """Of those who have connected to the stream."""
+        return [connection for connection, listener in self._of.items() if listener is self._stream]
 
     def poll(self, timeout_s: float) -> None:
         """Wait for clients up to so many real seconds, and deal with what has come."""
@@ -104,17 +124,23 @@ class Server:
         connection.closing = True
         self._selector.unregister(connection.socket)
         connection.socket.close()
-        if self._one_each:
+        if self._one_each and listener is not self._stream:
             self._selector.register(listener, selectors.EVENT_READ, listener)
 
     def close(self) -> None:
-        for connection in self.connections:
+        for connection in self._of:
             connection.socket.close()
-        for listener in self._listeners:
+        for listener in (*self._listeners, *filter(None, [self._stream])):
             listener.close()
         self._of.clear()
         self._listeners.clear()
         self._selector.close()
+
+    def _listener(self, host: str, port: int) -> socket.socket:
+        listener = socket.create_server((host, port))
+        listener.settimeout(0)
+        self._selector.register(listener, selectors.EVENT_READ, listener)
+        return listener
 
     def _accept(self, listener: socket.socket) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -124,7 +150,7 @@ class Server:
             connection = Connection(client)
             self._of[connection] = listener
             self._selector.register(client, selectors.EVENT_READ, connection)
-            if self._one_each:
+            if self._one_each and listener is not self._stream:
                 self._selector.unregister(listener)
 
     def _read(self, connection: Connection) -> None:
@@ -137,5 +163,6 @@ class Server:
         if not received:
             self.cut(connection)
             return
-        connection.received += received
-        self._on_bytes(connection)
+        if self._of[connection] is not self._stream:
+            connection.received += received
+            self._on_bytes(connection)

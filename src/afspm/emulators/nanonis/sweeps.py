@@ -17,14 +17,20 @@ class Sweep:
         points: how many; None: as many as the simulated curve has.
         limits: first and last value of what is swept; None: those of the simulated curve. Beyond it nothing changes
             any more.
+        sweeps: how many are averaged.
+        channels: indexes of the signals that are recorded; None: all that the simulated curve has.
         backward: whether it is swept back, too.
-        saves: whether a file is written.
+        saves: whether a file is written; saves_all: of every sweep, which is only told; dialog: so is this.
     """
 
     points: int | None = None
     limits: tuple[float, float] | None = None
+    sweeps: int = 1
+    channels: list[int] | None = None
     backward: bool = True
     saves: bool = True
+    saves_all: bool = False
+    dialog: bool = False
 
     def of(self, curve: RunningSpectrum) -> RunningSpectrum:
         """The same curve, swept like this."""

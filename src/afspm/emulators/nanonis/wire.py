@@ -5,6 +5,7 @@ Written apart from the translator's, which it is to be tested against.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from collections.abc import Mapping, Sequence
@@ -17,15 +18,16 @@ import numpy as np
 
 HEADER_BYTES: Final = 40
 _LARGEST_BODY: Final = 1 << 20
+_LARGEST_SINGLE: Final = float(np.finfo(np.float32).max)
+_NEVER: Final = 1 << 31
+_FIELD: Final = re.compile(r"(?P<code>[^@?=-]+)(?P<mark>\?|-|=-?\d+)?(?:@(?P<since>\d+))?(?:@<(?P<until>\d+))?")
+_SIZES: Final[Mapping[str, int]] = {code: struct.calcsize(f">{code}") for code in "BHIifd"}
 ZEROS: Final[Mapping[str, Any]] = {
-    **dict.fromkeys("HIi", 0),
+    **dict.fromkeys("HIin", 0),
     **dict.fromkeys("fd", 0.0),
     "S": "",
-    "A": [],
-    "[i]": [],
-    "[f]": [],
+    **dict.fromkeys(("A", "2S", *(f"[{code}]" for code in _SIZES), *(f"*{code}" for code in (*_SIZES, "S"))), ()),
     "2f": np.zeros((0, 0)),
-    "2S": [],
 }
 
 
@@ -34,18 +36,45 @@ class Unreadable(Exception):
 
 
 @dataclass(frozen=True)
-class Function:
-    """One function: the codes of its fields, each with the first release that has it, and its own."""
+class Field:
+    """One field of a request or a reply.
 
-    arguments: tuple[tuple[str, int], ...]
-    results: tuple[tuple[str, int], ...]
+    Attributes:
+        code: as in `functions.txt`.
+        since, until: the first release that has it, and the first that has it no more.
+        mark: how what is set is got: see `functions.txt`.
+    """
+
+    code: str
+    since: int = 0
+    until: int = _NEVER
+    mark: str = ""
+
+    @classmethod
+    def of(cls, text: str) -> Field:
+        found = _FIELD.fullmatch(text)
+        if found is None:
+            raise ValueError(text)
+        since, until = found["since"] or 0, found["until"] or _NEVER
+        return cls(found["code"], int(since), int(until), found["mark"] or "")
+
+    def is_in(self, release: int) -> bool:
+        return self.since <= release < self.until
+
+
+@dataclass(frozen=True)
+class Function:
+    """One function: its fields, and the first release that has it."""
+
+    arguments: tuple[Field, ...]
+    results: tuple[Field, ...]
     since: int
 
     def argument_codes(self, release: int) -> list[str]:
-        return [code for code, since in self.arguments if since <= release]
+        return [field.code for field in self.arguments if field.is_in(release)]
 
     def result_codes(self, release: int) -> list[str]:
-        return [code for code, since in self.results if since <= release]
+        return [field.code for field in self.results if field.is_in(release)]
 
 
 @cache
@@ -55,17 +84,22 @@ def functions() -> Mapping[str, Function]:
     for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
         if line and not line.startswith("#"):
             name, arguments, results, *since = re.split(" {2,}", line)
-            found[name] = Function(_codes(arguments), _codes(results), int(since[0]) if since else 0)
+            found[name] = Function(_fields(arguments), _fields(results), int(since[0]) if since else 0)
     return found
 
 
-def _codes(column: str) -> tuple[tuple[str, int], ...]:
-    codes = []
-    for field in column.split():
-        if field != "-":
-            code, _, since = field.partition("@")
-            codes.append((code, int(since or 0)))
-    return tuple(codes)
+@cache
+def _by_lower_case() -> Mapping[str, str]:
+    return {name.lower(): name for name in functions()}
+
+
+def known_as(name: str) -> str | None:
+    """How the table has the name, of which neither case counts; None if it does not have it."""
+    return _by_lower_case().get(name.lower())
+
+
+def _fields(column: str) -> tuple[Field, ...]:
+    return tuple(Field.of(text) for text in column.split() if text != "-")
 
 
 def split(received: bytearray) -> tuple[str, bool, bytes] | None:
@@ -94,10 +128,11 @@ def arguments(name: str, body: bytes, release: int) -> list[Any]:
     Raises:
         Unreadable: too few or too many bytes.
     """
-    at, found = 0, []
+    at, found, count = 0, [], 0
     try:
         for code in functions()[name].argument_codes(release):
-            value, at = _unpacked(code, body, at)
+            value, at = _unpacked(code, body, at, count)
+            count = value if code == "n" else count
             found.append(value)
     except struct.error as error:
         raise Unreadable(f"{len(body)} bytes of arguments are too few for {name}") from error
@@ -106,22 +141,39 @@ def arguments(name: str, body: bytes, release: int) -> list[Any]:
     return found
 
 
-def _unpacked(code: str, body: bytes, at: int) -> tuple[Any, int]:
-    if len(code) == 1 and code in "HIifd":
-        return struct.unpack_from(f">{code}", body, at)[0], at + struct.calcsize(f">{code}")
+def _unpacked(code: str, body: bytes, at: int, count: int) -> tuple[Any, int]:
+    """A value, and where the next begins; `count` is that of the lists which share one."""
+    if code in _SIZES:
+        return struct.unpack_from(f">{code}", body, at)[0], at + _SIZES[code]
+    if code.startswith("*"):
+        return _items(code[1], count, body, at)
     if code == "A":
         at += 4  # the size in bytes, which clients reckon in different ways
-    (count,) = struct.unpack_from(">i", body, at)
+    (number,) = struct.unpack_from(">i", body, at)
     at += 4
+    if code == "n":
+        return number, at
     if code == "S":
-        return struct.unpack_from(f">{max(count, 0)}s", body, at)[0].decode("utf-8", "replace"), at + max(count, 0)
+        end = at + max(number, 0)
+        return struct.unpack_from(f">{max(number, 0)}s", body, at)[0].decode("utf-8", "replace"), end
     if code == "A":
-        texts = []
-        for _ in range(count):
-            text, at = _unpacked("S", body, at)
-            texts.append(text)
-        return texts, at
-    return list(struct.unpack_from(f">{max(count, 0)}{code[1]}", body, at)), at + 4 * max(count, 0)
+        return _items("S", number, body, at)
+    if code == "2f":
+        (columns,) = struct.unpack_from(">i", body, at)
+        values, at = _items("f", max(number, 0) * max(columns, 0), body, at + 4)
+        return np.reshape(values, (max(number, 0), max(columns, 0))), at
+    return _items(code[1], number, body, at)
+
+
+def _items(code: str, count: int, body: bytes, at: int) -> tuple[list[Any], int]:
+    count = max(count, 0)
+    if code in _SIZES:
+        return list(struct.unpack_from(f">{count}{code}", body, at)), at + count * _SIZES[code]
+    texts = []
+    for _ in range(count):
+        text, at = _unpacked("S", body, at, 0)
+        texts.append(text)
+    return texts, at
 
 
 def reply(name: str, body: bytes) -> bytes:
@@ -132,7 +184,7 @@ def reply(name: str, body: bytes) -> bytes:
 def body(name: str, results: Sequence[Any], release: int, encoding: str = "utf-8") -> bytes:
     """Of a reply without an error."""
     values = zip(functions()[name].results, results, strict=True)
-    packed = (_packed(code, value, encoding) for (code, since), value in values if since <= release)
+    packed = (_packed(field.code, value, encoding) for field, value in values if field.is_in(release))
     return b"".join(packed) + error_block("", 0)
 
 
@@ -161,6 +213,13 @@ def _packed(code: str, value: Any, encoding: str) -> bytes:
         rows, columns = len(value), max(map(len, value), default=0)
         cells = (cell for row in value for cell in [*row, *[""] * (columns - len(row))])
         return struct.pack(">ii", rows, columns) + b"".join(_packed("S", cell, encoding) for cell in cells)
-    if code in ("[i]", "[f]"):
-        return struct.pack(f">i{len(value)}{code[1]}", len(value), *value)
+    if code.startswith("["):
+        return struct.pack(">i", len(value)) + b"".join(_packed(code[1], one, encoding) for one in value)
+    if code.startswith("*"):
+        return b"".join(_packed(code[1], one, encoding) for one in value)
+    if code == "f" and abs(value) > _LARGEST_SINGLE:
+        return struct.pack(">f", math.copysign(math.inf, value))
+    if code in "BHIin":  # what was set with a sign may be got without one
+        size = _SIZES[code.replace("n", "i")]
+        return (int(value) % (1 << 8 * size)).to_bytes(size, "big")
     return struct.pack(f">{code}", value)

@@ -1,0 +1,159 @@
+"""The frame of the fuzzers: an emulator runs in a thread, gets random calls, and must answer afterwards as before."""
+
+from __future__ import annotations
+
+import logging
+import random
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Generic, TypeVar
+
+from afspm.clock import ExperimentClock
+from afspm.emulators.emulator import Emulator
+
+CHECKED_EVERY: Final = 200
+_TOLD: Final = 40
+"""So many calls before the end are told when an emulator is found unfit."""
+_SPEED: Final = 300.0
+_SESSION: Final = "session"
+
+Emulated = TypeVar("Emulated", bound=Emulator)
+
+
+class Unfit(AssertionError):
+    """An emulator ended, no longer answers, failed at a request, or wrote where it should not."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of a fuzzer came to.
+
+    Attributes:
+        answered: calls with a result; refused: with an error of the vendor's; silent: without an answer.
+    """
+
+    answered: int
+    refused: int
+    silent: int
+
+
+class Fuzzer(ABC, Generic[Emulated]):
+    """One vendor's random calls. Write the abstract methods; all are called from one thread.
+
+    Args:
+        emulator: to be called, on any free port.
+        chance: all that is random comes from it.
+    """
+
+    def __init__(self, emulator: Emulated, chance: random.Random) -> None:
+        self.emulator = emulator
+        self.chance = chance
+
+    @abstractmethod
+    def connect(self, address: str) -> None:
+        """Connect to the emulator, also again after a connection was lost."""
+
+    @abstractmethod
+    def call(self) -> tuple[str, bool | None]:
+        """Make one call, of any kind.
+
+        Returns:
+            What was called, to be read by a person; and whether it was answered with a result, refused with an error,
+            or (None) not answered, which is right for some.
+        """
+
+    @abstractmethod
+    def check(self) -> None:
+        """Put an ordinary question, on a connection of its own. Raises Unfit, OSError: it is not answered as ever."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of all connections."""
+
+    def integer(self, *usual: int) -> int:
+        """One of the usual values as a rule, else one at a border."""
+        if usual and self.chance.random() < 0.8:
+            return self.chance.choice(usual)
+        return self.chance.choice((0, 1, 2, 3, 6, 7, 24, 127, 128, 255, 500, 65535, 2**31 - 1, -1, -2, -(2**31)))
+
+    def number(self, *usual: float) -> float:
+        """One of the usual values as a rule, else one that is not."""
+        if usual and self.chance.random() < 0.7:
+            return self.chance.choice(usual)
+        nan, huge, small = float("nan"), 3e38, 1e-38
+        odd = (0.0, -0.0, 1.0, -1.0, small, -small, huge, -huge, nan, float("inf"), -float("inf"), 1e-9, -1e-9)
+        return self.chance.choice(odd) * self.chance.choice((1.0, 1.0, self.chance.random()))
+
+    def text(self, *usual: str) -> str:
+        """One of the usual values as a rule, else one that no file can be called, and the like."""
+        if usual and self.chance.random() < 0.6:
+            return self.chance.choice(usual)
+        odd = (
+            "",
+            ".",
+            "..",
+            "../outside",
+            "a/b",
+            "/tmp/afspm-fuzz/x",
+            "a\\b",
+            "nul\0byte",
+            "C:\\x",
+            "ä€",
+            "%s%n",
+            "x" * 400,
+        )
+        return self.chance.choice(odd)
+
+
+def fuzz(kind: type[Fuzzer[Any]], emulator: Emulator, folder: Path, count: int, seed: int = 1) -> Outcome:
+    """Run so many calls.
+
+    Args:
+        folder: an empty one, in which the emulator has a folder of its own.
+
+    Raises:
+        Unfit: with the seed and the last calls.
+    """
+    fuzzer = kind(emulator, random.Random(seed))
+    told: deque[str] = deque(maxlen=_TOLD)
+    counts = {True: 0, False: 0, None: 0}
+    mishaps = _Mishaps()
+    log = logging.getLogger(f"emulated {emulator.vendor}")
+    log.addHandler(mishaps)
+    try:
+        with emulator.running(folder / _SESSION, ExperimentClock.starting_now(speed=_SPEED)) as address:
+            fuzzer.connect(address)
+            try:
+                for number in range(1, count + 1):
+                    called, answered = fuzzer.call()
+                    told.append(called)
+                    counts[answered] += 1
+                    if number % CHECKED_EVERY == 0 or number == count:
+                        fuzzer.check()
+                    if mishaps.texts:
+                        raise Unfit(mishaps.texts[0])
+            finally:
+                fuzzer.close()
+        outside = [path.name for path in folder.iterdir() if path.name != _SESSION]
+        if outside:
+            raise Unfit(f"{outside} were written outside the folder")
+    except (Unfit, OSError) as error:
+        last = "\n  ".join(told)
+        raise Unfit(f"{emulator.vendor}, seed {seed}, call {sum(counts.values())}: {error!r}\n  {last}") from error
+    finally:
+        log.removeHandler(mishaps)
+    return Outcome(counts[True], counts[False], counts[None])
+
+
+class _Mishaps(logging.Handler):
+    """Keeps the errors that an emulator logs, which only those are that nobody foresaw."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.texts: list[str] = []
+        self.setFormatter(logging.Formatter("%(message)s"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(self.format(record))

@@ -1,0 +1,76 @@
+"""The TCP Logger: a stream of signals on a port of its own, to whoever has connected there. No sockets here."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+from typing import Final
+
+USUAL_PORT: Final = 6590
+LARGEST_OVERSAMPLING: Final = 1000
+MOST_WAITING: Final = 1 << 20
+"""Bytes that a reader may leave unread: after that it gets nothing more until it has read."""
+_RATE_HZ: Final = 2000.0
+_MOST_AT_ONCE: Final = 20
+_DISCONNECTED, _IDLE, _RUNNING, _OVERFLOW = 0, 1, 4, 7
+
+
+class Logger:
+    """What is logged, while it is started.
+
+    Attributes:
+        slots: of the Signals Manager, which the channels are.
+        oversampling: how many samples a value stands for.
+        unread: how many bytes each reader has left unread.
+    """
+
+    def __init__(self) -> None:
+        self.slots: list[int] = []
+        self.oversampling = 1
+        self.unread: list[int] = []
+        self._started_s: float | None = None
+        self._counter = 0
+
+    @property
+    def running(self) -> bool:
+        """Whether anybody is to get anything."""
+        return self._started_s is not None and bool(self.unread)
+
+    def start(self, now_s: float) -> None:
+        """Begin, with the counter at zero."""
+        self._started_s, self._counter = now_s, 0
+
+    def stop(self) -> None:
+        """Send nothing more."""
+        self._started_s = None
+
+    def status(self) -> int:
+        """As the protocol counts."""
+        if not self.unread:
+            return _DISCONNECTED
+        if self._started_s is None:
+            return _IDLE
+        return _OVERFLOW if max(self.unread) >= MOST_WAITING else _RUNNING
+
+    def due(self, now_s: float) -> range:
+        """The counters of the frames to be sent now; what more has become due at once is lost, as they show."""
+        if self._started_s is None:
+            return range(0)
+        until = math.floor((now_s - self._started_s) / self._period_s + 1e-9)
+        found = range(max(self._counter, until - _MOST_AT_ONCE), until)
+        self._counter = max(self._counter, until)
+        return found
+
+    def next_s(self) -> float:
+        """When the next frame is due."""
+        return math.inf if self._started_s is None else self._started_s + self._period_s * (self._counter + 1)
+
+    def frame(self, counter: int, values: Sequence[float]) -> bytes:
+        """The number of channels (i), the oversampling (f), the counter (64 bits), the state (H), the values (f)."""
+        head = struct.pack(">ifqH", len(values), float(self.oversampling), counter, _RUNNING)
+        return head + struct.pack(f">{len(values)}f", *values)
+
+    @property
+    def _period_s(self) -> float:
+        return self.oversampling / _RATE_HZ
