@@ -177,11 +177,11 @@ def test_a_start_that_was_lost_on_its_way_gives_no_scan_of_before(bench: Make, m
     assert scans(peer.until(FREE))
     plain = made.emulator._answer
 
-    def lose(connection: Any, name: str, *rest: Any) -> None:
-        if name == "Scan.Action":
+    def lose(connection: Any, asked: Any, *rest: Any) -> None:
+        if asked.name == "Scan.Action":
             made.emulator._server.cut(connection)
         else:
-            plain(connection, name, *rest)
+            plain(connection, asked, *rest)
 
     monkeypatch.setattr(made.emulator, "_answer", lose)
     assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE

@@ -465,7 +465,7 @@ class Panel:
 
 def curve_columns(curve: RunningSpectrum) -> list[str]:
     """As Nanonis names them: "Current [bwd] (A)"; what is swept comes first, and has a name of its own."""
-    columns = []
+    columns: list[str] = []
     for name, unit in zip(curve.names, curve.units, strict=True):
         forward = name.removesuffix(RETRACE)
         called = forward if columns else _SWEPT.get(forward, forward)
