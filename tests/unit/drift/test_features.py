@@ -223,3 +223,36 @@ def test_only_pairs_that_are_allowed_are_matched() -> None:
     assert (0, 0) in [tuple(row) for row in pairs]
     assert all(allowed[row, column] for row, column in pairs)
     assert 2 not in pairs[:, 0]
+
+
+def disturbed() -> list[Any]:
+    """Two scans that share little more than half, the second with much noise: few matches are right."""
+    surface, drift_m = Waves(5), (50.4 * PIXEL_M, -12.5 * PIXEL_M)
+    first, second = scanned(surface, REGION, SHAPE), scanned(surface, REGION, SHAPE, drift_m, seed=1)
+    noise = np.random.default_rng(3).normal(scale=0.15 * second.values.std(), size=SHAPE)
+    return [first, replace(second, values=second.values + noise)]
+
+
+def inliers(pair: list[Any], **settings: Any) -> float:
+    return estimator({"class": "brief", "max_keypoints": 200, **settings}).register(*pair).quality.get("inliers", 0.0)
+
+
+def test_the_inlier_limit_is_that_of_the_paper_and_matters() -> None:
+    """Matches that are off by up to so much of the scan's resolution agree; the paper does not tighten that."""
+    pair = disturbed()
+    of = [inliers(pair, residual_threshold=limit, tighten=False) for limit in (0.01, 0.05, 0.6)]
+    assert of[0] < of[1] < of[2]
+    found = estimator({"class": "brief", "max_keypoints": 200, "tighten": False}).register(*pair)
+    assert found.matches is not None
+    off = found.matches.reference_m + found.displacement_m - found.matches.scan_m
+    limit_m = 0.05 * np.mean(REGION.size_m)
+    np.testing.assert_array_equal(np.hypot(*off.T) <= limit_m, found.matches.inlier)
+
+
+def test_more_iterations_find_more_that_agrees() -> None:
+    pair = disturbed()
+    seeds = range(8)
+    few = [inliers(pair, iterations=1, seed=seed) for seed in seeds]
+    many = [inliers(pair, iterations=100, seed=seed) for seed in seeds]
+    assert np.mean(few) < 0.8 * np.mean(many)
+    assert min(many) == max(many)

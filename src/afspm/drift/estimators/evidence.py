@@ -26,6 +26,7 @@ from afspm.model import Region
 
 Array = NDArray[np.float64]
 
+_RADIUS_PX = 1.5  # nearer no two keypoints need to be
 _REACH_PX = 4.0  # matches nearer to each other see the same feature
 _BLOCKS = 4  # the reference is divided into 4 x 4
 _BLOCKS_MIN = 4
@@ -44,6 +45,11 @@ class Evidence:
     consensus: Consensus
     form: Form
     pixel_m: float
+
+    @property
+    def radius_m(self) -> float:
+        """How far a pair may lie from the transform and still agree with it."""
+        return max(self.consensus.radius, _RADIUS_PX * self.pixel_m)
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ def _objection(
 
 def _log10_false_alarms(evidence: Evidence, reference: Region, prior: Prior | None) -> float:
     """Of matches that see the same feature one counts: they are no independent witnesses."""
-    radius_m = 1.5 * evidence.pixel_m
+    radius_m = evidence.radius_m
     # Two places thrown into the scans lie a given displacement apart with at most this density.
     area_m2 = reference.size_m[0] * reference.size_m[1]
     if prior is not None:
@@ -129,7 +135,7 @@ def _log10_false_alarms(evidence: Evidence, reference: Region, prior: Prior | No
 
 def _second(evidence: Evidence, standards: Standards) -> float:
     """How many of the others agree on one other displacement, for each that agrees on the best."""
-    transform, radius_m = evidence.consensus.transform, 1.5 * evidence.pixel_m
+    transform, radius_m = evidence.consensus.transform, evidence.radius_m
     far = ((transform(evidence.a) - evidence.b) ** 2).sum(axis=1) > (2.0 * radius_m) ** 2
     search = Search(FORMS["translation"], standards.iterations, 1.0, np.random.default_rng(standards.seed))
     other = search.among(evidence.a[far], evidence.b[far], radius_m)

@@ -2,7 +2,7 @@
 brute-force matches with cross-check, and the transform that most of them agree on.
 
 What is added to the paper: a result is accepted only if that many pairs can't agree by chance (`evidence`); the fit is
-tightened, since 5 % of the scan lets mismatches in; pixels need not be square; and it says how sure it is.
+tightened, since 5 % of the scan lets mismatches in (`tighten`); pixels need not be square; and it says how sure it is.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from afspm.errors import ConfigError
 
 Array = NDArray[np.float64]
 
-FINE_PX = 1.5  # how far a right pair may lie from the transform
+FINE_PX = 1.5  # how far a right pair lies from the transform
 GATE = 25.0  # squared standard deviations from what is expected, beyond which nothing is looked for
 
 
@@ -36,8 +36,10 @@ class Features:
 
     Attributes:
         transform: "translation", "euclidean", "similarity" or "affine".
-        residual_threshold: of the coarse search, as part of the scan's resolution.
-        iterations: of RANSAC.
+        residual_threshold: how far a match may lie from the transform to be an inlier of RANSAC, as part of the scan's
+            resolution.
+        iterations: of RANSAC: so many times a random few matches are tried. More are needed where fewer are right.
+        tighten: whether the inliers are then reduced to those that lie as near as most of them; the paper does not.
         max_keypoints: the strongest are kept.
         false_alarms: how often chance may give a result that is accepted, for scans that have nothing in common.
         inlier_share: of all matches, that must agree.
@@ -52,6 +54,7 @@ class Features:
     transform: str = "translation"
     residual_threshold: float = 0.05
     iterations: int = 100
+    tighten: bool = True
     max_keypoints: int = 2000
     false_alarms: float = 1e-3
     inlier_share: float = 0.12
@@ -85,7 +88,7 @@ class Features:
         known = [KINDS[self.kind](image, self.max_keypoints) for image in images]
         a, b = _matched(grid, known[0], known[1], prior, slack_m=pixel_m + 0.01 * max(reference.region.size_m))
         quality = {"keypoints": float(min(map(len, known))), "matches": float(len(a))}
-        found = self._consensus(a, b, self._coarse_m(reference, scan), FINE_PX * pixel_m)
+        found = self._consensus(a, b, self._limit_m(reference, scan), FINE_PX * pixel_m)
         if found is None:
             return Registration.refused(f"no transform agrees with any of {len(a)} matches", quality)
         return self._judged(reference, scan, Evidence(a, b, found, self._form, pixel_m), prior, quality)
@@ -94,23 +97,18 @@ class Features:
     def _form(self) -> Form:
         return FORMS[self.transform]
 
-    def _coarse_m(self, reference: DriftScan, scan: DriftScan) -> float:
+    def _limit_m(self, reference: DriftScan, scan: DriftScan) -> float:
         """A share of the resolution, in m: for pixels that are not square the mean of both axes."""
         return self.residual_threshold * float(np.mean([reference.region.size_m, scan.region.size_m]))
 
-    def _consensus(self, a: Array, b: Array, coarse_m: float, fine_m: float) -> Consensus | None:
-        """Coarse with the paper's radius and fine within that, and fine among all: the larger one, tightened.
-        Where mismatches are many, the coarse one is of those that happen to lie together."""
+    def _consensus(self, a: Array, b: Array, limit_m: float, fine_m: float) -> Consensus | None:
+        """The paper's search with its inlier limit, and what that leaves tightened."""
         search = Search(self._form, self.iterations, self.bend_max, np.random.default_rng(self.seed))
-        fine_m = min(fine_m, coarse_m)
-        candidates = [search.among(a, b, fine_m)]
-        coarse = search.among(a, b, coarse_m)
-        if coarse is not None:
-            candidates.append(search.within(coarse, a, b, fine_m))
-        best = max((c for c in candidates if c is not None), key=lambda c: c.count, default=None)
-        if best is None:
-            return None
-        return tightened(a, b, best, self._form, least=fine_m / 3, most=fine_m, bend_max=self.bend_max)
+        best = search.among(a, b, limit_m)
+        if best is None or not self.tighten:
+            return best
+        least = min(fine_m, limit_m) / 3
+        return tightened(a, b, best, self._form, least=least, most=limit_m, bend_max=self.bend_max)
 
     def _judged(
         self, reference: DriftScan, scan: DriftScan, evidence: Evidence, prior: Prior | None, quality: dict[str, float]

@@ -36,10 +36,11 @@ class Transform:
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """A transform and the pairs (n,) that agree with it."""
+    """A transform and the pairs (n,) that agree with it: they lie within `radius` of it."""
 
     transform: Transform
     inlier: Mask
+    radius: float
 
     @property
     def count(self) -> int:
@@ -154,22 +155,12 @@ class Search:
                     break
         return best
 
-    def within(self, coarse: Consensus, a: Array, b: Array, radius: float) -> Consensus | None:
-        """The same among those that agree already, with a smaller radius."""
-        near = np.flatnonzero(coarse.inlier)
-        found = self.among(a[near], b[near], radius)
-        if found is None:
-            return None
-        inlier = np.zeros(len(a), dtype=np.bool_)
-        inlier[near[found.inlier]] = True
-        return Consensus(found.transform, inlier)
-
 
 def consensus(a: Array, b: Array, transform: Transform | None, radius: float) -> Consensus | None:
     """Who agrees with a transform."""
     if transform is None:
         return None
-    return Consensus(transform, _squares(a, b, transform) <= radius**2)
+    return Consensus(transform, _squares(a, b, transform) <= radius**2, radius)
 
 
 def tightened(
