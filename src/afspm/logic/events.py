@@ -240,9 +240,11 @@ class Kill:
 
     Attributes:
         tip_is_safe: the translator may leave; if not, it sees to the tip when it is asked to.
+        stop: the action that stops what the microscope measures; empty: nothing.
     """
 
     tip_is_safe: bool = True
+    stop: str = ""
 
 
 Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill

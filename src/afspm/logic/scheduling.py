@@ -66,12 +66,14 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
     component_of,
+    names,
 )
 
 __all__ = ["CONTROL_STATE", "SchedulerCore", "SchedulerSettings"]
 
 _TELLING = frozenset({"ScopeStateMsg", "ZCtrlParameters", "ScanParameters2d", "ProbePosition"})
 """Messages from which we learn what the microscope is in. All others pass unread."""
+_STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 _AT_ONCE_S = 0.0  # in real monotonic time: always past
 
 
@@ -167,7 +169,8 @@ class SchedulerCore:
         if self._ending.is_due(now_s):
             self._ending.end()
             self._with_forwards()
-            self._effects += [*self._bulletin.entries(now_ns), Kill(not self._watchdog.owes_retract)]
+            stop = _STOPS.get(self._watchdog.state, "")
+            self._effects += [*self._bulletin.entries(now_ns), Kill(not self._watchdog.owes_retract, stop)]
             self._farewell.begin(now_s)
 
     def _with_forwards(self) -> list[Effect]:

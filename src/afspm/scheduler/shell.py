@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
-from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, Response
+from afspm.model import HAS_ENDED, TELL_REQUEST, ControlRequest, ControlResponse, Packet, Request, Response
 from afspm.record.disk import DEADLINE_S, SYNCER, Disk
 from afspm.record.whole import ToldOnce
 from afspm.transport.fair_queue import FairQueue
@@ -160,12 +160,15 @@ class Shell:
                 sockets.subscriber.follow()
         self._handle_requests()
 
-    def _let_translator_go(self) -> None:
-        """It subscribes to nobody.
+    def _let_translator_go(self, stop: str = "") -> None:
+        """It subscribes to nobody. One of version 1 goes on until it is stopped, but not with its scan.
 
         One whose tip is in danger is left to find that nobody is there any more: then it sees to the tip by itself.
         """
-        if self._tip_is_safe:
+        if self._sockets.link.version is wire.Version.ONE:
+            if stop:
+                self._sockets.link.send(0, wire.encode_request(Request(ControlRequest.ACTION, stop)))
+        elif self._tip_is_safe:
             self._sockets.link.send(0, [wire.CLOSE])
 
     def _asked_late(self, asked: RouterEvent) -> None:
@@ -293,7 +296,7 @@ class Shell:
                     sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
                     sockets.publisher.kill()
                     self._tip_is_safe = effect.tip_is_safe
-                    self._let_translator_go()
+                    self._let_translator_go(effect.stop)
                     self.ended = True
 
     def _reply(self, reply: events.Reply) -> None:

@@ -221,10 +221,13 @@ def test_their_translator_is_sent_what_version_1_has_until_after_the_end(rig: An
     assert ask(PARAM, control_pb2.ParameterMsg(parameter="x-unknown")) == 8
     assert [frames[0][0] for frames in server.asked] == [1, 4, PARAM]
     assert server.asked[1] == [b"\4", b""]
+    server.publish(control_pb2.ScopeStateMsg(scope_state=SCANNING), CLOCK.now_ns())
+    rig.until(lambda: ours.packets("ScopeStateMsg"))
     assert ask(END) == SUCCESS
     rig.until(lambda: any(isinstance(incoming, Killed) for incoming in ours.found))
     rig.until(lambda: rig.process.poll() is not None, timeout_s=30.0)
-    assert len(server.asked) == 3
+    stop = control_pb2.ActionMsg(action="stop-scan").SerializeToString()
+    assert [*server.asked][3:] == [[b"\1", stop]], "its scan does not go on with nobody there"
 
 
 def test_spectra_that_come_variable_after_variable_are_put_in_order(rig: Any, server: Server) -> None:

@@ -16,7 +16,7 @@ from afspm.transport.network import Network
 from afspm.transport.port import CaughtUp, ControlConnected, Killed, PacketReceived, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
-from afspm.wire.version import QUESTION
+from afspm.wire.version import ANSWER, QUESTION
 
 ANY = "tcp://127.0.0.1:0"
 CLOCK = ExperimentClock.real()
@@ -134,6 +134,58 @@ def test_a_plain_sub_gets_what_was_published_before_oldest_first_and_then_what_f
     assert [payload for _, payload, _ in got] == [b"%d" % n for n in range(10)] + [b"live"]
     times = [wire.decode_packet(frames).time_ns for frames in got]
     assert times == sorted(set(times))
+
+
+def test_a_plain_sub_to_everything_is_sent_the_messages_of_version_1_alone(open_: Any, plain: Any, until: Any) -> None:
+    publisher, subscriber = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)), plain(zmq.SUB)
+    ours, theirs = ("ScanLines", "Scan2", "Crystal", "JournalEntries"), ("Scan2d_1.0_Height", "ScopeStateMsg")
+    for envelope in (*ours, *theirs):
+        publisher.publish(envelope, b"before")
+    subscriber.setsockopt(zmq.SUBSCRIBE, b"")
+    subscriber.connect(publisher.publish_address)
+    until(lambda: subscriber.poll(0), (publisher, []))
+    for envelope in (*ours, *theirs):
+        publisher.publish(envelope, b"live")
+    publisher.kill()
+    got = []
+    while (frames := subscriber.recv_multipart()) != [b"KILL"]:
+        got.append((frames[0].decode(), frames[1]))
+    assert got == [(envelope, when) for when in (b"before", b"live") for envelope in theirs]
+
+
+def test_a_plain_sub_that_takes_back_one_prefix_keeps_what_another_means(open_: Any, plain: Any, until: Any) -> None:
+    publisher, subscriber = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)), plain(zmq.SUB)
+    for prefix in (b"", b"Scan2d", b"KILL"):
+        subscriber.setsockopt(zmq.SUBSCRIBE, prefix)
+    subscriber.connect(publisher.publish_address)
+    joined: list[Any] = []
+    until(lambda: joined, (publisher, joined))
+    subscriber.setsockopt(zmq.UNSUBSCRIBE, b"")
+    got: set[bytes] = set()
+
+    def narrowed() -> bool:
+        got.clear()
+        for envelope in ("ScopeStateMsg", "Scan2d"):
+            publisher.publish(envelope, b"")
+        while b"Scan2d" not in got:
+            got.add(subscriber.recv_multipart()[0])
+        return got == {b"Scan2d"}
+
+    until(narrowed, (publisher, []))
+
+
+def test_a_scheduler_of_version_1_that_passes_the_question_on_is_not_taken_for_ours(
+    open_: Any, plain: Any, until: Any
+) -> None:
+    server = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None))
+    ours, theirs = plain(zmq.DEALER), plain(zmq.REQ)
+    for socket, frames in ((ours, [b"", *QUESTION]), (theirs, [*QUESTION])):
+        socket.connect(server.serve_address)
+        socket.send_multipart(frames)
+    asked: list[Any] = []
+    until(lambda: asked, (server, asked))
+    assert [one.frames for one in asked] == [[*QUESTION]]
+    assert ours.recv_multipart() == [b"", *ANSWER]
 
 
 def test_a_plain_sub_to_everything_does_not_see_the_replay_for_one_of_ours(open_: Any, plain: Any, until: Any) -> None:
