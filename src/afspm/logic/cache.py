@@ -16,6 +16,8 @@ TIME_STEP_NS = 1_000
 _OVERHEAD_BYTES = 300  # of a kept packet beside its payload, so that a flood of empty ones is bounded too
 _TIMES_REMEMBERED = 4096
 _RECENT = 64
+_NEVER_NS = 0
+"""The time, among those that a restart remembers, of what was passed over: it is not published then either."""
 _NEWEST = 16
 _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than that is not believed
 
@@ -78,6 +80,8 @@ class Cache:
             self._saw(source_ns)
         envelope, history = self._envelopes.of(header)
         first_ns = None if source_ns is None else self._first_times.pop(source_ns, None)
+        if first_ns == _NEVER_NS:
+            return None
         if source_ns is not None and first_ns is not None:
             return self._again(Packet(envelope, packet.payload, first_ns), source_ns, history)
         said = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
@@ -91,8 +95,9 @@ class Cache:
         """Take note of a packet of the translator's that is not published; False: we have had it."""
         if packet.time_ns is None:
             return True
-        is_new = packet.time_ns not in self._sources
+        is_new = packet.time_ns not in self._sources and self._first_times.pop(packet.time_ns, None) != _NEVER_NS
         self._saw(packet.time_ns)
+        self._recent.append((packet.time_ns, _NEVER_NS))
         return is_new
 
     def recent(self) -> list[tuple[int, int]]:

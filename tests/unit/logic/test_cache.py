@@ -248,3 +248,20 @@ def test_whatever_comes_is_kept_in_order_within_its_bounds(
         assert cache.size == sum(len(p.payload) + 300 for p, _ in cache)
         if kept:
             assert last in got
+
+
+def test_what_was_passed_over_is_not_published_after_a_restart_either() -> None:
+    cache = Cache()
+    passed, after = (
+        Packet("ScopeStateMsg", b"FREE", 10 * TIME_STEP_NS),
+        Packet("ScopeStateMsg", b"SCANNING", 20 * TIME_STEP_NS),
+    )
+    assert cache.pass_over(passed)
+    assert not cache.pass_over(passed)
+    assert cache.take(after, PacketHeader("ScopeStateMsg"), 0) is not None
+    restarted = Cache()
+    restarted.remember(cache.recent())
+    assert restarted.take(passed, PacketHeader("ScopeStateMsg"), 0) is None
+    again = restarted.take(after, PacketHeader("ScopeStateMsg"), 0)
+    assert again is not None
+    assert again[0] == after
