@@ -256,10 +256,17 @@ class Rig:
 
     def pulse(self, voltage_v: float, duration_s: float) -> str:
         """A bias pulse where the probe is: "cured", "worsened" or "unchanged"."""
-        now_s = self._free_now_s()
-        outcome = self.world.pulse(voltage_v, duration_s, now_s, self._probe_m) if self.engaged else "unchanged"
+        self._free_now_s()
+        outcome = self.pulsed(voltage_v, duration_s)
         self.occupy("pulse", duration_s)
         return outcome
+
+    def pulsed(self, voltage_v: float, duration_s: float) -> str:
+        """As `pulse`, of one that is over: somebody has set the bias, and put it back."""
+        self._wait_for_picture()
+        if not self.engaged or duration_s <= 0.0:
+            return "unchanged"
+        return self.world.pulse(voltage_v, duration_s, self.clock.now_s(), self._probe_m)
 
     def crash(self, depth_m: float, speed_m_s: float) -> str:
         """Drive the tip into the sample where the probe is, and out again: as `pulse`."""

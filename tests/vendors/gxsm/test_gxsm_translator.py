@@ -237,6 +237,77 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True)).ok
 
 
+def test_the_feedback_is_switched_where_gxsm_has_actions_for_it(bench: Make) -> None:
+    made = bench(feedback_actions=["FB-ON", "FB-OFF"])
+    peer = made.start(feedback_actions=["FB-ON", "FB-OFF"])
+    ready(peer)
+    assert peer.set("x-feedback-on", False).ok
+    heard = peer.until(lambda one: isinstance(one, Feedback))
+    assert heard[-1].on is False
+    assert made.emulator.rig.feedback.on is False
+    assert peer.set("x-feedback-on", True).ok
+    assert made.emulator.rig.feedback.on
+
+
+def test_the_feedback_is_not_switched_by_actions_that_this_gxsm_lacks(bench: Make) -> None:
+    peer = bench().start(feedback_actions=["FB-ON", "FB-OFF"])
+    peer.until(FREE)
+    assert "can be asked for, not set" in peer.set("x-feedback-on", False).reason
+
+
+@pytest.mark.parametrize("settings", [{}, {"card": "RPSPMC"}, {"card": "simulator"}], ids=["sranger", "rpspmc", "sim"])
+def test_a_pulse_is_a_bias_that_is_put_back(
+    bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = bench(speed=1.0, **settings)
+    peer = made.start()
+    ready(peer)
+    pulses: list[tuple[float, float]] = []
+    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse))
+    before = peer.get(names.TIP_BIAS_VOLTAGE)
+    assert peer.set(names.PULSE_VOLTAGE, -4.5).ok
+    assert peer.set(names.PULSE_DURATION, "300", "ms").ok
+    assert peer.act(names.PULSE).ok
+    assert peer.act(names.START_SCAN).code == ControlResponse.NOT_FREE
+    assert states(peer.until(FREE)) == ["BUSY_PARAM", "FREE"]
+    assert peer.get(names.TIP_BIAS_VOLTAGE) == before
+    ((voltage_v, lasted_s),) = pulses
+    assert voltage_v == -4.5
+    assert 0.3 <= lasted_s < 0.6
+    assert peer.set(names.PULSE_VOLTAGE, 11).code == ControlResponse.PARAM_ERROR
+
+
+def test_a_pulse_of_a_translator_that_was_killed_is_ended_by_the_next(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = made.start()
+    ready(peer)
+    assert peer.set(names.PULSE_DURATION, 60).ok
+    assert peer.act(names.PULSE).ok
+    assert made.emulator.rig.bias_v == 4.0
+    made.kill()
+    made.start().until(FREE)
+    assert made.emulator.rig.bias_v == 0.1
+
+
+def test_a_crash_is_what_the_experiment_file_says(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench(speed=5.0)
+    peer = made.start(
+        parameters={
+            "x-crash-depth": {"vendor": "dsp-Z-end", "unit": "Å", "sign": -1},
+            "x-crash-speed": {"vendor": "dsp-Z-Slope", "unit": "Å/s"},
+        },
+        actions={"x-crash": {"command": "DSP_VP_FZ_EXECUTE", "for": "2 s"}},
+    )
+    ready(peer)
+    crashes: list[tuple[float, float]] = []
+    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash))
+    assert peer.set(names.CRASH_DEPTH, 2, "nm").ok
+    assert peer.set(names.CRASH_SPEED, 50, "nm/s").ok
+    assert peer.act(names.CRASH).ok
+    assert states(peer.until(FREE)) == ["BUSY_PARAM", "FREE"]
+    assert crashes == [pytest.approx((2e-9, 50e-9))]
+
+
 def test_what_this_hardware_lacks_is_not_supported(bench: Make) -> None:
     """GXSM answers -inf, or worse, for parameters that it does not have: it is not asked for them."""
     made = bench(card="simulator")

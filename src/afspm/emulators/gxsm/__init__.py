@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import select
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -36,6 +36,7 @@ class GxsmEmulator(Emulator):
         user_unit: of lengths on its panel: "Å", "nm" or "µm".
         decimal_comma: it runs where 12,5 is written.
         auto_save, probe_auto_save: what its panel has on.
+        feedback_actions: names of actions that switch the feedback on and off; left out: its hardware has none.
         reach_m: of the scanner in x and y, from the centre.
         seed, faults, and all of the simulated world: as of every emulator.
 
@@ -69,6 +70,7 @@ class GxsmEmulator(Emulator):
         decimal_comma: bool = False,
         auto_save: bool = True,
         probe_auto_save: bool = True,
+        feedback_actions: Sequence[str] = (),
         reach_m: Length = 2e-6,
         **settings: Any,
     ) -> None:
@@ -87,6 +89,7 @@ class GxsmEmulator(Emulator):
         self._user_unit, self._decimal_comma = user_unit, decimal_comma
         self._auto_save, self._probe_auto_save = auto_save, probe_auto_save
         self._reach_m = reach_m
+        self._feedback_actions = tuple(feedback_actions)
         self.unanswered: deque[Call] = deque()
         self.silent = False
         self._console: Console | None = None
@@ -110,7 +113,7 @@ class GxsmEmulator(Emulator):
             reach_m=self._reach_m,
         )
         self.program.auto_save, self.program.probe_auto_save = self._auto_save, self._probe_auto_save
-        self._calls = Calls(self.program)
+        self._calls = Calls(self.program, self._feedback_actions)
         if self._transport == "shm":
             self._block = Block(
                 self._block_name, self._process, self.folder, self.faults, self.clock.now_s, self.unanswered.append

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any, Final
 
@@ -43,10 +44,15 @@ class Uninitialised:
 
 
 class Calls:
-    """The functions. For one thread."""
+    """The functions. For one thread.
 
-    def __init__(self, program: Program) -> None:
+    Args:
+        feedback_actions: names of those that switch the feedback on and off, if there are any.
+    """
+
+    def __init__(self, program: Program, feedback_actions: Sequence[str] = ()) -> None:
         self._program = program
+        self._feedback_actions = feedback_actions
         self._faults = program.faults
 
     def answer(self, method: str, arguments: tuple[Any, ...]) -> Any:
@@ -89,7 +95,7 @@ class Calls:
             found += ["DSP_CMD_AUTOAPP", "DSP_CMD_STOPALL", "DSP_CMD_MOV-XP_XY"]
         if program.card == "RPSPMC":
             found += ["GVP_CMD_UP_Z0", "GVP_CMD_DN_Z0"]
-        return tuple(found)
+        return (*found, *self._feedback_actions)
 
     def _set(self, ref: str, value: str) -> int:
         if not isinstance(value, str) or not isinstance(ref, str):
@@ -122,13 +128,19 @@ class Calls:
 
     def _do(self, name: str) -> None:
         program, rig = self._program, self._program.rig
-        if name.startswith("CHECK-") and name.removeprefix("CHECK-") in _MODES[program.card]:
+        if name in self._feedback_actions:
+            rig.feedback = replace(rig.feedback, on=name == self._feedback_actions[0])
+        elif name.startswith("CHECK-") and name.removeprefix("CHECK-") in _MODES[program.card]:
             program.probe_auto_save = True
         elif name == "DSP_VP_ABORT_EXECUTE":
             rig.stop_spectrum()
             program.curve = None
         elif name.startswith("DSP_VP_"):
             mode = name.split("_")[2]
+            depth = -program.entries["dsp-Z-end"] * ANGSTROM_M if mode == "FZ" else 0.0
+            if depth > 0.0:
+                rig.crash(depth, program.entries["dsp-Z-Slope"] * ANGSTROM_M)
+                return
             program.take_curve(_KINDS.get(mode, "IV"))
         elif name == "DSP_CMD_AUTOAPP":
             rig.engage()

@@ -39,6 +39,7 @@ _PIXELS_S: Final = 0.045
 """What its own simulator takes for a line besides its pixels."""
 _EARLY_LINE_S, _EARLY_S = 0.2, 1.0
 """It ends a scan with lines longer than this after so long, and tells nobody."""
+_PULSE_S: Final = 1.0
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
@@ -87,6 +88,7 @@ class Program:
         self._scanning = self._saved = False
         self._before: list[Path] | None = None
         self._y_before = 0
+        self._bias_since_s = -math.inf
         self._memory: dict[Channel, np.ndarray] = {}
         self._own: list[Path] = []
         self._curves = 0
@@ -103,7 +105,7 @@ class Program:
 
     def _of_hardware(self) -> dict[str, Entry]:
         rig, loop = self.rig, self.rig.feedback
-        bias = Entry(rig.bias_v, -10.0, 10.0, "V", told=lambda value: setattr(rig, "bias_v", value))
+        bias = Entry(rig.bias_v, -10.0, 10.0, "V", told=self._bias)
         if self.card == "simulator":
             speed = Entry(1.0, 0.01, 4000.0, "px/s", "{:.2f}")
             return {"sim-stm-speed": speed, "sim-stm-bias": bias, **(simulated_3() if self.version == 3 else {})}
@@ -133,7 +135,15 @@ class Program:
         }
         if self.card == "RPSPMC":
             return {**found, "dsp-GVP-VPJR": Entry(0.0)}
-        return {**found, "dsp-fbs-motor": Entry(0.0, -10.0, 10.0), "dsp-Z-start": Entry(0.0, -1e4, 1e4)}
+        zs = {"dsp-Z-start": Entry(0.0, -1e4, 1e4), "dsp-Z-end": Entry(0.0, -1e4, 1e4)}
+        return {**found, **zs, "dsp-Z-Slope": Entry(100.0, 1e-3, 1e6), "dsp-fbs-motor": Entry(0.0, -10.0, 10.0)}
+
+    def _bias(self, value: float) -> None:
+        """Another bias; one that was in force for a short while has been a pulse."""
+        now_s = self.clock.now_s()
+        if now_s - self._bias_since_s < _PULSE_S:
+            self.rig.pulsed(self.rig.bias_v, now_s - self._bias_since_s)
+        self.rig.bias_v, self._bias_since_s = value, now_s
 
     # --- what happens by itself ---
 

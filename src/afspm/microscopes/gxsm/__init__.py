@@ -29,6 +29,8 @@ from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
 
+_KEPT: Final[Mapping[str, Value]] = {names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1}
+"""What is kept here, and at first, unless the experiment file says that GXSM has it."""
 _SAVERS: Final = ("afspm", "gxsm")
 
 
@@ -42,6 +44,7 @@ class Gxsm(Microscope):
             Auto Save is left on, and its files are waited for.
         hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
         scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
+        feedback_actions: GXSM's actions that switch the feedback on and off, where its hardware has such.
         secret_file: a copy of the bridge's `~/.afspm/gxsm-bridge-secret`, if GXSM runs on another computer.
         reply_timeout_s: how long an answer may take, in real time.
         parameters, actions, poll_period_s, result_timeout_s, live_lines_s: as for every microscope.
@@ -60,6 +63,7 @@ class Gxsm(Microscope):
         hardware: str | None = None,
         scan_dir: str | None = None,
         probe_dir: str | None = None,
+        feedback_actions: tuple[str, str] | None = None,
         secret_file: str | None = None,
         reply_timeout_s: Duration = 5.0,
         parameters: Mapping[str, Mapping[str, Any]] | None = None,
@@ -85,6 +89,7 @@ class Gxsm(Microscope):
         self._saves = saving == "afspm"
         self._given_hardware = hardware
         self._scan_dir, self._probe_dir = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
+        self._feedback_actions: Sequence[str] = feedback_actions or ()
         self._secret_file = None if secret_file is None else Path(secret_file)
         self._reply_timeout_s = reply_timeout_s
         self._whole_table = self.table
@@ -118,7 +123,8 @@ class Gxsm(Microscope):
         if self._saves and AUTOSAVE_OFF in self._actions:
             ask.call("action", AUTOSAVE_OFF)
             self.log.info("GXSM's Auto Save of scans is off from now on, and stays off: see the setting saving")
-        self._kept: dict[str, Any] = self.memory.setdefault("kept", {names.SPEC_KIND: "IV", "probe": None})
+        self._kept: dict[str, Any] = self.memory.setdefault("kept", {})
+        self._kept.update({names.SPEC_KIND: "IV", "probe": None, **_KEPT} | self._kept)
         self._harvest = Harvest(
             self.memory,
             self.patience_s(self.result_timeout_s / 2),
@@ -142,15 +148,22 @@ class Gxsm(Microscope):
         )
 
     def _find_parameters(self) -> None:
-        vendors = {name: spec.vendor for name, spec in self._whole_table.items() if name not in self.translated}
+        table = self._whole_table
+        own = {*self.translated, *(name for name in _KEPT if table[name].vendor == name)}
+        vendors = {name: spec.vendor for name, spec in table.items() if name not in own}
         self._refs = available(vendors, self._refnames)
         lacking = sorted(vendors.keys() - self._refs.keys())
-        self.table = self._whole_table.without(lacking)
+        self._own = [name for name in _KEPT if name in own]
+        if self._feedback_actions and self._actions.issuperset(self._feedback_actions):
+            table = table.extended({FEEDBACK_ON: {"read_only": False}}, where="feedback_actions")
+        self.table = table.without(lacking)
         self.log.info("GXSM with the hardware %s; unsupported: %s", self._hardware.value, ", ".join(lacking) or "none")
 
     def _missing_actions(self) -> dict[str, str]:
         """GXSM says 0 to actions that it does not have."""
         needed = {names.ENGAGE: [APPROACH], names.STOP_SPEC: [ABORT]}
+        if names.TIP_BIAS_VOLTAGE not in self.table:
+            needed[names.PULSE] = [names.TIP_BIAS_VOLTAGE]
         needed[names.START_SPEC] = [execute(kind) for kind in self._whole_table[names.SPEC_KIND].choices]
         for name, what in self.added_actions.items():
             if "command" in what:
@@ -192,7 +205,7 @@ class Gxsm(Microscope):
             found.update(zip(POSITION, self._probe_m(), strict=True))
         if FEEDBACK_ON in wanted:
             found[FEEDBACK_ON] = self._activity.doing().feedback_on
-        found[names.SPEC_KIND] = str(self._kept[names.SPEC_KIND])
+        found.update({name: self._kept[name] for name in (names.SPEC_KIND, *self._own)})
         found[names.CONTROLLER] = f"{self._harvest.program or 'GXSM'} ({self._hardware.value})"
         return found | super().read([name for name in wanted if name not in found])
 
@@ -205,9 +218,12 @@ class Gxsm(Microscope):
         if position:
             x, y = (position.get(name, before) for name, before in zip(POSITION, self._probe_m(), strict=True))
             self._send_probe((x, y))
-        if names.SPEC_KIND in values:
-            self._kept[names.SPEC_KIND] = values[names.SPEC_KIND]
-        own = {*framed, *position, names.SPEC_KIND}
+        kept = {name: values[name] for name in (names.SPEC_KIND, *self._own) if name in values}
+        self._kept.update(kept)
+        if FEEDBACK_ON in values:
+            on, off = self._feedback_actions
+            self._ask.call("action", on if values[FEEDBACK_ON] else off)
+        own = {*framed, *position, *kept, FEEDBACK_ON}
         super().write({name: value for name, value in values.items() if name not in own})
 
     def get(self, vendor: str) -> Value:
@@ -303,6 +319,12 @@ class Gxsm(Microscope):
     def stop_spec(self) -> None:
         """Break the spectrum off."""
         self._activity.stop_curve()
+
+    @action(names.PULSE, state=ScopeState.BUSY_PARAM)
+    def pulse(self) -> None:
+        """A bias pulse of `x-pulse-voltage` for `x-pulse-duration`, where the tip is: the bias is set, and put back."""
+        wanted = self.in_force([names.PULSE_VOLTAGE, names.PULSE_DURATION])
+        self.for_a_while({names.TIP_BIAS_VOLTAGE: wanted[names.PULSE_VOLTAGE]}, float(wanted[names.PULSE_DURATION]))
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
