@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import ClassVar, Literal
 
 from afspm import wire
@@ -80,6 +81,7 @@ class TipCorrector(Component):
     ) -> None:
         self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
+        self._frame: Region | None = None  # of our own, about a place
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         pulses = (names.PULSE,) if pulse_voltages else ()
         crashes = (names.CRASH,) if crash_depths else ()
@@ -189,7 +191,7 @@ class TipCorrector(Component):
     def _treat_at(self, place: XY, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
         """Whether it was done. All of it in one tenure of control: whoever has it in between may move the probe."""
         parameters = self.scope.scan_parameters  # a person may have chosen another region meanwhile
-        if parameters is not None and isinstance(parameters.region, Region):
+        if parameters is not None and isinstance(parameters.region, Region) and parameters.region != self._frame:
             safe = (*safe, parameters.region)
         if (away := min(clearance_m(place, region) for region in safe)) < self.keep_away:
             self.log.error("no %s: its place is only %.0f nm away from what is scanned", treatment, away * 1e9)
@@ -198,7 +200,7 @@ class TipCorrector(Component):
         if not self.scope.supports(action):
             self.log.warning("no %s: the microscope has no %s", treatment, action)
             return False
-        self.scope.move_probe(place)
+        self._go_to(place)
         self._prepare(treatment)
         if not self.scope.wait_until(
             lambda: self._stands_at(place) or not self.scope.in_control, timeout_s=SETTLED_WITHIN_S
@@ -210,6 +212,20 @@ class TipCorrector(Component):
         self.log.info("%s %s", treatment, where)
         self.publish(wire.message_type(DONE_ACTION)(action=action), f"{DONE_ACTION}_{self.name}")
         return True
+
+    def _go_to(self, place: XY) -> None:
+        """Move the probe to a place; with the scan frame, where the microscope moves its tip in that alone."""
+        try:
+            self.scope.move_probe(place)
+        except Refused as refused:
+            parameters = self.scope.scan_parameters
+            if parameters is None or not isinstance(parameters.region, Region):
+                raise
+            self.log.debug("the frame goes along to %s: %s", _nm(place), refused.reason)
+            size_m = (self.place_spacing, self.place_spacing)
+            self._frame = replace(parameters.region, center_m=place, size_m=size_m)
+            self.scope.set_scan_region(self._frame)
+            self.scope.move_probe(place)
 
     def _stands_at(self, place: XY) -> bool:
         """Whether the probe is published to be so near to a place that no other one is nearer."""

@@ -114,6 +114,28 @@ def test_what_is_done_is_done_away_from_the_scans_at_a_fresh_place_and_told() ->
     assert told == ["x-pulse", "x-pulse", "x-crash"]
 
 
+class MovesInItsFrame(Repairs):
+    """As GXSM: the tip is moved within the scan frame alone."""
+
+    def _execute(self, request: Request) -> Response:
+        if request.kind == ControlRequest.SET_PROBE_POS:
+            (x, y), region = request.subject.xy_m, self.parameters.region
+            if not region.contains((x, y)):
+                return Response(ControlResponse.PARAM_ERROR, reason="not in the frame")
+        return super()._execute(request)
+
+
+def test_the_frame_goes_along_where_the_tip_is_moved_in_it_alone() -> None:
+    lab = MovesInItsFrame([BAD, BAD, GOOD])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(5000.0, lab.kill)
+    assert run(corrector(), lab) == ExitCode.ENDED
+    assert [action for action, _ in lab.actions] == ["x-pulse", "x-pulse", "x-crash"]
+    assert all(x > 7e-6 for _, (x, _) in lab.actions)
+    assert lab.finished == [REGION] * 3
+    assert lab.problems == ()
+
+
 def test_what_it_may_do_to_a_tip_the_microscope_has_to_be_able_to() -> None:
     assert corrector().needs_actions == ("start-scan", "x-pulse", "x-crash")
     assert corrector(crash_depths=()).needs_actions == ("start-scan", "x-pulse")
