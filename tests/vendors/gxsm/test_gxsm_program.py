@@ -220,6 +220,32 @@ def test_the_bits_of_the_redpitaya_mean_other_things(bench: Make) -> None:
         assert "DSP_VP_ABORT_EXECUTE" not in gxsm.call("list_actions")
 
 
+@pytest.mark.parametrize("version", [3, 4])
+def test_gxsms_own_simulator_has_its_own_names(bench: Make, version: int) -> None:
+    made = bench(speed=SEEN, card="simulator", version=version)
+    with calling(made) as gxsm:
+        assert gxsm.call("get", "sim-stm-speed") == 1.0
+        assert gxsm.call("set", "sim-stm-speed", "0") == 0
+        assert gxsm.call("get", "sim-stm-speed") == 1.0, "refused"
+        gxsm.call("set", "sim-stm-speed", "4000")
+        assert gxsm.call("gets", "sim-stm-speed") == "4000.00 px/s"
+        gxsm.call("set", "PointsX", "20000")
+        assert gxsm.call("get", "PointsY") == 20_000.0
+        small(gxsm)
+        assert gxsm.call("gets", "StepsX") == "66.667 Å    "
+        refs = gxsm.call("list_refnames")
+        assert any(ref.startswith("sim-stm-fbs-") for ref in refs) == (version == 3)
+        assert any(ref.startswith("sim-config-adv-scan-slope-") for ref in refs) == (version == 3)
+        gxsm.call("startscan")
+        until(made, lambda: bool(bits(gxsm) & 2))
+        assert not gxsm.call("chfname", 0).startswith("EE")
+        names = [one.label for one in made.emulator.program.channels]
+        assert names == (["Topo", "MIX1"] if version == 3 else ["ZS-Topo", "ZS-Topo", "I-Tunnel", "dFreq"])
+        for code in ("S", "o", "O", "f", "p", "P"):
+            assert abs(gxsm.call("rtquery", code)[0]) < 1e5
+            assert gxsm.call("rtquery", code)[0] == 0.0 or abs(gxsm.call("rtquery", code)[0]) > 1e-300
+
+
 def test_what_action_returns_in_3_is_not_looked_at(bench: Make) -> None:
     with calling(bench(version=3)) as gxsm:
         assert gxsm.call("action", "CHECK-MainAutoSave") is None
