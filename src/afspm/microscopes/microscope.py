@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from afspm.clock import Clock
-from afspm.errors import AfspmError, ConfigError, Refused
+from afspm.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.microscopes.pace import EAGER_S
 from afspm.microscopes.parameters import ParameterTable, Value
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
@@ -292,8 +293,16 @@ class Microscope(ABC):
         return self.table[name].same(a, b)
 
     def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
-        """What `read` gives; what was set is told as it was set, as long as the controller has the same."""
+        """What `read` gives; what was set is told as it was set, as long as the controller has the same.
+
+        Raises:
+            InvalidValue: the controller says what is no number: it can be told to nobody.
+        """
         found, told = self.read(wanted), self._told
+        for name in wanted:
+            value = found[name]
+            if isinstance(value, float) and not math.isfinite(value):
+                raise InvalidValue(f"the controller says that {name} is {value}")
         return {
             name: told[name] if name in told and self.same(name, found[name], told[name], found) else found[name]
             for name in wanted

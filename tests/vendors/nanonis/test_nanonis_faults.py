@@ -370,3 +370,32 @@ def test_an_address_without_anybody_is_named(bench: Make) -> None:
     assert response.code == ControlResponse.NO_RESPONSE
     made.until_said(f"{made.address}: no connection")
     made.until_said("is Nanonis running")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_translator_outlives_a_controller_that_talks_nonsense(bench: Make, seed: int) -> None:
+    """Nothing of it is a measurement, and once the controller is right again, so is all that it says."""
+    made = bench(seed=seed)
+    peer = small(made, **SOON)
+    made.strike("nonsense", duration_s=200.0)  # two seconds in real time
+    ends_s = made.clock.now_s() + 200.0
+    asked = 0
+    while made.clock.now_s() < ends_s:
+        for ask in (
+            lambda: peer.act(names.START_SCAN),
+            lambda: peer.set(names.SCAN_RESOLUTION_X, 32),
+            lambda: peer.act(names.START_SPEC),
+            lambda: peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((1e-8, 2e-8))),
+            lambda: peer.act(names.STOP_SCAN),
+        ):
+            assert ask() is not None
+            asked += 1
+    assert asked >= 5
+    made.emulator.panel.set_frame(0.0, 0.0, 1e-7, 1e-7, 0.0)
+    while peer.act(names.STOP_SCAN).code == ControlResponse.NO_RESPONSE:
+        pass
+    peer.act_once_free(names.STOP_SCAN)
+    while not (response := peer.act(names.START_SCAN)).ok:
+        assert response.code in (ControlResponse.NOT_FREE, ControlResponse.NO_RESPONSE), response.reason
+    found = peer.until(lambda one: isinstance(one, Scan) and np.isfinite(one.values).all())
+    assert scans(found)

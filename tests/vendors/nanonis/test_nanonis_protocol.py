@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import struct
 import tracemalloc
 from contextlib import suppress
@@ -14,7 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.emulators.nanonis import RELEASES, wire
+from afspm.clock import ExperimentClock
+from afspm.emulators.nanonis import RELEASES, NanonisEmulator, wire
 from afspm.errors import InvalidValue
 from afspm.microscopes.nanonis import protocol
 from afspm.microscopes.nanonis.protocol import BadReply, NanonisError
@@ -187,3 +189,79 @@ def test_any_arguments_are_read_by_the_emulated_controller_or_unreadable(name: s
     with suppress(wire.Unreadable):
         found = wire.arguments(name, body, max(RELEASE_NUMBERS))
         assert len(found) == len(wire.functions()[name].argument_codes(max(RELEASE_NUMBERS)))
+
+
+# --- releases ---
+
+
+@pytest.mark.parametrize(
+    ("name", "release", "codes"),
+    [
+        ("BiasSpectr.PropsGet", 10862, "H i H i A A A"),
+        ("BiasSpectr.PropsGet", 11798, "H i H i A A H H"),
+        ("ZSpectr.PropsGet", 10862, "H i A A A H H"),
+        ("ZSpectr.PropsGet", 11798, "H i A A H H H H"),
+        ("BiasSpectr.ChsGet", 10862, "[i]"),
+        ("BiasSpectr.ChsGet", 13742, "[i]"),
+        ("ZSpectr.ChsGet", 14429, "[i] A"),
+    ],
+)
+def test_fields_of_a_reply_are_those_of_the_release(name: str, release: int, codes: str) -> None:
+    assert wire.functions()[name].result_codes(release) == codes.split()
+
+
+@pytest.mark.parametrize("release", RELEASE_NUMBERS)
+def test_properties_of_spectra_are_told_in_the_order_of_each_release(tmp_path: Path, release: int) -> None:
+    asked = ["BiasSpectr.Open", "ZSpectr.Open", "BiasSpectr.PropsGet", "ZSpectr.PropsGet"]
+    with NanonisEmulator(port=0, release=release).running(tmp_path) as address:
+        *_, bias, z = (_asked(address, name) for name in asked)
+    autosave, dialog, sweeps, save_all = b"\0\1", b"\0\0", b"\0\1", b"\0\0"
+    no_error = bytes(8)
+    assert bias.endswith((autosave + dialog if release >= 11798 else b"Y (m)") + no_error)
+    assert z.endswith(sweeps + (autosave + dialog if release >= 11798 else b"") + save_all + no_error)
+    assert (b"Current (A)" in bias) == (release < 11798)
+
+
+def test_names_are_those_of_the_protocol_in_either_case_and_echoed(tmp_path: Path) -> None:
+    with NanonisEmulator(port=0).running(tmp_path) as address:
+        assert _asked(address, "util.versionget").endswith(bytes(8))
+        assert b"Error in command: bias.nonsense: " in _asked(address, "Bias.Nonsense")
+        assert b"Error in command: laser.powerget: Module not available" in _asked(address, "Laser.PowerGet")
+
+
+def test_the_end_of_each_line_is_waited_for(tmp_path: Path) -> None:
+    with NanonisEmulator(port=0).running(tmp_path, ExperimentClock.starting_now(speed=20.0)) as address:
+        buffer = struct.pack(">iiii", 1, 14, 16, 16)
+        assert _asked(address, "Scan.BufferSet", buffer).endswith(bytes(8))
+        assert struct.unpack(">4I", _asked(address, "Scan.WaitEndOfLine", struct.pack(">i", 50))[:16])[0] == 1
+        _asked(address, "Scan.Action", struct.pack(">HI", 0, 1))
+        told = [struct.unpack(">4I", _asked(address, "Scan.WaitEndOfLine", b"\xff" * 4)[:16]) for _ in range(6)]
+    assert all(timed_out == 0 and 1 <= line <= 16 for timed_out, line, _, _ in told)
+    passes = [2 * line + backward for _, line, backward, _ in told]
+    assert passes == sorted(set(passes))
+
+
+def test_a_session_goes_on_in_a_folder_within_its_own(tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    with NanonisEmulator(port=0).running(session) as address:
+        for path, said in (
+            (session / "night", bytes(8)),
+            (tmp_path, b"not valid"),
+            (session / ".." / "x", b"can't be"),
+        ):
+            text = str(path).encode()
+            assert said in _asked(address, "Util.SessionPathSet", struct.pack(">i", len(text)) + text + bytes(4))
+        assert str(session / "night").encode() in _asked(address, "Util.SessionPathGet")
+    assert (session / "night").is_dir()
+    assert [path.name for path in tmp_path.iterdir()] == ["session"]
+
+
+def _asked(address: str, name: str, body: bytes = b"") -> bytes:
+    """The body of the reply to a request, which must be under the name that it was asked by."""
+    host, port = address.split(":")
+    with socket.create_connection((host, int(port)), timeout=20.0) as connection:
+        connection.sendall(name.encode().ljust(32, b"\0") + struct.pack(">iHH", len(body), 1, 0) + body)
+        reader = connection.makefile("rb")
+        header = reader.read(40)
+        assert header[:32].rstrip(b"\0").decode() == name
+        return reader.read(struct.unpack_from(">i", header, 32)[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any, ClassVar, Final
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
 from afspm.emulators.nanonis import logger, on_curves, on_patterns, on_scans, on_signals, on_tip, panel, wire
 from afspm.emulators.nanonis.answers import Later, Nope, Results, answer
+from afspm.emulators.nanonis.nonsense import nonsense
 from afspm.emulators.nanonis.panel import Panel
 from afspm.emulators.nanonis.server import Connection, Server
 from afspm.emulators.rig import RigBusy
@@ -92,6 +94,7 @@ class NanonisEmulator(Emulator):
         "huge": "a reply that announces two gigabytes",
         "not-utf8": "texts that are not UTF-8",
         "nan": "NaN for every number",
+        "nonsense": "for the duration, replies of the right form with values that make no sense",
         "crash": "the software vanishes",
         **panel.FAULT_KINDS,
     }
@@ -113,6 +116,7 @@ class NanonisEmulator(Emulator):
         self.release = _release(release)
         self._ports = ports
         self.logger_port = logger_port
+        self._chance = random.Random(self.seed)
         self._one_each = one_each
         self._session_path = session_path
         self._range_m = range_m
@@ -279,6 +283,8 @@ class NanonisEmulator(Emulator):
             results = tuple(math.nan if isinstance(value, float) else value for value in results)
         fields = wire.functions()[asked.name].results
         padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
+        if self.faults.lasts("nonsense", now_s):
+            padded = tuple(nonsense(field.code, self._chance) for field in fields)
         self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
 
     def _send(self, connection: Connection, name: str, body: bytes) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from afspm.errors import AfspmError
 from afspm.microscopes.microscope import ControllerLost
 from afspm.microscopes.nanonis.link import Link
+from afspm.microscopes.nanonis.protocol import BadReply
 
 _WAIT_MS: Final = 1000
 _LONGEST_CURVE_S: Final = 24 * 3600.0
@@ -100,6 +101,9 @@ class Listener:
             except AfspmError as error:
                 self._for_scan = False
                 result = Failed(error)
+            except Exception as error:  # whatever it says, this connection goes on being listened to, or is made anew
+                self._for_scan = False
+                result = Failed(BadReply(f"what Nanonis says of a measurement can't be: {error!r}"))
             if self._closed:
                 return
             if result is not None:
