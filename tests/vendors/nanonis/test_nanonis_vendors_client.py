@@ -5,7 +5,9 @@ Of nanonis-spm 1.0.9 some functions can't read any reply (`MISREAD`): those are 
 
 from __future__ import annotations
 
+import importlib.util
 import math
+import runpy
 import socket
 import struct
 import time
@@ -482,3 +484,24 @@ def test_signals_are_logged_on_a_port_of_their_own(tmp_path: Path) -> None:
     currents = [frame[4] for frame in frames]
     assert np.mean(currents) > 5e-12
     assert len(set(currents)) > 10
+
+
+@pytest.mark.parametrize(
+    "example",
+    ["BiasPulsesAtVariousZ", "BiasSpectroscopy", "BiasSpectroscopy_MultiSegment", "CustomBiasSweep"],
+)
+def test_the_makers_own_examples_run_as_they_are(
+    example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """But for the port that they connect to."""
+    spec = importlib.util.find_spec("nanonis_spm_examples")
+    assert spec is not None
+    assert spec.submodule_search_locations is not None
+    emulator = NanonisEmulator(port=0, surface="lattice")
+    with emulator.running(tmp_path, ExperimentClock.starting_now(speed=50.0)) as address:
+        connect, port = socket.socket.connect, int(address.split(":")[1])
+        monkeypatch.setattr(socket.socket, "connect", lambda made, _: connect(made, ("127.0.0.1", port)))
+        runpy.run_path(str(Path(spec.submodule_search_locations[0]) / f"Example_{example}.py"), run_name="__main__")
+    told = capsys.readouterr().out
+    assert "No error messages" in told
+    assert "The following error appeared" not in told

@@ -46,6 +46,7 @@ _STORED: Final = (
     "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util",
 )  # fmt: skip
 """The modules that are there: what is set in them is got again at least."""
+_KEEPS_NAN: Final = ("BiasSpectr.PropsSet",)
 _MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
 """A slew rate that is not limited is infinite."""
 
@@ -68,8 +69,8 @@ def answer(panel: Panel, name: str, arguments: list[Any]) -> Answer:
     Raises:
         Nope, RigBusy, InvalidValue.
     """
-    _refuse_no_numbers(name, arguments)
     handler = HANDLERS.get(name)
+    _refuse_no_numbers(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
     if handler is not None:
         return handler(panel, *([name] if handler in _NAMED else []), *arguments)
     if name.partition(".")[0] not in _STORED:
@@ -85,12 +86,12 @@ def answer(panel: Panel, name: str, arguments: list[Any]) -> Answer:
     raise Nope("it is not part of this emulator")
 
 
-def _refuse_no_numbers(name: str, arguments: Iterable[Any]) -> None:
-    """(!) How the real one takes NaN is not known."""
+def _refuse_no_numbers(name: str, arguments: Iterable[Any], *, keeps_nan: bool) -> None:
+    """The maker's own examples say of some functions that NaN is no change; (!) how others take it is not known."""
     for argument in arguments:
         if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":
             values = np.asarray(argument)
-            if np.isnan(values).any() or (np.isinf(values).any() and name not in _MAY_BE_INFINITE):
+            if (np.isnan(values).any() and not keeps_nan) or (np.isinf(values).any() and name not in _MAY_BE_INFINITE):
                 raise Nope("a value is not a number")
 
 

@@ -155,6 +155,16 @@ def _log_status(panel: Panel) -> Answer:
     return (panel.logger.status(),)
 
 
+@answers("PLL.FreqShiftAutoCenter")
+def _center(panel: Panel, modulator: int) -> Answer:
+    """The centre is where the frequency has shifted to."""
+    (shift_hz,) = panel.registers.got("PLL.FreqShiftGet", [modulator])
+    (center_hz,) = panel.registers.got("PLL.CenterFreqGet", [modulator])
+    panel.registers.set("PLL.CenterFreqSet", [modulator, center_hz + shift_hz])
+    panel.registers.set("PLL.FreqShiftSet", [modulator, 0.0])
+    return ()
+
+
 @answers("Util.Lock", "Util.UnLock")
 def _lock(panel: Panel) -> Answer:
     return ()

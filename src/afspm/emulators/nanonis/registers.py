@@ -101,7 +101,9 @@ def _keys_without_getter(register: str) -> int:
 
 
 def _set(mark: str, value: Any, before: Any) -> Any:
-    """How it is got from then on."""
+    """How it is got from then on; NaN is no change."""
+    if isinstance(value, float) and math.isnan(value):
+        return before
     if mark == "?":
         if value not in (0, 1, 2):
             raise ValueError(f"{value} is none of the choices")
