@@ -98,7 +98,9 @@ class Witness:
         self.contradicted: list[tuple[int, str]] = []
         self._context: Any = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
-        self._socket.setsockopt(zmq.SUBSCRIBE, b"")
+        # by the empty prefix a plain socket means what version 1 has
+        for prefix in ("", "JournalEntries", "LogLines", "ProcessStates", "Progress"):
+            self._socket.setsockopt(zmq.SUBSCRIBE, prefix.encode())
         self._socket.setsockopt(zmq.RCVHWM, 0)
         self._socket.setsockopt(zmq.RCVTIMEO, 20)
         self._address = ""
