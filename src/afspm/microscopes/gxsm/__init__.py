@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, Refused
@@ -29,8 +30,6 @@ from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
 
-_KEPT: Final[Mapping[str, Value]] = {names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1}
-"""What is kept here, and at first, unless the experiment file says that GXSM has it."""
 _SAVERS: Final = ("afspm", "gxsm")
 
 
@@ -52,6 +51,7 @@ class Gxsm(Microscope):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*Frame.names, *POSITION, FEEDBACK_ON, names.SPEC_KIND, names.CONTROLLER)
+    kept = MappingProxyType({names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1})
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
 
@@ -124,7 +124,7 @@ class Gxsm(Microscope):
             ask.call("action", AUTOSAVE_OFF)
             self.log.info("GXSM's Auto Save of scans is off from now on, and stays off: see the setting saving")
         self._kept: dict[str, Any] = self.memory.setdefault("kept", {})
-        self._kept.update({names.SPEC_KIND: "IV", "probe": None, **_KEPT} | self._kept)
+        self._kept.update({names.SPEC_KIND: "IV", "probe": None, **self.kept} | self._kept)
         self._harvest = Harvest(
             self.memory,
             self.patience_s(self.result_timeout_s / 2),
@@ -149,11 +149,11 @@ class Gxsm(Microscope):
 
     def _find_parameters(self) -> None:
         table = self._whole_table
-        own = {*self.translated, *(name for name in _KEPT if table[name].vendor == name)}
+        own = {*self.translated, *(name for name in self.kept if table[name].vendor == name)}
         vendors = {name: spec.vendor for name, spec in table.items() if name not in own}
         self._refs = available(vendors, self._refnames)
         lacking = sorted(vendors.keys() - self._refs.keys())
-        self._own = [name for name in _KEPT if name in own]
+        self._own = [name for name in self.kept if name in own]
         if self._feedback_actions and self._actions.issuperset(self._feedback_actions):
             table = table.extended({FEEDBACK_ON: {"read_only": False}}, where="feedback_actions")
         self.table = table.without(lacking)
