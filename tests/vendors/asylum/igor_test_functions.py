@@ -42,6 +42,10 @@ _FUNCTIONS: dict[str, Function] = {
     "TestFunctionMultipleReturnValuesValid1": Function(lambda: (123.0, "Hi there!", math.nan), "", "vsv"),
     "TestFunctionMultipleReturnValuesValid3": Function(lambda: ("root:Packages:", 1.0), "", "dv"),
     "TestFunctionMultipleReturnValuesValid5": Function(lambda: (0.0, ""), "", "vs"),
+    "TestFunctionOneResultListed": Function(lambda: (123.0,), "", "v", listed=True),
+    "TestFunctionVariableAndWave": Function(_nothing, "vw"),
+    "TestFunctionWaveForComplex": Function(_nothing, "w", "c"),
+    "TestFunctionBreaks": Function(lambda: 1 / 0),
     "TestNotUtf8": Function(lambda: "29.5 \udcb0C", "", "s"),
 }
 

@@ -108,7 +108,8 @@ def test_an_error_has_its_number_its_meaning_and_what_igor_printed() -> None:
     assert reply.error is not None
     error = xop.XopError(*reply.error, where="F")
     assert error.number == 107
-    assert "the function was aborted (107: CallFunction: The function was aborted. index out of range)" in str(error)
+    meant = "CallFunction: The function was partially executed but aborted at some point."
+    assert f"the function was aborted (107: {meant} index out of range)" in str(error)
 
 
 GOOD = wire.success(wire.Function(lambda: None, "S", "v"), (1.0, ("a",)), "7")

@@ -321,7 +321,7 @@ def test_a_value_that_asylum_does_not_have_is_named(bench: Make) -> None:
         (names.SCAN_SIZE_X, "1", "V", ControlResponse.PARAM_ERROR),
         (names.SCAN_SIZE_X, "1", "m", ControlResponse.PARAM_ERROR),
         (names.SCAN_DIRECTION, "sideways", None, ControlResponse.PARAM_ERROR),
-        ("x-engaged", "true", None, ControlResponse.PARAM_ERROR),
+        ("x-engaged", "false", None, ControlResponse.PARAM_ERROR),
         ("no-such", "1", None, ControlResponse.PARAM_NOT_SUPPORTED),
     ],
 )

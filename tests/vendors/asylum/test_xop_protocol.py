@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -97,8 +96,103 @@ def test_reference_calls(client: Client, case: dict[str, Any]) -> None:
         assert wanted in values(reply)
     if "expected_result" in case:
         told = reply["result"]["value"]
-        assert float(told) == float(case["expected_result"]) or math.isnan(float(told))
+        assert (told == "nan") if case["expected_result"] == "NaN" else told == float(case["expected_result"])
     assert xop.reply(json.dumps(reply).encode()).error is None or case["expect_code"]
+
+
+@pytest.mark.parametrize("top", [b"[1]", b"4711", b"null", b'"text"', b"[]"])
+def test_what_is_json_and_no_object_has_no_version(client: Client, top: bytes) -> None:
+    assert client.ask(top)["errorCode"]["value"] == 4
+
+
+@pytest.mark.parametrize("number", ["1e400", "-1e400", "9" * 400])
+def test_numbers_out_of_range_are_no_json(client: Client, number: str) -> None:
+    message = json.dumps(called("GV", 7)).replace("7]", f"{number}]").encode()
+    assert client.ask(message)["errorCode"]["value"] == 3
+
+
+def test_half_a_surrogate_pair_is_no_json(client: Client) -> None:
+    for where in ("messageID", "name", "params"):
+        message = {
+            "messageID": called("GV", "a", message_id="\ud800"),
+            "name": called("\udc00"),
+            "params": called("GV", "\ud800"),
+        }[where]
+        assert client.ask(json.dumps(message).encode()) == {
+            "errorCode": {"value": 3, "msg": "The string is not a valid json object."}
+        }
+
+
+def test_a_byte_order_mark_and_what_follows_a_nul_are_passed_over(client: Client) -> None:
+    message = json.dumps(called("TestFunction1Arg", 1)).encode()
+    for payload in (b"\xef\xbb\xbf" + message, message + b"\0", message + b"\0 {"):
+        assert client.ask(payload)["result"]["value"] == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0x10", 16), ("0x1.8p1", 3), (" 1", 1), ("+.5", 0.5), ("infinity", "inf"), ("-INF", "-inf"), ("nan(7)", "nan"),
+        ("", 0), ("1 ", None), (" ", None), ("1.a", None), ("0x", None), ("+", None), ("1_000", None), ("\u0661", None),
+    ],
+)  # fmt: skip
+def test_numbers_are_read_as_strtod_reads_them(client: Client, text: str, value: Any) -> None:
+    reply = client.call("TestFunction1Arg", text)
+    assert reply["errorCode"]["value"] == (106 if value is None else 0)
+    assert value is None or reply["result"]["value"] == value
+
+
+def test_the_order_of_checks(client: Client) -> None:
+    """How many, then numbers, then what is given back, then what can't be passed."""
+    for name, parameters, error in (
+        ("TestFunctionVariableAndWave", ("1.a",), 102),
+        ("TestFunctionVariableAndWave", ("1.a", 1), 106),
+        ("TestFunctionVariableAndWave", ("1", 1), 104),
+        ("TestFunctionWaveForComplex", (1,), 105),
+    ):
+        assert client.call(name, *parameters)["errorCode"]["value"] == error
+    nameless = client.call("")
+    assert nameless["errorCode"]["value"] == 101
+    assert "messageID" not in nameless
+
+
+def test_a_list_of_results_is_one_also_of_a_single_one(client: Client) -> None:
+    assert client.call("TestFunctionOneResultListed")["result"] == [{"type": "variable", "value": 123}]
+
+
+def test_a_function_that_breaks_is_aborted_and_igor_stays(client: Client) -> None:
+    reply = client.call("TestFunctionBreaks")
+    assert reply["errorCode"]["value"] == 107
+    assert "division by zero" in reply["history"]
+    assert client.call("TestFunctionNoArgs")["errorCode"]["value"] == 0
+
+
+@pytest.mark.parametrize(
+    "put",
+    [
+        ("AmplitudeSetpointVolts", 0), ("AmplitudeSetpointVolts", -1), ("IntegralGain", -10), ("TipVoltage", "nan"),
+        ("ScanRate", 0), ("ScanLines", 0), ("ScanPoints", -5), ("ScanSize", 0), ("FastRatio;SlowRatio", 0),
+        ("SlowRatio", -1), ("ScanSize", "nan"), ("XOffset", "inf"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_scan_that_can_not_be_taken_is_interrupted(
+    igor: WithTestFunctions, client: Client, put: tuple[str, Any]
+) -> None:
+    client.call("PV", *put)
+    assert client.call("DoScanFunc", "DoScan")["errorCode"]["value"] == 0
+    while client.call("GV", "ScanStatus")["result"]["value"]:
+        pass
+    assert igor.rig.scan is None
+
+
+def test_what_is_put_does_not_break_names_and_numbers(client: Client, tmp_path: Path) -> None:
+    client.call("PV", "BaseSuffix", "nan")
+    client.call("PS", "BaseName", "../nul\0\\out")
+    assert client.call("ARCheckSuffix")["errorCode"]["value"] == 0
+    client.call("PV", "ForceSpotNumber", 7)
+    assert client.call("GoToSpot")["errorCode"]["value"] == 107
+    assert client.call("GV", "ScanSize")["errorCode"]["value"] == 0
 
 
 def test_the_translators_requests_are_what_the_xop_takes(client: Client) -> None:

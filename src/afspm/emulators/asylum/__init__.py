@@ -13,7 +13,7 @@ from afspm.emulators.asylum.functions import Dialog, Software
 from afspm.emulators.asylum.server import Queued, Server
 from afspm.emulators.asylum.values import Values
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
-from afspm.errors import ConfigError
+from afspm.errors import AfspmError, ConfigError
 from afspm.units import Duration
 
 PROCEDURES: Final = ("afspm", "spots", "none")
@@ -157,6 +157,11 @@ class AsylumEmulator(Emulator):
         times += [self._delayed[0].at_s] if self._delayed else []
         return min((at_s for at_s in times if at_s is not None and at_s > now_s), default=None)
 
+    def abandon(self) -> None:
+        """Give up the scan or curve, too, that the software thinks is running."""
+        super().abandon()
+        self.controller.abandon()
+
     def close(self) -> None:
         """Listen no more."""
         if hasattr(self, "_server"):
@@ -202,10 +207,16 @@ class AsylumEmulator(Emulator):
             raise wire.Failed(_UNKNOWN)
         try:
             given = function.do(*arguments)
+        except wire.Failed:
+            raise
         except Dialog as dialog:
             self.log.warning("a dialog waits for OK: %s", dialog)
             self._wait_for_somebody(math.inf)
             given = dialog.result
+        except Exception as error:  # whatever a client asks for, Igor stays
+            if not isinstance(error, AfspmError):
+                self.log.exception("%s was aborted", call.name)
+            raise wire.Failed(_ABORTED, f"While executing {call.name} an error occurred: {error}") from error
         if isinstance(given, str) and self.faults.strikes("not-utf8", now_s):
             given += "\udcb0"
         return wire.success(function, given, call.message_id)

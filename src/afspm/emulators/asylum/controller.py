@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -12,6 +13,7 @@ from afspm.emulators.asylum import saving
 from afspm.emulators.asylum.values import Values
 from afspm.emulators.faults import Faults
 from afspm.emulators.rig import Rig
+from afspm.errors import AfspmError, InvalidValue
 from afspm.model import Region
 
 FAULT_KINDS: Final = {
@@ -28,6 +30,8 @@ FAULT_KINDS: Final = {
     "drive-gone": "for the duration, the drive with the data is not there",
 }
 _SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
+_MOST_POINTS: Final = 8192
+_LONGEST_NAME: Final = 17
 _INTEGRAL_GAIN: Final = 150.0
 """What Asylum's gain of 1 is to the simulated feedback, in 1/s."""
 
@@ -79,7 +83,7 @@ class Controller:
             self.rig.engage()
         if now_s >= self._starts_at_s and not self.rig.busy(now_s):
             self._starts_at_s = math.inf
-            self._start()
+            self._start_or_interrupt(now_s)
         if self.scanning and self.rig.scan is not None and math.isinf(self._starts_at_s):
             if not self.rig.scan.running(now_s):
                 self._image_done(now_s)
@@ -137,6 +141,34 @@ class Controller:
         """The tip stays where it is."""
         self.rig.feedback = replace(self.rig.feedback, on=False)
 
+    def abandon(self) -> None:
+        """Stop whatever goes on, as an error that nobody foresaw ended it."""
+        self._starts_at_s = math.inf
+        self._curve_running = self._engages = False
+        self.values.put("ScanStatus;FMapStatus", 0)
+
+    def _start_or_interrupt(self, now_s: float) -> None:
+        """Begin the image; with values that no scan can be taken with, it ends as if somebody had stopped it."""
+        try:
+            if not self._can_be_scanned():
+                raise InvalidValue("the scan parameters can't be scanned with")
+            self._start()
+        except (AfspmError, ArithmeticError, ValueError) as error:
+            self._log.warning("the scan was interrupted: %s", error)
+            self._leave_image(now_s)
+
+    def _can_be_scanned(self) -> bool:
+        """PV puts any number; the scan itself needs some that are finite and positive."""
+        values = self.values
+        positive = ("ScanSize", "FastRatio", "SlowRatio", "ScanRate", "ScanLines", "ScanPoints", "IntegralGain")
+        finite = ("XOffset", "YOffset", "ScanAngle", "TipVoltage", "AmplitudeSetpointVolts", "ScanDown", "LastScan")
+        return (
+            all(0.0 < values.get(name) < math.inf for name in positive)
+            and all(math.isfinite(values.get(name)) for name in finite)
+            and values.get("AmplitudeSetpointVolts") > 0.0
+            and all(2 <= values.get(name) <= _MOST_POINTS for name in ("ScanLines", "ScanPoints"))
+        )
+
     def _start(self) -> None:
         values, rig = self.values, self.rig
         rig.region = self._frame()
@@ -184,7 +216,11 @@ class Controller:
         """Take a force curve where the tip is: whether it does."""
         if self.scanning or self.rig.busy(now_s) or self.faults.strikes("force-refused", now_s):
             return False
-        self.rig.start_spectrum("force")
+        try:
+            self.rig.start_spectrum("force")
+        except (AfspmError, ArithmeticError, ValueError) as error:
+            self._log.warning("the force curve was refused: %s", error)
+            return False
         self._curve_running = True
         return True
 
@@ -194,8 +230,14 @@ class Controller:
         self.rig.stop_spectrum()
 
     def go_to_spot(self, now_s: float) -> None:
-        """Send the tip to the spot that ForceSpotNumber says, on the last image."""
-        number = int(self.values.get("ForceSpotNumber"))
+        """Send the tip to the spot that ForceSpotNumber says, on the last image.
+
+        Raises:
+            InvalidValue: there is no such spot, or it is nowhere. RigBusy.
+        """
+        number = self._whole("ForceSpotNumber")
+        if not 0 <= number < len(self.spots_m) or not all(map(math.isfinite, self.spots_m[number])):
+            raise InvalidValue(f"ForceSpotNumber is {number}, there are {len(self.spots_m)} spots")
         image = self._image
         x, y = (along - size / 2 for along, size in zip(self.spots_m[number], image.size_m, strict=True))
         cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
@@ -211,7 +253,7 @@ class Controller:
 
     def check_suffix(self) -> None:
         """The next number of which there is no file."""
-        base, suffix = self.values.text("BaseName"), int(self.values.get("BaseSuffix"))
+        base, suffix = self._base_name(), self._suffix()
         while (self._folder / f"{base}{suffix:04d}.ibw").exists():
             suffix += 1
         self.values.put("BaseSuffix", suffix)
@@ -220,15 +262,28 @@ class Controller:
         faults = self.faults
         if faults.strikes("other-name", now_s):
             self.values.put_text("BaseName", "Somebody")
-        if not int(self.values.get(where)) & 2 or faults.strikes("no-file", now_s):
+        if not self._whole(where) & 2 or faults.strikes("no-file", now_s):
             return
-        suffix = int(self.values.get("BaseSuffix"))
+        suffix = self._suffix()
         if faults.strikes("same-name", now_s):
             suffix = max(0, suffix - 1)
-        name = f"{self.values.text('BaseName')}{suffix:04d}"
+        name = f"{self._base_name()}{suffix:04d}"
         late = faults.strikes("late-file", now_s)
         half = faults.strikes("half-file", now_s)
         at_s = now_s + self._file_s + (late.duration_s if late else 0.0)
         rest_at_s = at_s + self._file_s + (half.duration_s if half else 0.0)
         self._disk.save(self._folder / f"{name}.ibw", made(name), at_s, rest_at_s)
         self.values.put("BaseSuffix", suffix + 1)
+
+    def _base_name(self) -> str:
+        """A name that Igor allows: a letter, then letters, digits and "_". A file never leaves its folder."""
+        kept = re.sub(r"[^A-Za-z0-9_]", "", self.values.text("BaseName")).lstrip("0123456789_")
+        return kept[:_LONGEST_NAME] or "Image"
+
+    def _suffix(self) -> int:
+        return min(max(0, self._whole("BaseSuffix")), 9999)
+
+    def _whole(self, name: str) -> int:
+        """A number that is used as a whole one; 0 for what is none."""
+        value = self.values.get(name)
+        return int(value) if math.isfinite(value) else 0

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from afspm.emulators.running import RunningScan, RunningSpectrum
 
 AMPLITUDE_M_PER_V = 1e-7
 
+Entries = Mapping[str, float | str]
 Made = Callable[[str], bytes]
 """The content of a file, given the name of its wave."""
 
@@ -78,13 +80,32 @@ def curve(name: str, spectrum: RunningSpectrum, values: Values, now_s: float) ->
     ]
     columns = np.column_stack([*there_and_back, there_and_back[0]])
     step_s = (spectrum.end_s - spectrum.start_s) / len(columns)
+    noted = _of_curve(spectrum, float(np.ptp(extension)), columns.shape[0], values)
+    return ibw.wave(name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, noted), now_s)
+
+
+def _of_curve(spectrum: RunningSpectrum, distance_m: float, points: int, values: Values) -> Entries:
+    """What the note of a force curve says of how it was taken."""
+    duration_s = spectrum.end_s - spectrum.start_s
+    velocity_m_s = distance_m / (duration_s / 2)
     place = zip(("XLVDT", "YLVDT"), spectrum.position_m, strict=True)
-    return ibw.wave(
-        name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, list(place)), now_s
-    )
+    return {
+        **dict(place),
+        "ImagingMode": "Contact",
+        "ForceDist": distance_m,
+        "ForceScanRate": 1.0 / duration_s,
+        "NumPtsPerSec": points / duration_s,
+        "InputTime": duration_s,
+        "ApproachVelocity": velocity_m_s,
+        "RetractVelocity": velocity_m_s,
+        "TriggerChannel": "DeflVolts",
+        "TriggerPoint": values.get("DeflectionSetpointVolts"),
+        "Indexes": f"0,{points // 2},{points - 1}",
+        "Direction": "NaN,1,-1,",
+    }
 
 
-def _note(values: Values, now_s: float, more: Sequence[tuple[str, float]] = ()) -> bytes:
+def _note(values: Values, now_s: float, more: Entries = MappingProxyType({})) -> bytes:
     local, seconds = ibw.moment(now_s)
     texts = {
         "StartHeadTemp": "32.125 °C",
@@ -96,4 +117,5 @@ def _note(values: Values, now_s: float, more: Sequence[tuple[str, float]] = ()) 
         "Version": "15.09.112",
         "BaseName": values.text("BaseName"),
     }
-    return ibw.note([*values.noted(), *more, *texts.items()])
+    numbers = ((name, value) for name, value in values.noted() if name not in more)
+    return ibw.note([*numbers, *more.items(), *texts.items()])

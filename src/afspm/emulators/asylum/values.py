@@ -49,7 +49,8 @@ class Values:
 
     def size(self) -> tuple[float, float]:
         """(fast, slow): ScanSize is the longer side, the ratios say how much shorter the other one is."""
-        longer, ratio = self.get("ScanSize"), self.get("SlowRatio") / self.get("FastRatio")
+        longer, fast, slow = self.get("ScanSize"), self.get("FastRatio"), self.get("SlowRatio")
+        ratio = slow / fast if fast else math.nan
         return (longer / ratio, longer) if ratio > 1.0 else (longer, longer * ratio)
 
     def settle(self) -> None:

@@ -16,23 +16,28 @@ from typing import Any, Final, NoReturn
 LONGEST_REQUEST: Final = 1024
 
 MESSAGES: Final = {
-    1: "Unknown error.",
+    1: "Unknown error in request interface.",
     3: "The string is not a valid json object.",
     4: "Request interface version is missing or invalid.",
-    5: "Request has no or an invalid operation.",
-    6: "CallFunction: The operation has an invalid format.",
-    7: "The messageID is invalid.",
-    8: "Out of memory.",
+    5: "Unknown operation type.",
+    6: "Invalid operation format.",
+    7: "Invalid optional messageID.",
+    8: "Request cancelled due to Out Of Memory condition.",
     100: "Procedures are not compiled.",
     101: "CallFunction: Unknown function.",
     102: "CallFunction: Too few parameters.",
     103: "CallFunction: Too many parameters.",
     104: "CallFunction: Unsupported function signature.",
     105: "CallFunction: Unsupported function return type.",
-    106: "CallFunction: Parameter has an invalid format.",
-    107: "CallFunction: The function was aborted.",
+    106: "CallFunction: Parameter is not an array or otherwise invalid.",
+    107: "CallFunction: The function was partially executed but aborted at some point.",
 }
-_NUMBER: Final = re.compile(r"\s*[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)?\s*", re.IGNORECASE)
+_DECIMAL: Final = r"(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
+_HEXADECIMAL: Final = r"0x([0-9a-f]+\.?[0-9a-f]*|\.[0-9a-f]+)(p[+-]?\d+)?"
+_NUMBER: Final = re.compile(
+    rf"[ \t\n\v\f\r]*[+-]?({_HEXADECIMAL}|{_DECIMAL}|inf(inity)?|nan(\(\w*\))?)", re.IGNORECASE | re.ASCII
+)
+"""A number as C's strtod reads it to the end of the text."""
 
 Value = float | str | Mapping[str, Any] | None
 
@@ -70,11 +75,13 @@ class Function:
         takes: a letter for each parameter: v(ariable), s(tring), d(ata folder), in upper case by reference; anything
             else can't be passed.
         gives: a letter for each result: v, s, d, w(ave); anything else can't be passed.
+        listed: it is declared by Igor's syntax for several results, which it may use for one, too.
     """
 
     do: Callable[..., Any]
     takes: str = ""
     gives: str = "v"
+    listed: bool = False
 
 
 def call(payload: bytes) -> Call:
@@ -83,26 +90,42 @@ def call(payload: bytes) -> Call:
     Raises:
         Failed: 3 to 7 or 106: the request itself is wrong.
     """
-    try:
-        content = json.loads(payload.decode("utf-8"), parse_constant=_no_constant)
-    except (ValueError, RecursionError):
-        raise Failed(3) from None
-    if not isinstance(content, dict):
-        raise Failed(3)
-    version, message_id = content.get("version"), content.get("messageID")
+    content = _parsed(payload)
+    fields = content if isinstance(content, dict) else {}
+    version, message_id = fields.get("version"), fields.get("messageID")
     if type(version) is not int or version != 1:
         raise Failed(4)
-    if "messageID" in content and not (isinstance(message_id, str) and 1 <= len(message_id.encode()) <= 255):
+    if "messageID" in fields and not (isinstance(message_id, str) and 1 <= len(message_id.encode()) <= 255):
         raise Failed(7)
-    wanted = content.get("CallFunction")
+    wanted = fields.get("CallFunction")
     if not isinstance(wanted, dict):
         raise Failed(5)
-    if not (wanted.keys() in ({"name"}, {"name", "params"}) and isinstance(wanted["name"], str)):
+    return Call(*_function_call(wanted), message_id)
+
+
+def _parsed(payload: bytes) -> Any:
+    """The JSON, which may begin with a byte order mark and ends at the first NUL."""
+    text = payload.removeprefix(b"\xef\xbb\xbf").partition(b"\0")[0]
+    try:
+        content = json.loads(text.decode("utf-8"), parse_constant=_no_constant, parse_int=_integer, parse_float=_finite)
+        json.dumps(content, ensure_ascii=False).encode("utf-8")  # half a surrogate pair is no text
+    except (ValueError, RecursionError):
+        raise Failed(3) from None
+    return content
+
+
+def _function_call(wanted: dict[str, Any]) -> tuple[str, tuple[str, ...]]:
+    """The name of the function, and its parameters."""
+    name, given = wanted.get("name"), wanted.get("params", [])
+    if len(wanted) > 2 or not isinstance(name, str):
         raise Failed(6)
-    given = wanted.get("params", [])
+    if not name:
+        raise Failed(101)
+    if "params" not in wanted and len(wanted) > 1:
+        raise Failed(6)
     if not isinstance(given, list):
         raise Failed(106)
-    return Call(wanted["name"], tuple(map(_parameter, given)), message_id)
+    return name, tuple(map(_parameter, given))
 
 
 def arguments(function: Function | None, parameters: Sequence[str]) -> list[float | str]:
@@ -113,13 +136,14 @@ def arguments(function: Function | None, parameters: Sequence[str]) -> list[floa
     """
     if function is None:
         raise Failed(101)
-    if not set(function.takes.lower()) <= set("vsd"):
-        raise Failed(104)
-    if not set(function.gives) <= set("vsdw"):
-        raise Failed(105)
     if len(parameters) != len(function.takes):
         raise Failed(102 if len(parameters) < len(function.takes) else 103)
-    return [_argument(kind.lower(), text) for kind, text in zip(function.takes, parameters, strict=True)]
+    given = [_argument(kind.lower(), text) for kind, text in zip(function.takes, parameters, strict=True)]
+    if not set(function.gives) <= set("vsdw"):
+        raise Failed(105)
+    if not set(function.takes.lower()) <= set("vsd"):
+        raise Failed(104)
+    return given
 
 
 def success(function: Function, given_back: Any, message_id: str | None) -> bytes:
@@ -130,10 +154,10 @@ def success(function: Function, given_back: Any, message_id: str | None) -> byte
     """
     by_reference = [kind.lower() for kind in function.takes if kind.isupper()]
     results, passed = given_back if by_reference else (given_back, ())
-    several = len(function.gives) > 1
+    several = function.listed or len(function.gives) > 1
     values = [_value(*one) for one in zip(function.gives, results if several else (results,), strict=True)]
     content: dict[str, Any] = {"errorCode": {"value": 0}, "result": values if several else values[0]}
-    if by_reference:
+    if by_reference and not several:
         content["passByReference"] = [_value(*one) for one in zip(by_reference, passed, strict=True)]
     return _message(content, message_id)
 
@@ -180,7 +204,7 @@ def _parameter(given: Any) -> str:
     if isinstance(given, bool):
         return str(int(given))
     if isinstance(given, int | float):
-        return f"{given:.15g}"
+        return f"{float(given):.15g}"
     if isinstance(given, str):
         return given
     raise Failed(106)
@@ -189,12 +213,35 @@ def _parameter(given: Any) -> str:
 def _argument(kind: str, text: str) -> float | str:
     if kind != "v":
         return text
+    if not text:
+        return 0.0
     if not _NUMBER.fullmatch(text):
         raise Failed(106)
+    number = text.strip().lower()
+    if "nan" in number:
+        return math.nan
+    return _from_hexadecimal(number) if "0x" in number else float(number)
+
+
+def _from_hexadecimal(number: str) -> float:
     try:
-        return float(text) if text.strip() else 0.0
-    except ValueError:  # a sign alone
-        raise Failed(106) from None
+        return float.fromhex(number)
+    except OverflowError:
+        return -math.inf if number.startswith("-") else math.inf
+
+
+def _finite(text: str) -> float:
+    """A number with a point or an exponent, which has to be one that a double can hold."""
+    number = float(text)
+    if math.isinf(number):
+        raise ValueError(f"{text} is out of range")
+    return number
+
+
+def _integer(text: str) -> int | float:
+    """A whole number; one of more than 64 bits is read as a double."""
+    is_short = len(text) <= 20 and -(2**63) <= int(text) < 2**64
+    return int(text) if is_short else _finite(text)
 
 
 def _no_constant(name: str) -> NoReturn:
