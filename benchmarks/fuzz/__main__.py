@@ -9,12 +9,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from afspm.emulators.asylum import AsylumEmulator
 from afspm.emulators.emulator import Emulator
 from afspm.emulators.nanonis import NanonisEmulator
+from benchmarks.fuzz.asylum import AsylumFuzzer
 from benchmarks.fuzz.frame import Fuzzer, fuzz
 from benchmarks.fuzz.nanonis import NanonisFuzzer
 
-FUZZERS: dict[type[Fuzzer[Any]], type[Emulator]] = {NanonisFuzzer: NanonisEmulator}
+FUZZERS: dict[type[Fuzzer[Any]], type[Emulator]] = {NanonisFuzzer: NanonisEmulator, AsylumFuzzer: AsylumEmulator}
 
 
 def main(count: int = 50_000, seed: int = 1) -> None:

@@ -18,18 +18,11 @@ _ODD: Final = (
     b'{"version": 1, "messageID": "\\ud800", "CallFunction": {"name": "GV", "params": ["ScanSize"]}}',
     b'{"version": 1, "CallFunction": {"name": ""}}', b'{"version": ' + b"9" * 400 + b"}",
 )  # fmt: skip
-_BUTTONS: Final = (
-    "DoScan",
-    "UpScan_0",
-    "DownScanButton_1",
-    "StopScan",
-    "StopEngage_",
-    "SingleForce",
-    "GoForce",
-    "ResetForce",
-)
-_SILENT: Final = ("DoScanFunc", "DoForceFunc", "GoToSpot")
-"""Functions that open a dialog for what they do not know: Igor is then busy until somebody presses OK."""
+_BUTTONS: Final = {
+    "DoScanFunc": ("DoScan", "UpScan_0", "DownScanButton_1", "StopScan", "StopEngage_"),
+    "DoForceFunc": ("SingleForce", "GoForce", "ResetForce", "StopForce", "NoForce", ""),
+}
+"""What DoScanFunc does not know opens a dialog, and Igor is busy until somebody presses OK."""
 
 
 class AsylumFuzzer(Fuzzer[AsylumEmulator]):
@@ -81,8 +74,9 @@ class AsylumFuzzer(Fuzzer[AsylumEmulator]):
         if kind < 0.5:
             return "PS", [self.chance.choice(("BaseName", "SaveImage", "SaveForce")), self.text("Image", "Curve_1")]
         if kind < 0.75:
-            return self.chance.choice(("DoScanFunc", "DoForceFunc")), [self.chance.choice(_BUTTONS)]
-        name = self.chance.choice([name for name in self._functions if name not in _SILENT])
+            function = self.chance.choice(tuple(_BUTTONS))
+            return function, [self.chance.choice(_BUTTONS[function])]
+        name = self.chance.choice([name for name in self._functions if name != "doscanfunc"])
         return name, [self._value(kind) for kind in self._functions[name]]
 
     def _value(self, kind: str) -> Any:

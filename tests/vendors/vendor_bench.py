@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import secrets
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -59,7 +60,7 @@ class Peer:
 
     def __init__(self, serve: str, publish: str) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
-        self._asked = itertools.count()
+        self._asked = (f"bench/{secrets.token_hex(4)}/{number}" for number in itertools.count())
         self._request = self._context.socket(zmq.REQ)
         self._request.connect(serve)
         self._packets = self._context.socket(zmq.SUB)
@@ -71,7 +72,7 @@ class Peer:
             each.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
 
     def ask(self, kind: int, subject: Any) -> Response:
-        request = Request(kind, subject, wire.frames.encode_subject(subject), f"bench/{next(self._asked)}")
+        request = Request(kind, subject, wire.frames.encode_subject(subject), next(self._asked))
         self._request.send_multipart(wire.encode_request(request))
         return wire.decode_response(self._request.recv_multipart())
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from afspm.emulators.asylum import AsylumEmulator
+from benchmarks.fuzz import fuzz
 from benchmarks.fuzz.asylum import AsylumFuzzer
-from benchmarks.fuzz.frame import fuzz
+
+from afspm.emulators.asylum import AsylumEmulator
 
 CALLS = 2000
 

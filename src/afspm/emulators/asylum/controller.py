@@ -31,6 +31,8 @@ FAULT_KINDS: Final = {
 }
 _SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
 _MOST_POINTS: Final = 8192
+_REACH_M: Final = 1e-3
+"""No scanner goes further."""
 _LONGEST_NAME: Final = 17
 _INTEGRAL_GAIN: Final = 150.0
 """What Asylum's gain of 1 is to the simulated feedback, in 1/s."""
@@ -161,9 +163,11 @@ class Controller:
         """PV puts any number; the scan itself needs some that are finite and positive."""
         values = self.values
         positive = ("ScanSize", "FastRatio", "SlowRatio", "ScanRate", "ScanLines", "ScanPoints", "IntegralGain")
-        finite = ("XOffset", "YOffset", "ScanAngle", "TipVoltage", "AmplitudeSetpointVolts", "ScanDown", "LastScan")
+        near = ("ScanSize", "XOffset", "YOffset")
+        finite = ("ScanAngle", "TipVoltage", "AmplitudeSetpointVolts", "ScanDown", "LastScan")
         return (
             all(0.0 < values.get(name) < math.inf for name in positive)
+            and all(abs(values.get(name)) < _REACH_M for name in near)
             and all(math.isfinite(values.get(name)) for name in finite)
             and values.get("AmplitudeSetpointVolts") > 0.0
             and all(2 <= values.get(name) <= _MOST_POINTS for name in ("ScanLines", "ScanPoints"))
@@ -236,7 +240,7 @@ class Controller:
             InvalidValue: there is no such spot, or it is nowhere. RigBusy.
         """
         number = self._whole("ForceSpotNumber")
-        if not 0 <= number < len(self.spots_m) or not all(map(math.isfinite, self.spots_m[number])):
+        if not 0 <= number < len(self.spots_m) or not all(abs(along) < _REACH_M for along in self.spots_m[number]):
             raise InvalidValue(f"ForceSpotNumber is {number}, there are {len(self.spots_m)} spots")
         image = self._image
         x, y = (along - size / 2 for along, size in zip(self.spots_m[number], image.size_m, strict=True))
