@@ -537,3 +537,50 @@ def test_a_force_curve_that_somebody_takes_is_published_with_the_place_of_its_fi
     peer.until(ScopeState.SPEC)
     (curve,) = [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
     assert curve.position_m == pytest.approx((x, y), rel=1e-4, abs=1e-12)
+
+
+# --- what is done to the tip ---
+
+
+def test_a_pulse_is_a_bias_that_is_put_back(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench(speed=1.0)
+    peer = made.start()
+    ready(peer)
+    pulses: list[tuple[float, float]] = []
+    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse))
+    assert peer.set(names.TIP_BIAS_VOLTAGE, 0.5).ok
+    assert peer.set(names.PULSE_VOLTAGE, -4.5).ok
+    assert peer.set(names.PULSE_DURATION, "300", "ms").ok
+    pulses.clear()
+    assert peer.act(names.PULSE).ok
+    assert peer.act(names.START_SCAN).code == ControlResponse.NOT_FREE
+    peer.until(FREE)
+    assert peer.get(names.TIP_BIAS_VOLTAGE) == "0.5"
+    voltage_v, lasted_s = pulses[-1]
+    assert voltage_v == -4.5
+    assert lasted_s >= 0.3
+    assert peer.set(names.PULSE_VOLTAGE, 11).code == ControlResponse.PARAM_ERROR
+
+
+def test_a_crash_is_an_indentation_that_is_not_saved(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the README has it."""
+    made = bench(speed=5.0)
+    peer = made.start(
+        parameters={
+            "x-crash-depth": {"vendor": "ForceDist", "unit": "m", "range": [0, 5e-6]},
+            "x-crash-speed": {"vendor": "Velocity", "unit": "m/s"},
+            "x-save-force": {"vendor": "SaveForce"},
+        },
+        actions={"x-crash": {"set": {"x-save-force": 0}, "command": 'DoForceFunc "SingleForce"', "for": "3 s"}},
+    )
+    ready(peer)
+    crashes: list[tuple[float, float]] = []
+    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash))
+    assert peer.set(names.CRASH_DEPTH, 2, "um").ok
+    assert peer.set(names.CRASH_SPEED, 5, "um/s").ok
+    assert peer.act(names.CRASH).ok
+    told = peer.until(FREE)
+    assert crashes == [pytest.approx((2e-6, 5e-6))]
+    assert not [one for one in told if isinstance(one, Spectrum)]
+    assert peer.get("x-save-force") == "2"
+    assert not list(made.data.glob("*.ibw"))

@@ -31,6 +31,9 @@ FAULT_KINDS: Final = {
 }
 _SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
 _MOST_POINTS: Final = 8192
+_PULSE_S: Final = 60.0
+_INDENTS_M: Final = 1e-6
+"""A force curve that goes further than this does not only touch the sample."""
 _REACH_M: Final = 1e-3
 """No scanner goes further."""
 _LONGEST_NAME: Final = 17
@@ -70,11 +73,22 @@ class Controller:
         self._log = log
         self._disk = saving.Disk()
         self._starts_at_s = math.inf
+        self._bias_since_s = -math.inf
         self._curve_running = self._engages = False
         # somebody has scanned once, and left the image open; the first spot is in its middle
         self._image = self._frame()
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
+
+    def put(self, names: str, value: float, now_s: float) -> None:
+        """PV; a bias that was in force for a short while has been a pulse."""
+        before_v = self.values.get("TipVoltage")
+        self.values.put(names, value)
+        if self.values.get("TipVoltage") == before_v:
+            return
+        if now_s - self._bias_since_s < _PULSE_S and math.isfinite(before_v):
+            self.rig.pulsed(before_v, now_s - self._bias_since_s)
+        self._bias_since_s = now_s
 
     # --- what goes on ---
 
@@ -221,12 +235,19 @@ class Controller:
         if self.scanning or self.rig.busy(now_s) or self.faults.strikes("force-refused", now_s):
             return False
         try:
+            self._indent()
             self.rig.start_spectrum("force")
         except (AfspmError, ArithmeticError, ValueError) as error:
             self._log.warning("the force curve was refused: %s", error)
             return False
         self._curve_running = True
         return True
+
+    def _indent(self) -> None:
+        depth_m, speed_m_s = self.values.get("ForceDist"), self.values.get("Velocity")
+        if depth_m > _INDENTS_M:
+            self.rig.crash(min(depth_m, _REACH_M), speed_m_s)
+            self.rig.abandon()  # the curve itself takes the time
 
     def stop_curve(self) -> None:
         """At once."""

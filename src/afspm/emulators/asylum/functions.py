@@ -89,7 +89,7 @@ class Software:
         return math.nan if self._controller.faults.strikes("nan", self._now_s()) else value
 
     def _put(self, names: str, value: float) -> float:
-        self._controller.values.put(names, value)
+        self._controller.put(names, value, self._now_s())
         return _NOTHING
 
     def _put_text(self, name: str, value: str) -> float:

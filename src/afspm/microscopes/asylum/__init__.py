@@ -22,7 +22,12 @@ from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.units import Duration
 
-_AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC_KIND: FORCE}
+_AT_FIRST: Final[dict[str, Value]] = {
+    names.SCAN_DIRECTION: names.UP,
+    names.SPEC_KIND: FORCE,
+    names.PULSE_VOLTAGE: 4.0,
+    names.PULSE_DURATION: 0.1,
+}
 _SPOTS: Final = ("image", "scanner", "none")
 _OUR_SPOT: Final = 1.0
 _NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
@@ -92,7 +97,8 @@ class Asylum(Microscope):
         link = Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
         self._session = session = Session(link)
         self.prove()
-        self._kept: dict[str, Any] = self.memory.setdefault("kept", dict(_AT_FIRST))
+        self._kept: dict[str, Any] = self.memory.setdefault("kept", {})
+        self._kept |= {name: value for name, value in _AT_FIRST.items() if name not in self._kept}
         self._harvest = Harvest(self.memory, self.log)
         self._activity = Activity(
             session, self._harvest, self.memory, self._folders, self._frame_in_force, self.clock, self.log
@@ -291,6 +297,12 @@ class Asylum(Microscope):
         """Bring the tip to the sample, as the button Engage does."""
         if not self._igor.do("SimpleEngageMe", "SimpleEngageButton"):
             raise Refused(ControlResponse.ACTION_ERROR, "Asylum refuses to engage")
+
+    @action(names.PULSE, state=ScopeState.BUSY_PARAM)
+    def pulse(self) -> None:
+        """A bias pulse of `x-pulse-voltage` for `x-pulse-duration`, where the tip is: the bias is set, and put back."""
+        wanted = self.in_force([names.PULSE_VOLTAGE, names.PULSE_DURATION])
+        self.for_a_while({names.TIP_BIAS_VOLTAGE: wanted[names.PULSE_VOLTAGE]}, float(wanted[names.PULSE_DURATION]))
 
     def command(self, text: str) -> None:
         """A function with its arguments as JSON: `DoScanFunc "DownScan"`, `PV "SaveImage", 2`."""
