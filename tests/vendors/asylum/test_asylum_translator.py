@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from asylum_bench import Bench, Emulated
+from igor2 import binarywave
 from vendor_bench import FLAT, SHAPE, TURNED, Peer, left_in_danger, moved, ready, scanned, states
 
 from afspm.emulators.asylum.wire import Failed
@@ -482,6 +483,17 @@ def test_a_force_curve_comes_with_the_place_where_it_was_taken(bench: Make) -> N
     raw, deflection = curve.values[:, 0], curve.values[:, 1]
     assert raw[0] == raw[-1] == 0.0
     assert deflection[raw.argmax()] == pytest.approx(deflection.max(), rel=0.1)
+    note = str(binarywave.load(curve.filename)["wave"]["note"], "latin-1")
+    noted = dict(line.split(": ", 1) for line in note.split("\r") if ": " in line)
+    assert (noted["ImagingMode"], noted["TriggerChannel"]) == ("Contact", "DeflVolts")
+    for name in (
+        "NumPtsPerSec",
+        "TriggerPoint",
+        "InputTime",
+        "ApproachVelocity",
+        "RetractVelocity",
+    ):
+        assert float(noted[name]) > 0.0
 
 
 def test_a_force_curve_after_a_scan_is_taken_where_the_tip_was_sent_before_it(bench: Make) -> None:
