@@ -86,10 +86,10 @@ SEED ?= 1
 simulate: $(SETUP)
 	@$(BIN)/python -m afspm.testing.longrun --hours $(HOURS) --seed $(SEED)
 
-## a recorded run whose processes are all killed, and that is resumed, again and again: make power-cut CUTS=100 SEED=1
+## a recorded run that loses its power, with all that was not synced, and is resumed, again and again: CUTS=100 SEED=1
 CUTS ?= 100
 power-cut: $(SETUP)
-	@$(BIN)/python -m afspm.testing.power_cut --cuts $(CUTS) --seed $(SEED)
+	@$(BIN)/python tests/system/record/power_cut.py --cuts $(CUTS) --seed $(SEED)
 
 clean:
 	rm -rf .venv build runs

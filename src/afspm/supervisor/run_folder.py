@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import FileError
+from afspm.record.disk import sync_folder
 from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, RUN_FILE, STATE_DIR
 from afspm.record.whole import replace
 
@@ -30,6 +31,7 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
         runs.mkdir(parents=True, exist_ok=True)
         folder = _new_folder(runs.resolve(), stamp)
         (folder / STATE_DIR).mkdir()
+        sync_folder(folder)
         _replace(runs / LATEST_FILE, folder.name + "\n")
     except OSError as error:
         raise FileError(

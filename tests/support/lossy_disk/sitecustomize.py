@@ -1,0 +1,125 @@
+"""What a disk has for sure, in real processes: each file as it was synced last, under the names that its folder had
+when that was synced last. `restore` makes a folder so, as a power cut would. Python imports this by itself at its
+start, where its folder is in PYTHONPATH.
+
+SQLite syncs by itself, which is not seen here: its main file is taken as it is when its write-ahead log is synced.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import stat
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+FOLDER = os.environ.get("LOSSY_FOLDER", "")
+WAL = "-wal"
+_fsync, _unlink, _replace, _rename = os.fsync, os.unlink, os.replace, os.rename
+
+
+class Shadow:
+    """What is on the disk for sure, kept beside the folder: contents by file, and names by folder."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
+        root = Path(f"{folder}.disk")
+        self._files, self._contents, self._names = root / "files", root / "contents", root / "names"
+        for each in (self._files, self._contents, self._names):
+            each.mkdir(parents=True, exist_ok=True)
+
+    def sync(self, descriptor: int) -> None:
+        """A file or a folder was synced."""
+        path = str(Path(f"/proc/self/fd/{descriptor}").readlink())
+        if not f"{path}/".startswith(f"{self._folder}/"):
+            return
+        found = os.fstat(descriptor)
+        if stat.S_ISDIR(found.st_mode):
+            self._sync_names(path)
+            return
+        self._sync_content(path, found.st_ino)
+        if path.endswith(WAL):
+            main = path.removesuffix(WAL)
+            self._sync_content(main, os.stat(main).st_ino)  # noqa: PTH116
+
+    def _sync_content(self, path: str, number: int) -> None:
+        name = self._content_of(number) or self._named(number)
+        aside = self._contents / f".{uuid.uuid4()}"
+        shutil.copyfile(path, aside)
+        _replace(aside, self._contents / name)
+
+    def _content_of(self, number: int) -> str:
+        with contextlib.suppress(FileNotFoundError):
+            return (self._files / str(number)).read_text()
+        return ""
+
+    def _named(self, number: int) -> str:
+        name = str(uuid.uuid4())
+        aside = self._files / f".{name}"
+        aside.write_text(name)
+        _replace(aside, self._files / str(number))
+        return name
+
+    def _sync_names(self, path: str) -> None:
+        names = {
+            entry.name: self._content_of(entry.inode()) or self._named(entry.inode())
+            for entry in os.scandir(path)
+            if entry.is_file(follow_symlinks=False)
+        }
+        aside = self._names / f".{uuid.uuid4()}"
+        aside.write_text(json.dumps({"folder": path, "names": names}))
+        _replace(aside, self._names / path.replace("/", "%"))
+
+    def forget(self, path: Any) -> None:
+        """The file of this name is no longer one of that name: its number may be given to another."""
+        with contextlib.suppress(OSError):
+            found = os.lstat(path)
+            if str(path).startswith(self._folder) and stat.S_ISREG(found.st_mode):
+                _unlink(self._files / str(found.st_ino))
+
+    def restore(self) -> None:
+        """Make the folder what it is after a power cut."""
+        for path in [*Path(self._folder).rglob("*")]:
+            if path.is_file() and not path.is_symlink():
+                _unlink(path)
+        for number in self._files.iterdir():
+            _unlink(number)
+        for known in self._names.iterdir():
+            told = json.loads(known.read_text())
+            folder = Path(told["folder"])
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, content in told["names"].items():
+                kept, path = self._contents / content, folder / name
+                shutil.copyfile(kept, path) if kept.exists() else path.touch()
+                aside = self._files / str(path.stat().st_ino)
+                aside.write_text(content)
+
+
+def watch(shadow: Shadow) -> None:
+    """Have it see what this process syncs and removes."""
+
+    def syncing(call: Callable[[int], None]) -> Callable[[int], None]:
+        def called(descriptor: int) -> None:
+            call(descriptor)
+            shadow.sync(descriptor)
+
+        return called
+
+    def removing(call: Callable[..., None], which: int) -> Callable[..., None]:
+        def called(*arguments: Any, **options: Any) -> None:
+            shadow.forget(arguments[which])
+            call(*arguments, **options)
+
+        return called
+
+    os.fsync, os.fdatasync = syncing(os.fsync), syncing(os.fdatasync)
+    os.unlink = os.remove = removing(os.unlink, 0)
+    os.replace, os.rename = removing(_replace, 1), removing(_rename, 1)
+
+
+if FOLDER:
+    watch(Shadow(FOLDER))
