@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 T = TypeVar("T")
 
@@ -133,14 +133,22 @@ class Syncer:
     def __init__(self, period_s: float = SYNC_PERIOD_S) -> None:
         self._period_s = period_s
         self._changed = threading.Condition()
-        self._written: dict[Any, int] = {}
+        self._written: dict[tuple[int, int], int] = {}
         self._urgent = False
         self._asked = self._done = 0
         self._thread: threading.Thread | None = None
 
     def soon(self, file: int) -> None:
         """What was written to a file, by its descriptor, is on the disk within the period."""
-        self._mark(file, file)
+        found = os.fstat(file)
+        with self._changed:
+            if (key := (found.st_dev, found.st_ino)) in self._written:
+                return
+            self._written[key] = os.dup(file)  # it may be closed before
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="syncer", daemon=True)
+                self._thread.start()
+            self._changed.notify_all()
 
     def folder_soon(self, folder: Path) -> None:
         """The same for the names of the files in a folder. Raises OSError."""
@@ -148,19 +156,9 @@ class Syncer:
             return
         descriptor = os.open(folder, os.O_RDONLY)
         try:
-            self._mark(folder, descriptor)
+            self.soon(descriptor)
         finally:
             os.close(descriptor)
-
-    def _mark(self, key: Any, descriptor: int) -> None:
-        with self._changed:
-            if key in self._written:
-                return
-            self._written[key] = os.dup(descriptor)  # it may be closed before
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="syncer", daemon=True)
-                self._thread.start()
-            self._changed.notify_all()
 
     def now(self, within_s: float) -> None:
         """All that was written until now is on the disk.

@@ -88,15 +88,21 @@ class Shadow:
                 _unlink(path)
         for number in self._files.iterdir():
             _unlink(number)
-        for known in self._names.iterdir():
+        for path, content in self.copy(Path(self._folder)):
+            (self._files / str(path.stat().st_ino)).write_text(content)
+
+    def copy(self, into: Path) -> list[tuple[Path, str]]:
+        """What the folder would be after a power cut, in another; returns each file with the name of its content."""
+        copied = []
+        for known in [*self._names.iterdir()]:
             told = json.loads(known.read_text())
-            folder = Path(told["folder"])
+            folder = into / Path(told["folder"]).relative_to(self._folder)
             folder.mkdir(parents=True, exist_ok=True)
             for name, content in told["names"].items():
                 kept, path = self._contents / content, folder / name
                 shutil.copyfile(kept, path) if kept.exists() else path.touch()
-                aside = self._files / str(path.stat().st_ino)
-                aside.write_text(content)
+                copied.append((path, content))
+        return copied
 
 
 def watch(shadow: Shadow) -> None:
@@ -121,5 +127,5 @@ def watch(shadow: Shadow) -> None:
     os.replace, os.rename = removing(_replace, 1), removing(_rename, 1)
 
 
-if FOLDER:
+if FOLDER and __name__ == "sitecustomize":
     watch(Shadow(FOLDER))

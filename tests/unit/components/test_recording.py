@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
+import os
+import runpy
 import sqlite3
 import threading
 from collections.abc import Callable
@@ -30,6 +32,7 @@ from afspm.runtime.process import Activity, Context
 from afspm.transport.port import Incoming, ParentGone
 
 DEADLINE_S = 20.0
+LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
 
 
 def control(time_ns: int, holder: str = "series") -> Packet:
@@ -88,6 +91,29 @@ def test_what_was_written_ahead_and_what_is_sent_again_is_recorded_once_in_order
     writer.finish(ended=True)
     assert bench.times() == [1, 2, 3, 4, 5, 6]
     assert recorded_until(bench.state / ahead.RECORDED_FILE) == 6
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="what a descriptor is open on is found in /proc")
+def test_what_is_said_to_be_recorded_is_on_the_disk(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    monkeypatch.setattr(recording, "SURE_S", 0.01)
+    lossy = runpy.run_path(str(LOSSY / "sitecustomize.py"))
+    for name in ("fsync", "fdatasync", "unlink", "remove", "replace", "rename"):
+        monkeypatch.setattr(os, name, getattr(os, name))  # to be as they were after the test
+    shadow = lossy["Shadow"](str(bench.folder))
+    lossy["watch"](shadow)
+    said = lambda: recorded_until(bench.state / ahead.RECORDED_FILE)  # noqa: E731
+    writer = bench.writer()
+    writer.caught_up()
+    for time_ns in range(1, 6):
+        writer.put(control(time_ns), "")
+        _until(lambda time_ns=time_ns: said() >= time_ns)
+        after = tmp_path_factory.mktemp("after")
+        shadow.copy(after)
+        with afspm.open_run(after) as run:
+            assert [packet.time_ns for packet in run.packets()] == list(range(1, time_ns + 1))
+    writer.finish(ended=True)
 
 
 def test_a_scheduler_that_does_not_say_when_all_has_come_is_not_waited_for(

@@ -357,3 +357,8 @@ def test_only_one_transaction_is_written_at_a_time_and_readers_never_wait(
     assert len(run.control) == 1
     with pytest.raises(sqlite3.OperationalError):
         run._journal.execute("DELETE FROM packets")
+
+
+def test_the_journal_is_on_the_disk_before_its_write_ahead_log_is_begun_anew(store: Store) -> None:
+    """SQLite syncs by itself, and says whether it does: 0 is never."""
+    assert store._journal.execute("PRAGMA synchronous").fetchone()[0] >= 1
