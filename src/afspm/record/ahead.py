@@ -1,8 +1,8 @@
-"""What is published is written down ahead of it, until it is in the record: then a power cut loses nothing of it.
+"""What is published is written down ahead of it, until it is in the record: then a kill loses nothing of it.
 
 The scheduler, which alone knows what is published under which envelope at what time, appends each packet to a file
-before it goes out (see `segments`). That is handed to the system and not waited for: it outlives a kill of all
-processes. The recorder says up to which time everything is in the record and on disk; files that have nothing newer
+before it goes out (see `segments`). That is handed to the system, and outlives a kill of all processes; a moment later
+it is on the disk, and outlives a power cut (see `disk`). The recorder says up to which time everything is in the record and on disk; files that have nothing newer
 are written over. What a kill has cut off at the end of a file was not published.
 """
 
