@@ -2,8 +2,9 @@
 
 The scheduler, which alone knows what is published under which envelope at what time, appends each packet to a file
 before it goes out (see `segments`). That is handed to the system, and outlives a kill of all processes; a moment later
-it is on the disk, and outlives a power cut (see `disk`). The recorder says up to which time everything is in the record and on disk; files that have nothing newer
-are written over. What a kill has cut off at the end of a file was not published.
+it is on the disk, and outlives a power cut (see `disk`). The recorder says up to which time everything is in the record
+and on disk; files that have nothing newer are written over. What a kill has cut off at the end of a file was not
+published.
 """
 
 from __future__ import annotations
