@@ -80,10 +80,9 @@ def _props_set(panel: Panel, module: str, points: int, sweeps: int, switches: tu
 def _curve_props_get(panel: Panel, name: str) -> Answer:
     module = _module(panel, name)
     sweep, channels = panel.sweeps[module], _channel_names(panel, module)
-    fixed, backward, saves, saves_all, dialog = (
-        ["X (m)", "Y (m)"],
-        *map(int, (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog)),
-    )
+    switches = (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog)
+    backward, saves, saves_all, dialog = map(int, switches)
+    fixed = ["X (m)", "Y (m)"]
     if module == "BiasSpectr":
         points = sweep.points or panel.rig.world.settings.iv.points
         return saves_all, sweep.sweeps, backward, points, channels, ["Sweep Start (V)"], fixed, saves, dialog

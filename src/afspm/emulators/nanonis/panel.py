@@ -115,9 +115,8 @@ class Panel:
         self.sweeps = {module: Sweep() for module in MODULES}
         self.curve_names = dict(_BASE_NAMES)
         self.ends, self.ended_s, self.last_path = 0, -math.inf, ""
-        self.slots = [*_SIGNALS.values(), _BIAS, *(n for n in range(128) if n not in (*_SIGNALS.values(), _BIAS))][
-            :_SLOTS
-        ]
+        used = [*_SIGNALS.values(), _BIAS]
+        self.slots = [*used, *(index for index in range(len(self.signals)) if index not in used)][:_SLOTS]
         self.logger = Logger()
         self.client: dict[str, Any] = {}
         self.opened: set[str] = set()
