@@ -74,7 +74,7 @@ SHORT_NIGHT = """
 speed = 240.0
 [series]
 every = "5 min"
-duration = "50 min"
+scans = 9
 pixels = [64, 64]
 [scheduler.drift]
 correct_after = "15 min"
@@ -86,7 +86,7 @@ SHORT_SERIES = '[experiment]\nevery = "6 min"\nscans = 7\n'
 @pytest.mark.parametrize(
     ("files", "quicker"),
     [
-        (("drift_night/experiment.toml",), SHORT_NIGHT),
+        (("drift_night/experiment.toml",), SHORT_NIGHT + TABLE),
         (("drift_night/experiment.toml", "drift_night/paper.toml"), SHORT_NIGHT + TABLE),
         (("paper_form/drift.toml",), SHORT_SERIES + TABLE),
     ],
@@ -97,15 +97,18 @@ def test_a_night_of_drift_runs_and_the_frame_follows_the_sample(
 ) -> None:
     if "drift_night/paper.toml" in files:
         pytest.importorskip("skimage")
-    pictures = ("--without", "drift_pictures") if len(files) == 2 else ()  # drawn by the other
+    pictures = ("--without", "drift_pictures") if "drift_night" in files[0] else ()  # they take longer than the night
     one = to_its_end(afspm_run, tmp_path, files, quicker, *pictures)
     with (one.folder / "drift_correction.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) >= 4, one.output
+    assert len(rows) >= 7, one.output
     assert [row["reason"] for row in rows if row["matched"] != "yes"] == []
-    last, pixel_m = rows[-1], 2e-6 / 64
-    assert last["correcting"] == "yes"
-    drift_m = np.array([float(last["drift_x_m"]), float(last["drift_y_m"])])
-    center_m = np.array([float(last["center_x_m"]), float(last["center_y_m"])])
-    assert np.hypot(*drift_m) > 3 * pixel_m, "the sample stood still"
-    assert np.hypot(*(center_m - drift_m)) < 1.5 * pixel_m, "the frame is not where the sample has gone"
+    assert {row["correcting"] for row in rows[-4:]} == {"yes"}
+    drift_m, center_m = (
+        np.array([[float(row[f"{what}_{axis}_m"]) for axis in "xy"] for row in rows[-4:]])
+        for what in ("drift", "center")
+    )
+    pixel_m = 2e-6 / 64
+    assert np.hypot(*drift_m[-1]) > 3 * pixel_m, "the sample stood still"
+    off_m = np.hypot(*(center_m - drift_m).T)  # at a time more, where a busy computer has left scans out
+    assert np.median(off_m) < pixel_m, "the frame is not where the sample has gone"

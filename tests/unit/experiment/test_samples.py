@@ -75,7 +75,8 @@ def test_the_paper_s_drift_method_has_the_values_of_its_table() -> None:
     experiment = sample("drift_night", "paper.toml")
     assert experiment.check() == []
     drift, series = (experiment.resolved.settings[name] for name in ("scheduler", "series"))
-    assert drift["drift"]["estimator"]["class"] == "brief"
+    ransac = {"transform": "translation", "residual_threshold": 0.05, "iterations": 100, "tighten": False}
+    assert drift["drift"]["estimator"] == {"class": "brief", **ransac}
     tracker, rescan = drift["drift"]["tracker"], drift["drift"]["rescan"]
     assert tracker == {"class": "paper", "transform": "translation", "f_min": 0.5, "sr_norm_min": 0.25, "w_update": 1.0}
     assert (rescan["rule"], rescan["f_rescan"]) == ("paper", 0.75)
