@@ -6,11 +6,13 @@ the same addresses would else command one microscope, and neither would notice.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 ANOTHER = "this translator obeys another scheduler: two experiments have the same address"
-_LONGEST = 100
+NOT_SIMULATED = "this scheduler's experiment is called simulated, and this microscope is not"
+_EPOCH = re.compile(rb"([\w-]{1,40}):(\d{1,20}):([01])")
 
 
 @dataclass(frozen=True)
@@ -20,23 +22,25 @@ class Epoch:
     Attributes:
         run: the identity of the run.
         life: grows from one life to the next.
+        simulated: whether its experiment is called so.
     """
 
     run: str
     life: int
+    simulated: bool = False
 
     def is_followed_by(self, epoch: Epoch | None, run: str) -> bool:
         """True for the same scheduler, a later life of it, and a component of its run."""
         return run == self.run and (epoch is None or epoch.life >= self.life)
 
     def encode(self) -> bytes:
-        return f"{self.run}:{self.life}".encode()
+        return f"{self.run}:{self.life}:{int(self.simulated)}".encode()
 
     @classmethod
     def decode(cls, frame: bytes) -> Epoch | None:
         """What `encode` gave; None: something else."""
-        run, _, life = frame[:_LONGEST].decode("latin-1").partition(":")
-        return cls(run, int(life)) if run and life.isdecimal() and life.isascii() else None
+        found = _EPOCH.fullmatch(frame)
+        return None if found is None else cls(found[1].decode(), int(found[2]), found[3] == b"1")
 
 
 class Allegiance:
@@ -44,10 +48,12 @@ class Allegiance:
 
     Args:
         run: the identity of the translator's run; empty: the scheduler that asks first is obeyed while it is connected.
+        simulated: whether its microscope is.
     """
 
-    def __init__(self, run: str) -> None:
+    def __init__(self, run: str, *, simulated: bool) -> None:
         self._run = run
+        self._simulated = simulated
         self._obeyed: Epoch | None = None
 
     def refusal(self, epoch: Epoch | None, run: str, is_connected: Callable[[], bool]) -> str:
@@ -58,6 +64,8 @@ class Allegiance:
             run: else that of a component that asks by itself, as its id says; empty: nothing is known.
             is_connected: says whether the scheduler that was obeyed last still has its connection.
         """
+        if epoch is not None and epoch.simulated and not self._simulated:
+            return NOT_SIMULATED
         told = epoch.run if epoch is not None else run
         if told and self._run and told != self._run:
             return ANOTHER

@@ -65,6 +65,7 @@ class Translator:
         controller: the emulator of this run, in whose place nobody else is ever talked to; None: the microscope
             knows where its controller is.
         run: the identity of the run, whose scheduler alone is obeyed; empty: that which asks first.
+        simulated: whether the microscope is, so that the scheduler of a simulated experiment may ask.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Translator:
         retracts: bool = False,
         controller: EmulatedController | None = None,
         run: str = "",
+        simulated: bool = False,
     ) -> None:
         self.microscope = microscope
         self._controller = controller
@@ -108,7 +110,7 @@ class Translator:
         self._why_lost = self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
-        self._allegiance = Allegiance(run)
+        self._allegiance = Allegiance(run, simulated=simulated)
         self._commander, self._told_refused = b"", ""
         self._ended = False
 
@@ -545,6 +547,7 @@ def _run_alone(microscope: Microscope, context: Context, make: Callable[..., Tra
     context.when_stopping(lambda: port.wake_up(ParentGone()))
     run_dir = Path(launch.run_dir or ".")
     step = context.activity.step
-    translator = make(microscope, port, memory, run_dir, context.log, step, retracts=launch.retracts, run=launch.run)
+    told = {"retracts": launch.retracts, "run": launch.run, "simulated": launch.simulated}
+    translator = make(microscope, port, memory, run_dir, context.log, step, **told)
     context.tip_in_danger(translator.leaves_danger)
     return translator.run()

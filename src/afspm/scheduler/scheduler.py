@@ -137,8 +137,8 @@ class Scheduler:
 
 
 def _epoch(context: SchedulerContext) -> bytes:
-    run = context.launch.run
-    return Epoch(run, context.clock.now_ns()).encode() if run else b""
+    launch = context.launch
+    return Epoch(launch.run, context.clock.now_ns(), launch.simulated).encode() if launch.run else b""
 
 
 def _restore(core: Core, state: StateFile, journal: Journal) -> None:

@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 
+from afspm.errors import ConfigError
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
+from afspm.supervisor import run as running
 from afspm.supervisor.resuming import Resumable, _wait_until_gone
 from afspm.supervisor.run import ONLY, WITHOUT, Options, dry_run, facts_to_resume
 
@@ -103,3 +105,30 @@ def test_all_processes_are_asked_at_once_whether_they_are_gone(monkeypatch: pyte
         f"part {n}": {"publish": address.format(29000 + n), "serve": address.format(29100 + n)} for n in range(6)
     }
     _wait_until_gone({"processes": processes}, tmp_path)
+
+
+EMULATED = """
+[clock]
+speed = 60.0
+
+[controller]
+component = true
+class = "NanonisEmulator"
+
+[microscope]
+component = true
+class = "Nanonis"
+
+[scheduler]
+component = true
+class = "Scheduler"
+"""
+
+
+def test_without_its_emulator_an_experiment_does_not_have_the_time_of_a_simulation(tmp_path: Path) -> None:
+    """The translator would talk to whatever is at its address: nothing is started."""
+    (tmp_path / "night.toml").write_text(EMULATED, encoding="utf-8")
+    options = Options(runs=tmp_path / "runs", without=("controller",))
+    with pytest.raises(ConfigError, match="nothing here proves that its microscope is simulated"):
+        running.run(load(tmp_path / "night.toml"), options)
+    assert not (tmp_path / "runs").exists()
