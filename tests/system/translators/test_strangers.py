@@ -64,7 +64,9 @@ def test_no_call_reaches_the_shared_memory_of_a_gxsm_that_is_not_the_emulated_on
     overlay.write_text('[controller]\ntransport = "shm"\n[microscope]\naddress = "shm"\n', encoding="utf-8")
     calls: list[Any] = []
     clock = ExperimentClock.real()
-    real = Block(name, GxsmEmulator.usual["process"], Faults([], {}, clock.now_s()), clock.now_s, calls.append)
+    real = Block(
+        name, GxsmEmulator.usual["process"], tmp_path, Faults([], {}, clock.now_s()), clock.now_s, calls.append
+    )
     try:
         before = Path("/dev/shm", name).read_bytes()
         assert checked(tmp_path, FILES / "emulated_gxsm.toml", overlay)["simulated"] is True
