@@ -69,6 +69,8 @@ class Security(Section):
     """[security]: the folder of CURVE keys, or the spoken word that there are none."""
 
     keys: str | None = None
+    plain: bool = False
+    """No keys are made for the run either: programs of this computer that know nothing of keys can join."""
     insecure: bool = False
 
 

@@ -22,6 +22,8 @@ from afspm.runtime.scope import Scope
 from afspm.transport.launching import open_port
 
 GUEST = "guest"
+GUEST_KEYS = "guest.keys"
+"""The file beside what the run keeps with the keys of those who join it; see `supervisor.key_ring`."""
 JOINED_WITHIN_S = 5.0
 
 
@@ -93,10 +95,27 @@ def guest_of(folder: Path, name: str) -> Launch:
             where=str(folder / RUN_FILE),
             hint="connect on the computer where components run",
         )
-    launch = Launch.from_json(json.dumps({**guest, "name": name}))
+    launch = Launch.from_json(json.dumps({**guest, "name": name, **_keys_in(folder)}))
     if not launch.sockets.subscribe or launch.sockets.control is None:
         raise ConfigError("this experiment has no scheduler to connect to", where=str(folder / RUN_FILE))
     return launch
+
+
+def _keys_in(folder: Path) -> dict[str, Any]:
+    """The keys that were made for those who join this run; nothing if none were made."""
+    from afspm.transport.keys import require_private
+
+    file = folder / STATE_DIR / GUEST_KEYS
+    try:
+        text = file.read_bytes()
+        require_private(file)
+        return {"keys": json.loads(text)}
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise FileError(
+            f"the key of this run can't be read: {error}", where=str(file), hint="join it as the user who started it"
+        ) from error
 
 
 def find_run(where: Path) -> Path:

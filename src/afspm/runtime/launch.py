@@ -64,8 +64,8 @@ class Launch:
     request_timeout_s: float = 5.0
     request_retries: int = 3
     log_level: str = "INFO"
-    keys: Mapping[str, str] | None = None
-    """CURVE key files and the servers' public keys; None: no encryption (loopback)."""
+    keys: Mapping[str, Any] | None = None
+    """The own CURVE pair, and whose key to expect where, see `transport.keys.from_launch`; None: no encryption."""
     messages: tuple[str, ...] = ()
     """Python modules, or .proto files, with message types of the user."""
     run: str = ""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from afspm.addresses import connectable
 from afspm.clock import Clock
@@ -18,8 +19,18 @@ from afspm.supervisor.reporter import Reporter
 _LONGEST = 60
 
 
-def reporter(experiment: Experiment, starts: Sequence[Start], clock: Clock, run: str = "") -> Reporter | None:
-    """One for what is started here; None where the scheduler can't be asked, or is perhaps none of ours."""
+def reporter(
+    experiment: Experiment,
+    starts: Sequence[Start],
+    clock: Clock,
+    run: str = "",
+    keys: Mapping[str, Any] | None = None,
+) -> Reporter | None:
+    """One for what is started here; None where the scheduler can't be asked, or is perhaps none of ours.
+
+    Args:
+        keys: that were made for it; None: the file says where they are, or there are none.
+    """
     scheduler = next((start for start in starts if start.role is Role.SCHEDULER), None)
     here = re.sub(r"[^\w.-]+", "-", platform.node())[:_LONGEST] or "computer"
     if scheduler is None:
@@ -28,7 +39,9 @@ def reporter(experiment: Experiment, starts: Sequence[Start], clock: Clock, run:
         here = f"{here}-{os.getpid()}"  # there may be several parts on one computer
     else:
         launch = _local(scheduler)
-    return None if launch is None else Reporter(replace(launch, name=f"{SUPERVISOR}:{here}"), clock, here)
+    if launch is None:
+        return None
+    return Reporter(replace(launch, name=f"{SUPERVISOR}:{here}", keys=keys or launch.keys), clock, here)
 
 
 def _local(scheduler: Start) -> Launch | None:

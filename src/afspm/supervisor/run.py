@@ -20,7 +20,7 @@ from afspm.record.facts import ENDED, STATE_DIR, known_facts
 from afspm.record.going_on import locked
 from afspm.runtime.connect import GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
-from afspm.supervisor import aftermath, common_clock, reporting, run_folder
+from afspm.supervisor import aftermath, common_clock, key_ring, reporting, run_folder
 from afspm.supervisor.aftermath import Ended
 from afspm.supervisor.common_clock import Common
 from afspm.supervisor.log import RunLog
@@ -74,6 +74,7 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     own = _own(experiment, options)
     # whatever is wrong is told before a folder is made
     first = _starts(experiment, options, own, FreePorts())
+    key_ring.hand_over(experiment, first)
     names = [start.launch.name for start in first]
     require_free(addresses_of(first))
     common = _common(experiment, first, own, options, terminal)
@@ -107,9 +108,12 @@ def go(
         if {start.launch.name for start in starts} & set(experiment.recorders):
             ahead.expect_record(folder / STATE_DIR)
         log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
-        reporter = reporting.reporter(experiment, starts, clock, common.run)
-        supervisor = Supervisor([from_start(start) for start in starts], log, clock, experiment.policy(), reporter)
-        outcome = supervisor.run()
+        handed = key_ring.hand_over(experiment, starts)
+        reporter = reporting.reporter(experiment, starts, clock, common.run, handed.supervisor)
+        tasks = [from_start(start) for start in handed.starts]
+        supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter)
+        with handed.laid_down(folder):
+            outcome = supervisor.run()
         try:
             ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}
             bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)

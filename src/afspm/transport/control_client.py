@@ -41,7 +41,7 @@ class ControlClient:
         self._name, self._token = name, ""
         self.touched = True
         self.socket = network.socket(zmq.DEALER)
-        self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
+        self.socket.setsockopt(zmq.ROUTING_ID, name.encode() if network.keys is None else network.keys.routing_id(name))
         self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 

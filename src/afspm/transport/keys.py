@@ -8,17 +8,25 @@ The files are those of ZeroMQ's own tools (ZPL), so that peers of other makes ca
 
 from __future__ import annotations
 
+import hmac
 import os
 import re
+import stat
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import zmq
 
 from afspm.errors import ConfigError
 from afspm.model import component_of
 
+GUEST = "guest"
+"""Whose key notebooks and commands of the terminal have, where keys are made for a run; it is good for other names."""
+MARK = b"\0"
+"""Between a name and what nobody else knows of its owner's identity."""
 _NAME = re.compile(r"[A-Za-z0-9_. +-]{1,100}")
 _ENTRY = re.compile(r'^\s*(public-key|secret-key)\s*=\s*"([^"]{40})"\s*$', re.MULTILINE)
 
@@ -32,7 +40,10 @@ class Keys:
         public, secret: the own pair, as Z85 text.
         peers: the public keys that are let in, and the names of their owners.
         servers: the names of those who bind the addresses that we connect to, by address.
-        folder: where they came from; keys that are put there later are found; None: these are all.
+        folder: where public keys are that are made later; None: these are all.
+        everywhere: whether every socket is encrypted. Else, on one computer, those by which requests come are, if we
+            guard them, and connections to `servers`; what is published is plain.
+        guards: whether requests to us are encrypted, where not everything is.
     """
 
     name: str
@@ -41,10 +52,14 @@ class Keys:
     peers: Mapping[bytes, str]
     servers: Mapping[str, str] = field(default_factory=dict)
     folder: Path | None = None
+    everywhere: bool = True
+    guards: bool = True
 
-    def server_key(self, address: str) -> bytes:
-        """The public key that whoever binds `address` must have."""
+    def server_key(self, address: str) -> bytes | None:
+        """The public key that whoever binds `address` must have; None: the connection is plain."""
         name = self.servers.get(address)
+        if name is None and not self.everywhere:
+            return None
         if name is None:
             raise ConfigError(
                 "it is not known whose key to expect at this address", where=address,
@@ -57,12 +72,42 @@ class Keys:
             f"there is no public key of {name!r}", where=address, hint=f"afspm keys can make one: {name}.key"
         )
 
+    def binds_encrypted(self, *, requests: bool) -> bool:
+        """Return whether a socket that we bind is encrypted; `requests`: one by which requests come."""
+        return self.everywhere or (requests and self.guards)
+
+    def routing_id(self, name: str) -> bytes:
+        """The identity of a socket that asks in a name: the same in every life, and known to nobody else.
+
+        By a bare name anybody who is let in could take the answers of another.
+        """
+        mark = hmac.digest(self.secret, name.encode(), "sha256").hex()[:16]
+        return name.encode() + MARK + mark.encode()
+
+    def user_as(self, user: str | None, name: str) -> str | None:
+        """Return for whom a key is good: the guests' for every name that is not that of a process with its own key."""
+        component = component_of(name)
+        return component if user == GUEST and component not in self.peers.values() else user
+
+    def as_launch(self) -> dict[str, Any]:
+        """As it is handed over in a launch line, see `from_launch`."""
+        return {
+            "name": self.name,
+            "public": self.public.decode(),
+            "secret": self.secret.decode(),
+            "peers": {key.decode(): name for key, name in self.peers.items()},
+            "servers": dict(self.servers),
+            "folder": None if self.folder is None else str(self.folder),
+            "everywhere": self.everywhere,
+            "guards": self.guards,
+        }
+
 
 def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None) -> Keys:
     """The keys of the component `name` out of the folder that `generate` made.
 
     Raises:
-        ConfigError: no such folder or key, or a file that is no certificate.
+        ConfigError: no such folder or key, a file that is no certificate, or a secret that others may read.
     """
     folder = Path(folder)
     secret_file = folder / "private" / f"{_checked(name)}.key_secret"
@@ -75,25 +120,60 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
     entries = _read(secret_file, name)
     if "secret-key" not in entries:
         raise ConfigError("there is no secret key in this file", where=str(secret_file))
-    peers = public_keys(folder, name)
-    return Keys(name, entries["public-key"], entries["secret-key"], peers, dict(servers or {}), folder)
+    require_private(secret_file)
+    public = folder / "public"
+    return Keys(
+        name, entries["public-key"], entries["secret-key"], public_keys(public, name), dict(servers or {}), public
+    )
+
+
+def require_private(file: Path) -> None:
+    """Refuse a secret that others than its owner may read. Raises ConfigError."""
+    mode = file.stat().st_mode if sys.platform != "win32" else 0
+    if mode & 0o077:
+        raise ConfigError(
+            f"others may read this secret: its mode is {stat.S_IMODE(mode):04o}", where=str(file),
+            hint=f"if nobody did: chmod 600 {file.name}; else make another",
+        )  # fmt: skip
 
 
 def public_keys(folder: Path, name: str) -> dict[bytes, str]:
     """The public keys in a folder, with the names of their owners; read for `name`. Raises ConfigError, as `load`."""
-    files = sorted((folder / "public").glob("*.key"))
+    files = sorted(folder.glob("*.key"))
     return {_read(file, name)["public-key"]: file.name.removesuffix(".key") for file in files}
 
 
-def from_launch(name: str, entries: Mapping[str, str] | None) -> Keys | None:
-    """The keys that a launch line speaks of: `{"folder": …, "<address>": "<name of who binds it>", …}`.
+def from_launch(name: str, entries: Mapping[str, Any] | None) -> Keys | None:
+    """The keys that a launch line hands over (`Keys.as_launch`), or speaks of, for those who join.
 
     Whoever acts for a person ("dashboard:Ada") does so with the key of the component.
+
+    Args:
+        entries: what `as_launch` returns; or `{"folder": …, "<address>": "<name of who binds it>", …}`.
     """
-    if not entries or "folder" not in entries:
+    if not entries:
+        return None
+    if "secret" in entries:
+        folder = entries["folder"]
+        return Keys(
+            str(entries["name"]),
+            str(entries["public"]).encode(),
+            str(entries["secret"]).encode(),
+            {str(key).encode(): str(owner) for key, owner in entries["peers"].items()},
+            dict(entries["servers"]),
+            None if folder is None else Path(folder),
+            bool(entries["everywhere"]),
+            bool(entries["guards"]),
+        )
+    if "folder" not in entries:
         return None
     servers = {address: owner for address, owner in entries.items() if "://" in address}
     return load(entries["folder"], component_of(name), servers)
+
+
+def pair() -> tuple[bytes, bytes]:
+    """A new pair, public and secret."""
+    return zmq.curve_keypair()
 
 
 def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
@@ -107,8 +187,8 @@ def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
     """
     folder = Path(folder)
     written = []
-    for directory in (folder / "public", folder / "private"):
-        directory.mkdir(parents=True, exist_ok=True)
+    (folder / "public").mkdir(parents=True, exist_ok=True)
+    (folder / "private").mkdir(mode=0o700, exist_ok=True)
     for name in names:
         public_file = folder / "public" / f"{_checked(name)}.key"
         secret_file = folder / "private" / f"{name}.key_secret"
@@ -117,7 +197,7 @@ def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
         if secret_file.exists():
             public = _read(secret_file, name)["public-key"]
         else:
-            public, secret = zmq.curve_keypair()
+            public, secret = pair()
             _write(secret_file, {"public-key": public, "secret-key": secret}, mode=0o600)
             written.append(secret_file)
         _write(public_file, {"public-key": public}, mode=0o644)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
@@ -35,7 +35,7 @@ class Launched(Protocol):
     @property
     def envelopes(self) -> Sequence[str] | None: ...
     @property
-    def keys(self) -> Mapping[str, str] | None: ...
+    def keys(self) -> Mapping[str, Any] | None: ...
 
 
 def open_port(launch: Launched, clock: Clock) -> ZmqPort:
@@ -61,5 +61,5 @@ def open_server_port(launch: Launched, clock: Clock) -> ZmqServerPort:
         clock,
         serve=launch.sockets.serve,
         publish=launch.sockets.publish,
-        allowed=(launch.keys or {}).get("scheduler"),
+        allowed=(launch.keys or {}).get("scheduler") or None,
     )

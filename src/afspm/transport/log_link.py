@@ -64,7 +64,7 @@ class LogReceiver:
         self._socket.setsockopt(zmq.SUBSCRIBE, b"")
         self._monitor = Monitor(network, self._socket, ACCEPTED | DISCONNECTED)
         self._connected: set[int] = set()
-        self.address = network.bind(self._socket, address)
+        self.address = network.bind(self._socket, address, requests=True)
 
     def take(self) -> list[LogLine]:
         """The next of what has come, a batch at most; does not wait."""
@@ -96,7 +96,8 @@ class LogReceiver:
 
     def _is_own(self, name: str, first: zmq.Frame) -> bool:
         """Whether the name is the sender's, as far as there are keys to tell."""
-        return self._network.keys is None or user_of(first) == component_of(name)
+        keys = self._network.keys
+        return keys is None or not keys.binds_encrypted(requests=True) or user_of(first) == component_of(name)
 
     def _count(self) -> int:
         """How many senders there are."""

@@ -15,6 +15,8 @@ from afspm.transport.network import Network
 CONNECTED = int(zmq.EVENT_HANDSHAKE_SUCCEEDED)
 DISCONNECTED = int(zmq.EVENT_DISCONNECTED)
 ACCEPTED = int(zmq.EVENT_ACCEPTED)
+REFUSED = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+"""Of both kinds: the peer has no key, or one that is not known."""
 _HEADER = struct.Struct("=hi")
 _numbers = itertools.count()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import zmq
 
@@ -57,7 +57,8 @@ class Network:
     """Makes sockets, binds and connects them: to this computer only, or with keys, or after `insecure` was said.
 
     Args:
-        keys: of this process. With keys every connection is encrypted, and whose it is is known.
+        keys: of this process. With keys connections are encrypted, and whose they are is known: all of them, or
+            those by which requests come (`Keys.everywhere`).
         insecure: bind and connect to other computers without keys. Anyone there can then move the tip.
     """
 
@@ -68,18 +69,17 @@ class Network:
         self._sockets: list[zmq.Socket[bytes]] = []
         self.connections = Connections()
         self._authenticator = None
-        if keys is not None:
+        if keys is not None and keys.binds_encrypted(requests=True):
             from afspm.transport.zap import Authenticator
 
             self._authenticator = Authenticator(self._context, keys)
 
     @classmethod
-    def from_launch(cls, name: str, entries: Mapping[str, str] | None) -> Network:
+    def from_launch(cls, name: str, entries: Mapping[str, Any] | None) -> Network:
         """As the launch line of the process `name` says.
 
         Args:
-            entries: `{"folder": the folder of certificates, "<address>": "<name of whoever binds it>", …}`, or
-                `{"insecure": "true"}`; None: this computer only, without keys.
+            entries: see `keys.from_launch`, or `{"insecure": "true"}`; None: this computer only, without keys.
         """
         if not entries:
             return cls()
@@ -101,15 +101,18 @@ class Network:
             socket.setsockopt(option, value)
         return socket
 
-    def bind(self, socket: zmq.Socket[bytes], address: str) -> str:
+    def bind(self, socket: zmq.Socket[bytes], address: str, *, requests: bool = False) -> str:
         """Bind; returns the address with the port that was found, where `address` asks for any (port 0).
+
+        Args:
+            requests: who sends something by this socket is to be known.
 
         Raises:
             TransportError: the address is taken or malformed.
             ConfigError: it would be open to others, and there are no keys.
         """
         self._guard(address)
-        if self.keys is not None:
+        if self.keys is not None and self.keys.binds_encrypted(requests=requests):
             socket.setsockopt(zmq.CURVE_SERVER, 1)
             socket.setsockopt(zmq.CURVE_SECRETKEY, self.keys.secret)
             socket.setsockopt(zmq.ZAP_DOMAIN, b"afspm")
@@ -132,8 +135,8 @@ class Network:
             ConfigError: it is another computer's, and there are no keys.
         """
         self._guard(address)
-        if self.keys is not None:
-            socket.setsockopt(zmq.CURVE_SERVERKEY, self.keys.server_key(address))
+        if self.keys is not None and (server_key := self.keys.server_key(address)) is not None:
+            socket.setsockopt(zmq.CURVE_SERVERKEY, server_key)
             socket.setsockopt(zmq.CURVE_PUBLICKEY, self.keys.public)
             socket.setsockopt(zmq.CURVE_SECRETKEY, self.keys.secret)
         try:
@@ -151,7 +154,8 @@ class Network:
         self._context.destroy(linger=_LINGER_MS)
 
     def _guard(self, address: str) -> None:
-        if self.keys is None and not self._insecure and not is_local(address):
+        everywhere = self.keys is not None and self.keys.everywhere
+        if not everywhere and not self._insecure and not is_local(address):
             raise ConfigError(
                 "this address can be reached from other computers, and there are no keys",
                 where=address,

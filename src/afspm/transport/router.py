@@ -9,7 +9,8 @@ import zmq
 
 from afspm.transport.complaints import Complaints
 from afspm.transport.frames import descriptor_of, property_of, readable, receive_small, send, user_of
-from afspm.transport.monitor import ACCEPTED, DISCONNECTED, Monitor
+from afspm.transport.keys import MARK
+from afspm.transport.monitor import ACCEPTED, DISCONNECTED, REFUSED, Monitor
 from afspm.transport.network import QUEUE_LENGTH, Network
 from afspm.wire.version import ANSWER, QUESTION
 
@@ -63,7 +64,9 @@ class Router:
 
     def __init__(self, network: Network, address: str, complaints: Complaints) -> None:
         self._complaints = complaints
-        self._with_keys = network.keys is not None
+        keys = network.keys
+        self._keys = keys if keys is not None and keys.binds_encrypted(requests=True) else None
+        self._has_refused = False
         self._guard = network.connections
         self._heard: set[int] = set()
         self._connections = 0
@@ -73,8 +76,8 @@ class Router:
         self._identities: dict[int, bytes] = {}
         self.socket = network.socket(zmq.ROUTER)
         self.socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
-        self.monitor = Monitor(network, self.socket, ACCEPTED | DISCONNECTED)
-        self.address = network.bind(self.socket, address)
+        self.monitor = Monitor(network, self.socket, ACCEPTED | DISCONNECTED | REFUSED)
+        self.address = network.bind(self.socket, address, requests=True)
 
     def receive(self) -> list[RouterEvent]:
         """The next requests, a batch at most; the changes of connections that they have to do with; and all that came
@@ -198,6 +201,9 @@ class Router:
         """The monitor's events: who, and whether it came or went."""
         changes = []
         for kind, descriptor in self.monitor.drain():
+            if kind not in (ACCEPTED, DISCONNECTED):
+                self._tell_refused()
+                continue
             gone = self._by_descriptor.pop(descriptor, None)
             if gone is not None:
                 self._formers[descriptor] = gone
@@ -205,6 +211,15 @@ class Router:
             if kind == ACCEPTED:
                 changes.append((self._new(descriptor), True))
         return changes
+
+    def _tell_refused(self) -> None:
+        """Once: who is refused tries again without end."""
+        if self._keys is not None and not self._has_refused:
+            self._has_refused = True
+            self._complaints.say(
+                f"refused a connection to {self.address}: it has no key that is known here; programs that know nothing "
+                "of keys are let in by [security] plain = true"
+            )
 
     def _new(self, descriptor: int) -> _Peer:
         self._connections += 1
@@ -215,7 +230,7 @@ class Router:
         if peer.identity is None:
             peer.identity = self._identities[peer.connection] = identity
             peer.name = _name(identity)
-            peer.user = user_of(first) if self._with_keys else None
+            peer.user = None if self._keys is None else self._keys.user_as(user_of(first), peer.name)
         return peer
 
     def close(self) -> None:
@@ -228,6 +243,6 @@ def _name(identity: bytes) -> str:
     if identity.startswith(b"\0"):
         return ""
     try:
-        return identity.decode()
+        return identity.partition(MARK)[0].decode()
     except UnicodeDecodeError:
         return ""

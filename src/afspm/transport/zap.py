@@ -64,7 +64,7 @@ class Authenticator:
         if folder is None:
             return
         try:
-            changed_ns = (folder / "public").stat().st_mtime_ns
+            changed_ns = folder.stat().st_mtime_ns
             if changed_ns == self._read_ns:
                 return
             found = {z85.decode(key): name.encode() for key, name in public_keys(folder, self._keys.name).items()}

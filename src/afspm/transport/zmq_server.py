@@ -42,6 +42,7 @@ class ZmqServerPort:
         self._network = network
         self._clock = clock
         self._allowed = allowed
+        self._guarded = network.keys is not None and network.keys.binds_encrypted(requests=True)
         self._asker: list[bytes] | None = None
         self._heard: set[int] = set()
         self._asked_by_version_1: int | None = None
@@ -55,7 +56,7 @@ class ZmqServerPort:
         # never heard. And what it says is never freed: the library keeps the queues of those that it does not hear.
         self._socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
         self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # so that it can be seen who is there
-        self.serve_address = network.bind(self._socket, serve)
+        self.serve_address = network.bind(self._socket, serve, requests=True)
         self._poller = poller(self._wake_up)
         self._poller.register(self._socket, self._request, self)
         if self._publisher is not None:
@@ -100,8 +101,8 @@ class ZmqServerPort:
             epoch = parts[start - 2] if start > _WITHOUT_EPOCH else b""
             is_of_version_1 = not epoch and len(parts) - start < _WITH_ID
             self._asked_by_version_1 = int.from_bytes(parts[start][:1]) if is_of_version_1 else None
-            user = user_of(first) if self._network.keys is not None else None
-            allowed = self._allowed is None or self._network.keys is None or user == self._allowed
+            user = user_of(first) if self._guarded else None
+            allowed = self._allowed is None or not self._guarded or user == self._allowed
             if not allowed:
                 self._asked_by_version_1 = None  # who may not ask hears why, whoever it is
                 self.reply([b"\1", b"", f"only {self._allowed} may ask here, not {user}".encode()])

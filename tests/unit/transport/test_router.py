@@ -13,9 +13,10 @@ import zmq
 
 from afspm import wire
 from afspm.clock import ExperimentClock
-from afspm.model import Response
+from afspm.model import CLOCK_REQUEST, Request, Response
 from afspm.transport import router
 from afspm.transport.complaints import Complaints
+from afspm.transport.keys import GUEST, Keys, pair
 from afspm.transport.monitor import ACCEPTED, DISCONNECTED, ConnectionEvent
 from afspm.transport.network import MAX_REQUEST_BYTES, Network
 from afspm.transport.port import ControlConnected, ReplyReceived
@@ -28,8 +29,8 @@ CLOCK = ExperimentClock.real()
 class Listening:
     """A router and everything that it has told."""
 
-    def __init__(self, open_: Any) -> None:
-        self.network = open_(Network())
+    def __init__(self, open_: Any, own: Keys | None = None) -> None:
+        self.network = open_(Network(own))
         self.router = Router(self.network, "tcp://127.0.0.1:0", Complaints(logging.getLogger("test"), CLOCK))
         self.told: list[Any] = []
 
@@ -271,3 +272,96 @@ def test_to_be_looked_for_disturbs_no_component(open_: Any, until: Any, caplog: 
     listening.router.reply(asked.connection, wire.encode_response(Response(0, id="A/first/1")))
     until(lambda: any(isinstance(one, ReplyReceived) for one in found), (component, found))
     assert not caplog.records
+
+
+class Run:
+    """A router with keys that were made for a run, and clients of it."""
+
+    def __init__(self, open_: Any) -> None:
+        self._open = open_
+        self.pairs = {name: pair() for name in ("scheduler", "series", "thief", GUEST)}
+        peers = {public: name for name, (public, _) in self.pairs.items()}
+        self.listening = Listening(open_, Keys("scheduler", *self.pairs["scheduler"], peers, everywhere=False))
+
+    def keys(self, name: str) -> Keys:
+        address = self.listening.router.address
+        peers = {self.pairs["scheduler"][0]: "scheduler"}
+        return Keys(name, *self.pairs[name], peers, {address: "scheduler"}, everywhere=False, guards=False)
+
+    def client(self, name: str, claimed: str = "") -> ZmqPort:
+        network = Network(self.keys(name))
+        port: ZmqPort = self._open(ZmqPort(network, claimed or name, CLOCK, control=self.listening.router.address))
+        found: list[Any] = []
+        deadline_s = time.monotonic() + 5.0
+        while ControlConnected() not in found:
+            assert time.monotonic() < deadline_s
+            found += port.poll(0.01)
+            self.listening.told += self.listening.router.follow()
+        return port
+
+
+def answered(port: ZmqPort) -> list[bytes]:
+    """The payloads of what the port is answered within a moment."""
+    found: list[Any] = []
+    deadline_s = time.monotonic() + 0.5
+    while not found and time.monotonic() < deadline_s:
+        found += [incoming for incoming in port.poll(0.05) if isinstance(incoming, ReplyReceived)]
+    return [bytes(incoming.response.payload) for incoming in found]
+
+
+def test_nobody_takes_the_answers_of_another_by_its_name(open_: Any, plain: Any) -> None:
+    run = Run(open_)
+    series = run.client("series")
+    series.send(wire.encode_request(Request(CLOCK_REQUEST, id="series/x/1")))
+    (asked,) = run.listening.until(1)
+    assert (asked.name, asked.user) == ("series", "series")
+    thief = run.client("thief", "series")
+    bare = plain(zmq.DEALER)
+    bare.setsockopt(zmq.ROUTING_ID, b"series")
+    own = run.keys("thief")
+    bare.curve_publickey, bare.curve_secretkey, bare.curve_serverkey = own.public, own.secret, own.server_key(
+        run.listening.router.address
+    )  # fmt: skip
+    bare.connect(run.listening.router.address)
+    thief.send(wire.encode_request(Request(CLOCK_REQUEST, id="series/y/1")))
+    bare.send_multipart([b"", *wire.encode_request(Request(CLOCK_REQUEST, id="series/z/1"))])
+    assert {(one.name, one.user) for one in run.listening.until(3)[1:]} == {("series", "thief")}
+    run.listening.router.reply(asked.connection, wire.encode_response(Response(0, b"hers", id="series/x/1")))
+    assert answered(series) == [b"hers"]
+    assert answered(thief) == []
+    assert bare.poll(100) == 0
+
+
+def test_one_that_is_started_again_has_its_name_again_while_its_old_connection_stands(open_: Any) -> None:
+    run = Run(open_)
+    for life in range(2):
+        port = run.client("series")
+        port.send(wire.encode_request(Request(CLOCK_REQUEST, id=f"series/{life}/1")))
+        asked = run.listening.until(life + 1)[-1]
+    assert (asked.name, asked.user) == ("series", "series")
+    run.listening.router.reply(asked.connection, wire.encode_response(Response(0, b"anew", id="series/1/1")))
+    assert answered(port) == [b"anew"]
+
+
+def test_guests_have_any_name_but_that_of_a_process(open_: Any) -> None:
+    run = Run(open_)
+    heard = []
+    for n, name in enumerate(("notebook", "dashboard:Ada", "series", "series:Ada", "scheduler", GUEST)):
+        run.client(GUEST, name).send(wire.encode_request(Request(CLOCK_REQUEST, id="x")))
+        heard.append(run.listening.until(n + 1)[-1].user)
+    assert heard == ["notebook", "dashboard", GUEST, GUEST, GUEST, GUEST]
+
+
+def test_one_without_a_key_is_not_heard_and_that_is_told_once(
+    open_: Any, plain: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = Run(open_)
+    for name in (b"series", b"another"):
+        peer(plain, run.listening, name).send_multipart([b"", *wire.encode_request(Request(CLOCK_REQUEST))])
+    run.client("series").send(wire.encode_request(Request(CLOCK_REQUEST, id="series/x/1")))
+    assert [one.user for one in run.listening.until(1)] == ["series"]
+    deadline_s = time.monotonic() + 5.0
+    while "has no key" not in caplog.text:
+        assert time.monotonic() < deadline_s
+        run.listening.router.follow()
+    assert caplog.text.count("plain = true") == 1

@@ -1,0 +1,83 @@
+"""Without keys in the file each process has its own all the same: roles hold on one computer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import zmq
+from experiment_lab import Run, require_each_once
+
+import afspm
+from afspm import wire
+from afspm.errors import AfspmError
+from afspm.model import ControlRequest, Request
+from afspm.runtime.connect import guest_of
+
+THIEF = """
+from afspm import wire
+from afspm.model import ControlRequest, Request
+from afspm.runtime.component import Component
+from afspm.transport.network import Network
+import zmq
+
+
+class Thief(Component):
+    def run_process(self, context):
+        self.launch = context.launch
+        return super().run_process(context)
+
+    def on_start(self):
+        for claimed in ("witness", "terminal"):
+            network = Network.from_launch(self.name, self.launch.keys)
+            socket = network.socket(zmq.DEALER)
+            socket.setsockopt(zmq.ROUTING_ID, claimed.encode())
+            network.connect(socket, self.launch.sockets.control)
+            request = Request(ControlRequest.END_EXPERIMENT, id=claimed + "/thief/1")
+            socket.send_multipart([b"", *wire.encode_request(request)])
+            said = wire.decode_response(socket.recv_multipart()[1:]).reason if socket.poll(20_000) else "nothing"
+            self.log.info("was told: %s", said)
+            network.close()
+"""
+MORE = """
+[thief]
+component = true
+class = "thief.Thief"
+
+[control.roles]
+end_experiment = ["witness"]
+"""
+
+
+def test_a_component_without_the_role_can_not_take_the_name_of_one_that_has_it(run: Run, tmp_path: Any) -> None:
+    (tmp_path / "thief.py").write_text(THIEF, encoding="utf-8")
+    one = run(more=MORE)
+    for claimed in ("witness", "terminal"):
+        one.wait_for(" thief ", f"was told: the key is that of thief, not of {claimed}")
+    with afspm.connect(one.folder, "witness") as scope, pytest.raises(AfspmError, match="the key is that of guest"):
+        scope.end_experiment()
+    with afspm.connect(one.folder, "ada") as scope, pytest.raises(AfspmError, match="has not the role 'end'"):
+        scope.end_experiment()
+    assert "secret" not in (one.folder / "run.json").read_text(encoding="utf-8")
+    assert one.end() == 0, one.output
+    require_each_once(one, 4)
+    assert not (one.folder / "state" / "guest.keys").exists()
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_program_without_keys_joins_where_the_file_says_so(run: Run, plain: bool) -> None:
+    one = run(scans=1000, more="[security]\nplain = true\n" if plain else "")
+    one.wait_for("scan 1 of 1000")
+    control = guest_of(one.folder, "bare").sockets.control
+    assert control is not None
+    with zmq.Context() as context, context.socket(zmq.REQ) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.ROUTING_ID, b"bare")
+        socket.connect(control)
+        socket.send_multipart(wire.encode_request(Request(ControlRequest.END_EXPERIMENT)))
+        if plain:
+            assert wire.decode_response(socket.recv_multipart()).ok
+            assert one.end() == 0, one.output
+        else:
+            one.wait_for(" scheduler ", r"\[security\] plain = true")
+            assert socket.poll(0) == 0
