@@ -313,7 +313,7 @@ def test_nobody_takes_the_answers_of_another_by_its_name(open_: Any, plain: Any)
     run = Run(open_)
     series = run.client("series")
     series.send(wire.encode_request(Request(CLOCK_REQUEST, id="series/x/1")))
-    (asked,) = run.listening.until(1)
+    (asked,) = run.listening.until(1, PeerAsked, series)
     assert (asked.name, asked.user) == ("series", "series")
     thief = run.client("thief", "series")
     bare = plain(zmq.DEALER)
@@ -325,7 +325,7 @@ def test_nobody_takes_the_answers_of_another_by_its_name(open_: Any, plain: Any)
     bare.connect(run.listening.router.address)
     thief.send(wire.encode_request(Request(CLOCK_REQUEST, id="series/y/1")))
     bare.send_multipart([b"", *wire.encode_request(Request(CLOCK_REQUEST, id="series/z/1"))])
-    assert {(one.name, one.user) for one in run.listening.until(3)[1:]} == {("series", "thief")}
+    assert {(one.name, one.user) for one in run.listening.until(3, PeerAsked, thief)[1:]} == {("series", "thief")}
     run.listening.router.reply(asked.connection, wire.encode_response(Response(0, b"hers", id="series/x/1")))
     assert answered(series) == [b"hers"]
     assert answered(thief) == []
@@ -337,7 +337,7 @@ def test_one_that_is_started_again_has_its_name_again_while_its_old_connection_s
     for life in range(2):
         port = run.client("series")
         port.send(wire.encode_request(Request(CLOCK_REQUEST, id=f"series/{life}/1")))
-        asked = run.listening.until(life + 1)[-1]
+        asked = run.listening.until(life + 1, PeerAsked, port)[-1]
     assert (asked.name, asked.user) == ("series", "series")
     run.listening.router.reply(asked.connection, wire.encode_response(Response(0, b"anew", id="series/1/1")))
     assert answered(port) == [b"anew"]
@@ -347,8 +347,9 @@ def test_guests_have_any_name_but_that_of_a_process(open_: Any) -> None:
     run = Run(open_)
     heard = []
     for n, name in enumerate(("notebook", "dashboard:Ada", "series", "series:Ada", "scheduler", GUEST)):
-        run.client(GUEST, name).send(wire.encode_request(Request(CLOCK_REQUEST, id="x")))
-        heard.append(run.listening.until(n + 1)[-1].user)
+        client = run.client(GUEST, name)
+        client.send(wire.encode_request(Request(CLOCK_REQUEST, id="x")))
+        heard.append(run.listening.until(n + 1, PeerAsked, client)[-1].user)
     assert heard == ["notebook", "dashboard", GUEST, GUEST, GUEST, GUEST]
 
 
@@ -358,8 +359,9 @@ def test_one_without_a_key_is_not_heard_and_that_is_told_once(
     run = Run(open_)
     for name in (b"series", b"another"):
         peer(plain, run.listening, name).send_multipart([b"", *wire.encode_request(Request(CLOCK_REQUEST))])
-    run.client("series").send(wire.encode_request(Request(CLOCK_REQUEST, id="series/x/1")))
-    assert [one.user for one in run.listening.until(1)] == ["series"]
+    series = run.client("series")
+    series.send(wire.encode_request(Request(CLOCK_REQUEST, id="series/x/1")))
+    assert [one.user for one in run.listening.until(1, PeerAsked, series)] == ["series"]
     deadline_s = time.monotonic() + 5.0
     while "has no key" not in caplog.text:
         assert time.monotonic() < deadline_s
