@@ -296,11 +296,11 @@ def check_names_of_people(resolved: Resolved) -> None:
                     resolved.document.place("control", "roles", role, i),
                     f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]",
                 )
-    if any_role and keys is None:
+    if any_role and (resolved.security.plain or resolved.security.insecure):
         resolved.findings.warning(
             "[control.roles] without keys: whoever takes the name has the role",
             resolved.document.place("control", "roles"),
-            "make keys with `afspm keys` and set [security] keys",
+            "leave [security] plain away, or make keys with `afspm keys` and set [security] keys",
         )
     if keys is not None and not keys.is_dir():
         resolved.findings.error(

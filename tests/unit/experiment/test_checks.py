@@ -289,9 +289,11 @@ def test_all_insecure_must_be_said_aloud(write: Write) -> None:
 
 
 def test_roles_without_keys_are_a_warning(write: Write) -> None:
-    experiment = write(CORRECTOR + '[control.roles]\nend_experiment = ["repair"]\n')
-    assert not errors(experiment)
-    assert any("without keys" in f.what for f in experiment.check())
+    roles = CORRECTOR + '[control.roles]\nend_experiment = ["repair"]\n'
+    for more, told in (("", False), ("[security]\nplain = true\n", True)):
+        experiment = write(roles + more)
+        assert not errors(experiment)
+        assert any("without keys" in f.what for f in experiment.check()) is told
 
 
 def test_a_role_of_a_person_without_a_password_is_told(write: Write) -> None:
