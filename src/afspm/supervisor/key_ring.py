@@ -13,11 +13,14 @@ from typing import Any
 from afspm.addresses import connectable, reaches
 from afspm.experiment import Experiment, Role, Start
 from afspm.logic.telling import SUPERVISOR
+from afspm.record.disk import bounded
 from afspm.record.facts import STATE_DIR
 from afspm.record.whole import replace as write
 from afspm.runtime.connect import GUEST_KEYS
 from afspm.transport import keys
 from afspm.transport.keys import GUEST, Keys
+
+WRITTEN_WITHIN_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -35,15 +38,17 @@ class Handed:
 
     @contextmanager
     def laid_down(self, folder: Path) -> Iterator[None]:
-        """While in the block, who may read the run's folder finds the guests' key in it. Raises OSError."""
+        """While in the block, who may read the run's folder finds the guests' key in it, unless its disk fails."""
         file = folder / STATE_DIR / GUEST_KEYS
         if self.guest is not None:
-            write(file, [json.dumps(self.guest).encode()], mode=0o600)
+            text = json.dumps(self.guest).encode()
+            with contextlib.suppress(OSError):
+                bounded(lambda: write(file, [text], mode=0o600), WRITTEN_WITHIN_S)
         try:
             yield
         finally:
             with contextlib.suppress(OSError):
-                file.unlink(missing_ok=True)
+                bounded(lambda: file.unlink(missing_ok=True), WRITTEN_WITHIN_S)
 
 
 def hand_over(experiment: Experiment, starts: Sequence[Start]) -> Handed:
