@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 MOST_UNREAD_BYTES = 8 << 20
 """Received from one peer, and not yet taken as whole messages."""
-UNFINISHED_BYTES, UNFINISHED_S = 64 << 10, 5.0
+UNFINISHED_BYTES, UNFINISHED_S = 256 << 10, 5.0
 """As much may be received of a message that is not finished for longer than this."""
-PERIOD_S = 0.1
+PERIOD_S = 0.2
 _IDLE_BYTES_PER_S = 100.0
 """Heartbeats of ZMTP, which are no messages."""
 _TELLS = sys.platform == "linux"

@@ -8,7 +8,7 @@ import zmq
 
 from afspm.clock import Clock
 from afspm.errors import ConfigError
-from afspm.transport.frames import descriptor_of, property_of, receive_small, send, user_of
+from afspm.transport.frames import descriptor_of, property_of, readable, receive_small, send, user_of
 from afspm.transport.history import Published
 from afspm.transport.network import Network
 from afspm.transport.polling import milliseconds, poller
@@ -87,10 +87,11 @@ class ZmqServerPort:
         while self._asker is None:
             first, parts = receive_small(self._socket)
             if first is None:
-                self._network.connections.settled(self._heard)
-                self._heard.clear()
                 break
             self._heard.add(descriptor_of(first) or -1)
+            if not readable(self._socket):
+                self._network.connections.settled(self._heard)
+                self._heard.clear()
             try:
                 start = parts.index(b"", 1) + 1
             except ValueError:
