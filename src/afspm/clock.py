@@ -6,13 +6,20 @@ request timeouts and whatever else is about processes stays in real time: `monot
 
 from __future__ import annotations
 
+import mmap
+import struct
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Protocol
+
+from afspm.errors import ConfigError
+from afspm.file_lock import locked
 
 NS_PER_S = 1_000_000_000
 
@@ -44,6 +51,10 @@ class Clock(Protocol):
         """How long `experiment_s` of the experiment last in real time, in s."""
         ...
 
+    def late(self) -> AbstractContextManager[None]:
+        """Let a simulated time wait, within bounds, for what is done in the block."""
+        ...
+
 
 def _anchor_s() -> float:
     """Wall-clock time at the zero of time.monotonic(), so that a corrected system clock never jumps a run."""
@@ -70,6 +81,66 @@ def monotonic_id() -> str:
     return f"{boot} {time.get_clock_info('monotonic').implementation}"
 
 
+LONGEST_LATE_S = 10.0  # real time: who is killed while it is late must not slow the rest of the night
+_SHARED = struct.Struct("<qqq")  # real time, experiment time then, and real time until which time goes slowly, in ns
+_CHECKSUM = struct.Struct("<I")
+
+
+class WaitingTime:
+    """The time of a simulated run, which waits for those who are late; shared by its processes in a small file.
+
+    Since a moment of real time it has gone at the speed of real time until another, and at full speed from then on. Who
+    is late writes both anew.
+
+    Args:
+        path: of the file, which is there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with path.open("r+b") as file:
+            self._map = mmap.mmap(file.fileno(), _SHARED.size + _CHECKSUM.size)
+
+    def now_ns(self, real_ns: int, speed: float) -> int:
+        """Experiment time at a moment of real time, by `time.monotonic_ns`."""
+        return _shown_ns(self._read(), real_ns, speed)
+
+    @contextmanager
+    def late(self, speed: float) -> Iterator[None]:
+        """See `ExperimentClock.late`."""
+        until_ns = self._slow_until(time.monotonic_ns() + int(LONGEST_LATE_S * NS_PER_S), speed)
+        try:
+            yield
+        finally:
+            if self._read()[2] == until_ns:  # else somebody else is late, too, and for longer
+                self._slow_until(0, speed)
+
+    def _slow_until(self, until_ns: int, speed: float) -> int:
+        with self.path.open("r+b") as file, locked(file):
+            real_ns, told = time.monotonic_ns(), self._read()
+            until_ns = max(until_ns, real_ns)
+            self._map[:] = _shared_bytes(real_ns, _shown_ns(told, real_ns, speed), until_ns)
+        return until_ns
+
+    def _read(self) -> tuple[int, int, int]:
+        while True:
+            found = self._map[:]
+            if _CHECKSUM.unpack_from(found, _SHARED.size)[0] == zlib.crc32(found[: _SHARED.size]):
+                return _SHARED.unpack_from(found)
+
+
+def _shown_ns(told: tuple[int, int, int], real_ns: int, speed: float) -> int:
+    since_ns, shown_ns, slow_until_ns = told
+    real_ns = max(real_ns, since_ns)
+    fast_since_ns = min(max(slow_until_ns, since_ns), real_ns)
+    return shown_ns + fast_since_ns - since_ns + int((real_ns - fast_since_ns) * speed)
+
+
+def _shared_bytes(real_ns: int, shown_ns: int, slow_until_ns: int) -> bytes:
+    told = _SHARED.pack(real_ns, shown_ns, slow_until_ns)
+    return told + _CHECKSUM.pack(zlib.crc32(told))
+
+
 @dataclass(frozen=True)
 class ExperimentClock:
     """experiment time = start + (real time - origin) · speed.
@@ -87,6 +158,7 @@ class ExperimentClock:
     start_s: float = 0.0
     speed: float = 1.0
     _wall_at_zero_s: float = field(default_factory=_anchor_s, repr=False, compare=False)
+    _waiting: WaitingTime | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def real(cls) -> ExperimentClock:
@@ -105,9 +177,17 @@ class ExperimentClock:
         if not values:
             return cls.real()
         told = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
+        waits = values.get("waits")
         if values.get("monotonic") != monotonic_id():  # another computer's: real time is what the wall here says
+            if waits:
+                raise ConfigError(
+                    "the simulated clock waits for those who are late, which it can do on one computer only",
+                    where="[clock]",
+                    hint="set waits = false where the scheduler is started",
+                )
             return cls(*told)
-        return cls(*told, float(values["wall_at_zero_s"]))
+        waiting = WaitingTime(Path(waits)) if waits and Path(waits).exists() else None  # gone with its run
+        return cls(*told, float(values["wall_at_zero_s"]), waiting)
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON has it, for the other processes of the run."""
@@ -117,16 +197,40 @@ class ExperimentClock:
             "speed": self.speed,
             "wall_at_zero_s": self._wall_at_zero_s,
             "monotonic": monotonic_id(),
+            **({"waits": str(self._waiting.path)} if self._waiting else {}),
         }
+
+    def waiting_in(self, path: Path) -> ExperimentClock:
+        """Return this clock, which from now on waits for those who are late, if it goes faster than real time.
+
+        Args:
+            path: of the file by which the processes of the run share that.
+        """
+        if self.speed <= 1.0 or self._waiting is not None:
+            return self
+        path.write_bytes(_shared_bytes(time.monotonic_ns(), self.now_ns(), 0))
+        return replace(self, _waiting=WaitingTime(path))
+
+    def late(self) -> AbstractContextManager[None]:
+        """Let the experiment's time go no faster than real time in the block, at most for `LONGEST_LATE_S`.
+
+        For what takes no time in the experiment, and computers need time for: a scan that is due and not begun, one
+        that is finished and not yet registered. At a speed of one nothing changes.
+        """
+        return nullcontext() if self._waiting is None else self._waiting.late(self.speed)
 
     def wall_ahead_s(self) -> float:
         """By how much the clock on the wall is ahead, s: it was set since, or the computer was suspended."""
         return _anchor_s() - self._wall_at_zero_s
 
     def now_s(self) -> float:
+        if self._waiting is not None:
+            return self.now_ns() / NS_PER_S
         return self.start_s + (self._wall_at_zero_s + time.monotonic() - self.origin_s) * self.speed
 
     def now_ns(self) -> int:
+        if self._waiting is not None:
+            return self._waiting.now_ns(time.monotonic_ns(), self.speed)
         real_ns = time.monotonic_ns() + self._since_origin_ns
         return self._start_ns + (real_ns if self.speed == 1.0 else int(real_ns * self.speed))
 

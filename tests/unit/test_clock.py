@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
-from afspm.clock import ExperimentClock
+from afspm.clock import NS_PER_S, ExperimentClock, _shown_ns
+from afspm.errors import ConfigError
 
 
 def test_real_time_by_default() -> None:
@@ -74,3 +78,78 @@ def test_it_tells_by_how_much_the_wall_clock_has_gone_another_way(monkeypatch: p
     assert clock.wall_ahead_s() == pytest.approx(0.0, abs=0.5)
     monkeypatch.setattr(time, "time", lambda: wall() - 3600.0)
     assert clock.wall_ahead_s() == pytest.approx(-3600.0, abs=0.5)
+
+
+def waiting(tmp_path: Path, speed: float = 480.0) -> ExperimentClock:
+    return ExperimentClock.starting_now(1_000_000.0, speed).waiting_in(tmp_path / "clock")
+
+
+def test_time_goes_no_faster_than_real_time_while_somebody_is_late(tmp_path: Path) -> None:
+    clock = waiting(tmp_path)
+    other = ExperimentClock.from_dict(json.loads(json.dumps(clock.as_dict())))  # of another process
+    with clock.late():
+        began_s, real_s = other.now_s(), time.monotonic()
+        while time.monotonic() < real_s + 0.05:
+            pass
+        passed_s, lasted_s = other.now_s() - began_s, time.monotonic() - real_s
+        assert 0.05 <= passed_s <= 10.0 * lasted_s  # a busy computer does something else between two looks
+    began_s, real_s = other.now_s(), time.monotonic()
+    while time.monotonic() < real_s + 0.05:
+        pass
+    assert other.now_s() - began_s >= 0.05 * 480.0
+
+
+def test_who_dies_late_slows_the_night_for_a_moment_only() -> None:
+    told = (0, 0, 10 * NS_PER_S)
+    assert _shown_ns(told, 4 * NS_PER_S, 480.0) == 4 * NS_PER_S
+    assert _shown_ns(told, 12 * NS_PER_S, 480.0) == (10 + 2 * 480) * NS_PER_S
+    assert _shown_ns(told, -1, 480.0) == 0  # read just before it was written
+
+
+def test_time_never_goes_back_however_many_are_late(tmp_path: Path) -> None:
+    clock = waiting(tmp_path)
+    seen: list[int] = []
+    done = threading.Event()
+
+    def watch() -> None:
+        mine = ExperimentClock.from_dict(clock.as_dict())
+        while not done.is_set():
+            seen.append(mine.now_ns())
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    for _ in range(50):
+        with clock.late(), clock.late():
+            pass
+    done.set()
+    watcher.join()
+    assert seen == sorted(seen)
+    assert clock.now_ns() >= seen[-1]
+
+
+def test_the_one_who_is_late_for_longer_is_waited_for(tmp_path: Path) -> None:
+    clock = waiting(tmp_path)
+    with ExitStack() as first:
+        first.enter_context(clock.late())
+        second = ExitStack()
+        second.enter_context(clock.late())
+        first.close()
+        began_ns, real_ns = clock.now_ns(), time.monotonic_ns()
+        assert clock.now_ns() - began_ns <= 10 * (time.monotonic_ns() - real_ns)
+        second.close()
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0])
+def test_real_time_waits_for_nobody_and_needs_no_file(tmp_path: Path, speed: float) -> None:
+    clock = waiting(tmp_path, speed)
+    with clock.late():
+        assert list(tmp_path.iterdir()) == []
+    assert "waits" not in clock.as_dict()
+
+
+def test_a_clock_that_waits_is_refused_on_another_computer_and_its_file_may_be_gone(tmp_path: Path) -> None:
+    clock = waiting(tmp_path)
+    with pytest.raises(ConfigError, match="one computer only"):
+        ExperimentClock.from_dict({**clock.as_dict(), "monotonic": "another boot"})
+    (tmp_path / "clock").unlink()
+    assert ExperimentClock.from_dict(clock.as_dict()).speed == 480.0

@@ -75,7 +75,7 @@ class PlannedScans(Component):
             self.scope.end_experiment()
 
     def _set_parameters(self) -> None:
-        with self.scope.control():
+        with self.clock.late(), self.scope.control():
             for name, quantity in self.parameters.items():
                 self.scope.set(name, quantity)
 

@@ -30,6 +30,7 @@ class Clock(Section):
 
     start: datetime | None = None
     speed: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+    waits: bool = True
 
 
 class Roles(Section):

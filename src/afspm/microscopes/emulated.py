@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from afspm.errors import ConfigError
+from afspm.file_lock import lock
 from afspm.microscopes.microscope import ControllerLost
-from afspm.record.going_on import lock
 
 if TYPE_CHECKING:
     from afspm.microscopes.microscope import Microscope

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from afspm.errors import AfspmError
-from afspm.record.going_on import lock
+from afspm.file_lock import lock
 
 _LOCKED_BYTES = 1  # where a lock covers what is read (Windows), who holds it is told behind it
 

@@ -252,12 +252,14 @@ class Translator:
             self._observe_values(announce)
         # the state first: a result that comes in between then waits for the next look, and is not lost
         status = self._status()
-        if self._sequence.said.state in MEASURING and status.state not in MEASURING:
+        is_over = self._sequence.said.state in MEASURING and status.state not in MEASURING
+        if is_over:
             self._pace.over(self._clock.monotonic_s())
-        steps = self._sequence.observe(status, self._outbox.look(), self._clock.now_s())
-        if steps:
-            self._save()  # before anything is out: who comes back from a kill must not tell an older story
-            self._play(steps)
+        with self._clock.late() if is_over else nullcontext():
+            steps = self._sequence.observe(status, self._outbox.look(), self._clock.now_s())
+            if steps:
+                self._save()  # before anything is out: who comes back from a kill must not tell an older story
+                self._play(steps)
 
     def _observe_values(self, announce: Sequence[str]) -> None:
         values = self._read()

@@ -7,9 +7,9 @@ import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 from afspm.errors import FileError
+from afspm.file_lock import lock
 from afspm.record.facts import ENDED, REPLAY_OF, STATE_DIR, known_facts
 
 LOCK_FILE = "running"
@@ -73,20 +73,3 @@ def _is_left(folder: Path) -> bool:
     except OSError:
         return False
     return True
-
-
-def lock(file: IO[bytes], *, shared: bool = False, wait: bool = False) -> None:
-    """Until it is closed. Raises OSError: another process has it.
-
-    Args:
-        wait: for the process that has it (on Windows for ten seconds).
-    """
-    if sys.platform == "win32":
-        import msvcrt
-
-        file.seek(0)
-        msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))

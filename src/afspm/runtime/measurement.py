@@ -179,19 +179,21 @@ class Measuring:
             return resumed
         if resumed is None:
             self._write_down(progress)
-        plan.prepare(progress.until_s)
+        with link.clock.late():
+            plan.prepare(progress.until_s)
         states = link.view.count("ScopeStateMsg")
         cycle = resumed or Cycle(plan.busy, plan.fits, since_ns=link.view.newest_ns)
         forget = self._forget_resumed if resumed else link.listen(self._listener(cycle, plan.message))
         is_unknown = True  # until we know what became of it, an error in between leaves it to be taken up
         try:
-            response = self._asker.send(
-                ControlRequest.ACTION,
-                plan.action,
-                request_id=progress.request_id(),
-                until_s=progress.until_s,
-                is_seen=lambda: cycle.begun,
-            )
+            with link.clock.late():
+                response = self._asker.send(
+                    ControlRequest.ACTION,
+                    plan.action,
+                    request_id=progress.request_id(),
+                    until_s=progress.until_s,
+                    is_seen=lambda: cycle.begun,
+                )
             if not response.ok and not cycle.begun:
                 is_unknown = False
                 self._get_over(response, states, progress, is_new=resumed is None)
@@ -235,7 +237,9 @@ class Measuring:
     def _follow(self, progress: _Progress, cycle: Cycle) -> None:
         """From the success of the action to the end of it."""
         link, until_s = self._link, progress.until_s
-        if not link.wait_connected(lambda: cycle.begun or cycle.outcome is not None, BEGUN_WITHIN_S, until_s):
+        with link.clock.late():
+            begun = link.wait_connected(lambda: cycle.begun or cycle.outcome is not None, BEGUN_WITHIN_S, until_s)
+        if not begun:
             cycle.outcome = Outcome.VANISHED
         elif not link.wait(lambda: cycle.outcome is not None, until_s):
             raise NoResponse(

@@ -81,6 +81,8 @@ def _read(response: Response, asked_s: float, answered_s: float, where: str) -> 
         clock = ExperimentClock.from_dict(told)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise WireError(f"the scheduler's time can't be read: {error!r}", where=where) from error
+    if told.get("waits"):
+        return Common(clock, run, simulated)
     real_s = (asked_s + answered_s) / 2
     shown_s = clock.start_s + (real_s - clock.origin_s) * clock.speed
     if abs(now_s - shown_s) <= ((answered_s - asked_s) / 2 + _SAME_S) * clock.speed:

@@ -35,6 +35,9 @@ RUN, HOW, HOMES, FILES, ONLY, WITHOUT = "run", "how", "homes", "files", "only", 
 WRITTEN_WITHIN_S = 5.0
 
 
+CLOCK_FILE = "clock"
+
+
 @dataclass(frozen=True)
 class Options:
     """How to run an experiment here and now, as far as the experiment file is not about it.
@@ -98,6 +101,8 @@ def go(
     Args:
         name: of the experiment; names: of its processes.
     """
+    if experiment.resolved.clock.waits:
+        common = replace(common, clock=common.clock.waiting_in(folder / STATE_DIR / CLOCK_FILE))
     clock = common.clock
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:

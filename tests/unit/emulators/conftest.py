@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
+
 import pytest
 
 from afspm.emulators.rig import Rig
@@ -22,6 +24,9 @@ class FakeClock:
 
     def real_s(self, experiment_s: float) -> float:
         return experiment_s
+
+    def late(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
 
 @pytest.fixture

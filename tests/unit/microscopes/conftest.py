@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,9 @@ class FakeClock:
 
     def real_s(self, experiment_s: float) -> float:
         return experiment_s
+
+    def late(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
 
 class FakePort:

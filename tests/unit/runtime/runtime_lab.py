@@ -6,6 +6,7 @@ import heapq
 import itertools
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -72,6 +73,9 @@ class FakeClock:
 
     def real_s(self, experiment_s: float) -> float:
         return experiment_s
+
+    def late(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
 
 class Nothing(AssertionError):

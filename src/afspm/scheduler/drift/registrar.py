@@ -11,6 +11,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,15 @@ class Registrar:
 
     Attributes:
         wake: called from another thread when there is something to take.
+        late: keeps a simulated time from running away while a scan is registered.
     """
 
     def __init__(self, settings: DriftSettings, file: Path | None, log: logging.Logger) -> None:
         self._first = {"drift": asdict(settings), "file": str(file) if file else ""}
         self._log = log
         self.wake: Callable[[], None] = lambda: None
+        self.late: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
+        self._late = contextlib.ExitStack()
         self._said: deque[tuple[int, WorkerSaid]] = deque()
         self._life = 0
         self._process: subprocess.Popen[bytes] | None = None
@@ -61,6 +65,7 @@ class Registrar:
         self._orders.put((self._first, None))
 
     def register(self, job: ScanJob) -> None:
+        self._late.enter_context(self.late())
         self._orders.put((pipe.job_to_head(job), job.scan.values))
 
     def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
@@ -75,8 +80,13 @@ class Registrar:
                 said.append(event)
         return said
 
+    def caught_up(self) -> None:
+        """What the worker has said of scans is done."""
+        self._late.close()
+
     def close(self) -> None:
         """End the worker: its state is on disk."""
+        self._late.close()
         self._life += 1
         self._end(kill=False)
 

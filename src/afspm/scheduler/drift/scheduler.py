@@ -13,6 +13,7 @@ from afspm.scheduler.drift.consequences import RESCAN
 from afspm.scheduler.drift.core import MAPPING, DriftCore
 from afspm.scheduler.drift.registrar import Registrar
 from afspm.scheduler.drift.settings import DriftSettings
+from afspm.scheduler.drift.told import Forecasted
 from afspm.scheduler.scheduler import Scheduler, SchedulerContext
 from afspm.scheduler.shell import Core, Shell
 from afspm.transport.scheduler_sockets import SchedulerSockets
@@ -71,6 +72,7 @@ class DriftCompensatedScheduler(Scheduler):
         launch = context.launch
         file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
         self._registrar = Registrar(self.drift, file, context.log)
+        self._registrar.late = context.clock.late
         return DriftCore(self._settings(context), self.drift, DriftWireCodec(), self._registrar, launch.name)
 
     def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> Shell:
@@ -91,6 +93,8 @@ class DriftShell(Shell):
         if not self.ended:
             for said in self._registrar.said():
                 self._carry_out(self._drift_core.said(said, self._clock.monotonic_s(), self._clock.now_ns()))
+                if not isinstance(said, Forecasted):
+                    self._registrar.caught_up()
         super().handle(ready)
 
     def close(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import random
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 START_S = 1_750_000_000.0
@@ -66,6 +67,10 @@ class Timeline:
 
     def real_s(self, experiment_s: float) -> float:
         return experiment_s / self.speed
+
+    def late(self) -> AbstractContextManager[None]:
+        """Nobody is late here."""
+        return nullcontext()
 
     # --- what happens ---
 

@@ -1,0 +1,39 @@
+"""Locks on files, as each system has them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO
+
+
+def lock(file: IO[bytes], *, shared: bool = False, wait: bool = False) -> None:
+    """Lock a file until it is closed. Raises OSError: another process has it.
+
+    Args:
+        wait: for the process that has it (on Windows for ten seconds).
+    """
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+
+
+@contextmanager
+def locked(file: IO[bytes]) -> Iterator[None]:
+    """Lock a file in the block, which waits for the process that has it, and release it."""
+    lock(file, wait=True)
+    try:
+        yield
+    finally:
+        if sys.platform == "win32":
+            import msvcrt
+
+            file.seek(0)
+            msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)

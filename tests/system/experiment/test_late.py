@@ -1,0 +1,47 @@
+"""A simulated night on a slow computer: nothing that it was to show is lost, since its clock waits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from experiment_lab import Run
+
+import afspm
+
+NIGHT = """
+[clock]
+speed = 600.0
+waits = {waits}
+
+[microscope]
+component = true
+class = "Simulator"
+surface = "flat"
+initial = {{ scan-speed = "40 um/s" }}
+faults = [{{ kind = "slow", count = 1000, duration_s = 0.9 }}]  # real seconds: nine minutes of the experiment
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[series]
+component = true
+class = "ScanSeries"
+size = ["1 um", "1 um"]
+pixels = [16, 16]
+every = "10 min"
+duration = "1 h"
+keep_control = true
+end_when_done = true
+"""
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_scans_are_missed_only_where_the_clock_does_not_wait(afspm_run: Run, tmp_path: Path, waits: bool) -> None:
+    file = tmp_path / "night.toml"
+    file.write_text(NIGHT.format(waits=str(waits).lower()), encoding="utf-8")
+    one = afspm_run(str(file), "--runs", str(tmp_path / "runs"))
+    assert one.end() == 0, one.output
+    with afspm.open_run(one.folder) as record:
+        assert (len(record.scans) == 7) is waits, one.output
