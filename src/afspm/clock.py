@@ -82,7 +82,8 @@ def monotonic_id() -> str:
 
 
 LONGEST_LATE_S = 10.0  # real time: who is killed while it is late must not slow the rest of the night
-_SHARED = struct.Struct("<qqq")  # real time, experiment time then, and real time until which time goes slowly, in ns
+_MOST_LATE = 16  # at the same time; more are not waited for
+_SHARED = struct.Struct(f"<{2 + _MOST_LATE}q")  # real time, experiment time then, until when each is waited for; ns
 _CHECKSUM = struct.Struct("<I")
 
 
@@ -108,36 +109,39 @@ class WaitingTime:
     @contextmanager
     def late(self, speed: float) -> Iterator[None]:
         """See `ExperimentClock.late`."""
-        until_ns = self._slow_until(time.monotonic_ns() + int(LONGEST_LATE_S * NS_PER_S), speed)
+        mine_ns = time.monotonic_ns() + int(LONGEST_LATE_S * NS_PER_S)
+        self._change(0, mine_ns, speed)
         try:
             yield
         finally:
-            if self._read()[2] == until_ns:  # else somebody else is late, too, and for longer
-                self._slow_until(0, speed)
+            self._change(mine_ns, 0, speed)
 
-    def _slow_until(self, until_ns: int, speed: float) -> int:
+    def _change(self, before_ns: int, after_ns: int, speed: float) -> None:
+        """Write one of the times until which somebody is waited for instead of another, and the time that it is now."""
         with self.path.open("r+b") as file, locked(file):
-            real_ns, told = time.monotonic_ns(), self._read()
-            until_ns = max(until_ns, real_ns)
-            self._map[:] = _shared_bytes(real_ns, _shown_ns(told, real_ns, speed), until_ns)
-        return until_ns
+            real_ns, (since_ns, shown_ns, *until_ns) = time.monotonic_ns(), self._read()
+            shown_ns = _shown_ns((since_ns, shown_ns, *until_ns), real_ns, speed)
+            until_ns = [until if until > real_ns else 0 for until in until_ns]
+            if before_ns in until_ns:
+                until_ns[until_ns.index(before_ns)] = after_ns
+            self._map[:] = _shared_bytes(real_ns, shown_ns, *until_ns)
 
-    def _read(self) -> tuple[int, int, int]:
+    def _read(self) -> tuple[int, ...]:
         while True:
             found = self._map[:]
             if _CHECKSUM.unpack_from(found, _SHARED.size)[0] == zlib.crc32(found[: _SHARED.size]):
                 return _SHARED.unpack_from(found)
 
 
-def _shown_ns(told: tuple[int, int, int], real_ns: int, speed: float) -> int:
-    since_ns, shown_ns, slow_until_ns = told
+def _shown_ns(told: tuple[int, ...], real_ns: int, speed: float) -> int:
+    since_ns, shown_ns, *until_ns = told
     real_ns = max(real_ns, since_ns)
-    fast_since_ns = min(max(slow_until_ns, since_ns), real_ns)
+    fast_since_ns = min(max(since_ns, *until_ns), real_ns)
     return shown_ns + fast_since_ns - since_ns + int((real_ns - fast_since_ns) * speed)
 
 
-def _shared_bytes(real_ns: int, shown_ns: int, slow_until_ns: int) -> bytes:
-    told = _SHARED.pack(real_ns, shown_ns, slow_until_ns)
+def _shared_bytes(real_ns: int, shown_ns: int, *until_ns: int) -> bytes:
+    told = _SHARED.pack(real_ns, shown_ns, *until_ns)
     return told + _CHECKSUM.pack(zlib.crc32(told))
 
 
@@ -208,7 +212,7 @@ class ExperimentClock:
         """
         if self.speed <= 1.0 or self._waiting is not None:
             return self
-        path.write_bytes(_shared_bytes(time.monotonic_ns(), self.now_ns(), 0))
+        path.write_bytes(_shared_bytes(time.monotonic_ns(), self.now_ns(), *[0] * _MOST_LATE))
         return replace(self, _waiting=WaitingTime(path))
 
     def late(self) -> AbstractContextManager[None]:

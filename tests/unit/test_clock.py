@@ -127,16 +127,22 @@ def test_time_never_goes_back_however_many_are_late(tmp_path: Path) -> None:
     assert clock.now_ns() >= seen[-1]
 
 
-def test_the_one_who_is_late_for_longer_is_waited_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_first", [False, True])
+def test_whoever_is_late_for_longer_is_waited_for_and_no_longer(tmp_path: Path, is_first: bool) -> None:
     clock = waiting(tmp_path)
-    with ExitStack() as first:
-        first.enter_context(clock.late())
-        second = ExitStack()
-        second.enter_context(clock.late())
-        first.close()
-        began_ns, real_ns = clock.now_ns(), time.monotonic_ns()
-        assert clock.now_ns() - began_ns <= 10 * (time.monotonic_ns() - real_ns)
-        second.close()
+    stacks = [ExitStack(), ExitStack()]
+    for stack in stacks:
+        stack.enter_context(clock.late())
+    stacks[is_first].close()
+    real_ns, began_ns = time.monotonic_ns(), clock.now_ns()
+    while time.monotonic_ns() < real_ns + NS_PER_S // 50:
+        pass
+    assert clock.now_ns() - began_ns <= 10 * (time.monotonic_ns() - real_ns)
+    stacks[not is_first].close()
+    real_ns, began_ns = time.monotonic_ns(), clock.now_ns()
+    while time.monotonic_ns() < real_ns + NS_PER_S // 50:
+        pass
+    assert clock.now_ns() - began_ns >= 480 * (NS_PER_S // 50)
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any
@@ -111,12 +112,15 @@ class Measuring:
         if cycle is not None and self._is_complete(progress, cycle):
             self._holding.release_inherited()
         else:
-            with self._holding.hold(until_s=until_s):
+            with ExitStack() as control:
+                with self._link.clock.late():
+                    control.enter_context(self._holding.hold(until_s=until_s))
                 cycle = self._measure(progress, cycle)
         result = Result(_newest_of_each(plan, cycle.results), progress.interruptions)
         self._channels[plan.what] = frozenset(map(plan.name_of, result.things))
         if key is not None:
-            self._results.fulfil(key, plan.facts, result)
+            with self._link.clock.late():
+                self._results.fulfil(key, plan.facts, result)
         return result
 
     def _taken_up(self, progress: _Progress) -> Cycle | None:
