@@ -159,3 +159,15 @@ def test_a_clock_that_waits_is_refused_on_another_computer_and_its_file_may_be_g
         ExperimentClock.from_dict({**clock.as_dict(), "monotonic": "another boot"})
     (tmp_path / "clock").unlink()
     assert ExperimentClock.from_dict(clock.as_dict()).speed == 480.0
+
+
+def test_who_is_killed_while_writing_stops_nobody(tmp_path: Path) -> None:
+    clock = waiting(tmp_path)
+    before_ns = clock.now_ns()
+    whole = (tmp_path / "clock").read_bytes()
+    with (tmp_path / "clock").open("r+b") as file:
+        file.write(b"torn" + whole[4:])
+    assert before_ns <= clock.now_ns()
+    with clock.late():  # writes it anew
+        pass
+    assert ExperimentClock.from_dict(clock.as_dict()).now_ns() >= before_ns
