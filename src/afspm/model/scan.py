@@ -6,7 +6,7 @@ import operator
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from afspm.errors import InvalidValue
 from afspm.model.geometry import XY, Region, RegionChange
@@ -14,6 +14,7 @@ from afspm.model.geometry import XY, Region, RegionChange
 if TYPE_CHECKING:
     import numpy as np
     import xarray
+    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
 
@@ -162,6 +163,60 @@ class Scan:
 
         values = undistorted(self.values, self.region, velocity_m_s, duration_s, upwards=upwards)
         return replace(self, values=values)
+
+    def levelled(self, order: int = 1, fit: str = "least-squares", quantile: float = 0.5) -> Scan:
+        """Return the scan without the polynomial surface that fits it best.
+
+        Args:
+            order: 0 for a height, 1 for a plane, 2 and 3 for curved surfaces.
+            fit: "least-squares", or one that particles and steps do not lead astray: "huber", "theil-sen", "ransac" or
+                "quantile".
+            quantile: of the last: which part of the pixels lies below the surface.
+
+        Raises:
+            InvalidValue: there is no such fit or order, or too little was measured.
+        """
+        from afspm.model.levelling import levelled
+
+        return replace(self, values=levelled(self.values, order, fit, quantile))
+
+    def plot(self, kind: str = "image", axes: Axes | None = None) -> Axes:
+        """Draw the scan with matplotlib (needs the extra `plot`).
+
+        Args:
+            kind: "image", "contour" or "surface" (in three dimensions).
+            axes: to draw in; for a surface they need `projection="3d"`. None: a figure of its own.
+
+        Returns:
+            The axes, in nm; the values in their own unit.
+
+        Raises:
+            InvalidValue: there is no such kind, or nothing was measured.
+        """
+        from afspm.model.views import draw
+
+        return draw(self, kind, axes)
+
+    def to_sidpy(self) -> Any:
+        """Return the scan as a `sidpy.Dataset`, for programs of the pycroscopy ecosystem (needs sidpy).
+
+        Its axes are x and y in m, those of the unrotated rectangle; angle, frame, time and file are in
+        `original_metadata["afspm"]`.
+        """
+        from afspm.model.sidpy_dataset import to_sidpy
+
+        return to_sidpy(self)
+
+    @staticmethod
+    def from_sidpy(dataset: Any) -> Scan:
+        """Return a two-dimensional `sidpy.Dataset` as a scan; axes in any unit of length.
+
+        Raises:
+            InvalidValue: it is not an image, or its axes are not lengths.
+        """
+        from afspm.model.sidpy_dataset import from_sidpy
+
+        return from_sidpy(dataset)
 
     def to_xarray(self) -> xarray.DataArray:
         """As an xarray DataArray with coordinates in m (needs the extra `xarray`).

@@ -1,0 +1,138 @@
+"""Levelling of scans: a polynomial surface is fitted to the heights and taken away. Pure.
+
+Heights are fitted over x and y from -1 to 1, so that the result does not depend on the scan's size. What was not
+measured (NaN) takes no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.errors import InvalidValue
+
+Floats = NDArray[np.float64]
+_MOST_PIXELS: Final = 4096
+"""Robust fits look at so many pixels at most, spread over the scan."""
+_ROUNDS: Final = 50
+_TRIALS: Final = 200
+_HUBER: Final = 1.345
+_MAD: Final = 1.4826
+"""From the median of absolute deviations to a standard deviation."""
+
+
+def levelled(values: Floats, order: int = 1, fit: str = "least-squares", quantile: float = 0.5) -> Floats:
+    """Return the values without the polynomial surface that fits them best.
+
+    Args:
+        values: [y, x]; NaN where nothing was measured.
+        order: 0 for a height, 1 for a plane, 2 and 3 for curved surfaces.
+        fit: "least-squares", or one that outliers such as particles and steps do not lead astray: "huber",
+            "theil-sen" (medians of many small fits), "ransac" (the most pixels that agree), "quantile".
+        quantile: of "quantile": which part of the pixels lies below the surface; a small one finds a substrate.
+
+    Raises:
+        InvalidValue: there is no such fit or order, or too little was measured.
+    """
+    if fit not in FITS:
+        raise InvalidValue(f"there is no fit {fit!r}", hint=f"one of {', '.join(sorted(FITS))}")
+    if order not in range(4) or not 0.0 < quantile < 1.0:
+        raise InvalidValue(
+            f"order {order}, quantile {quantile}", hint="an order from 0 to 3, a quantile between 0 and 1"
+        )
+    terms = _terms(values.shape, order)
+    known = np.isfinite(values)
+    if known.sum() < 2 * len(terms):
+        raise InvalidValue("too little was measured to level it")
+    columns, heights = terms[:, known].T, values[known]
+    scale = float(np.ptp(heights)) or 1.0  # heights are nanometres: in units of their range, limits hold for all
+    solve = partial(_quantile, quantile=quantile) if fit == "quantile" else FITS[fit]
+    coefficients = solve(columns, (heights - heights.mean()) / scale)
+    surface: Floats = np.tensordot(coefficients, terms, 1) * scale + heights.mean()
+    return values - surface
+
+
+def _terms(shape: tuple[int, ...], order: int) -> Floats:
+    """[term, y, x]: 1, x, y, x² … up to the order."""
+    y, x = (np.linspace(-1.0, 1.0, count) for count in shape)
+    powers = [(i, j) for total in range(order + 1) for i in range(total + 1) for j in [total - i]]
+    return np.stack([np.outer(y**j, x**i) for i, j in powers])
+
+
+def _least_squares(columns: Floats, heights: Floats) -> Floats:
+    found = np.linalg.lstsq(columns, heights, rcond=None)[0]
+    return np.asarray(found, dtype=np.float64)
+
+
+def _weighted(columns: Floats, heights: Floats, weights: Floats) -> Floats:
+    root = np.sqrt(weights)
+    return _least_squares(columns * root[:, None], heights * root)
+
+
+def _reweighted(columns: Floats, heights: Floats, weigh: Callable[[Floats], Floats]) -> Floats:
+    """Iteratively reweighted least squares."""
+    columns, heights = _few(columns, heights)
+    coefficients = _least_squares(columns, heights)
+    for _ in range(_ROUNDS):
+        before, coefficients = coefficients, _weighted(columns, heights, weigh(heights - columns @ coefficients))
+        if np.allclose(before, coefficients, rtol=0.0, atol=1e-9):
+            break
+    return coefficients
+
+
+def _huber(columns: Floats, heights: Floats) -> Floats:
+    def weigh(residuals: Floats) -> Floats:
+        sigma = max(_MAD * float(np.median(np.abs(residuals))), 1e-9)
+        return np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(residuals), 1e-12))
+
+    return _reweighted(columns, heights, weigh)
+
+
+def _quantile(columns: Floats, heights: Floats, quantile: float) -> Floats:
+    def weigh(residuals: Floats) -> Floats:
+        return np.where(residuals > 0.0, quantile, 1.0 - quantile) / np.maximum(np.abs(residuals), 1e-4)
+
+    return _reweighted(columns, heights, weigh)
+
+
+def _samples(columns: Floats, heights: Floats) -> Floats:
+    """Exact fits, [trial, term], each through as few pixels as it takes; the choice is always the same."""
+    chance = np.random.default_rng(0)
+    rows = [chance.choice(len(heights), columns.shape[1], replace=False) for _ in range(_TRIALS)]
+    return np.array([_least_squares(columns[row], heights[row]) for row in rows])
+
+
+def _theil_sen(columns: Floats, heights: Floats) -> Floats:
+    """After Theil and Sen: the median of what small samples say, term by term, and then of the height."""
+    columns, heights = _few(columns, heights)
+    coefficients = np.median(_samples(columns, heights), axis=0).astype(np.float64)
+    coefficients[0] += np.median(heights - columns @ coefficients)
+    return coefficients
+
+
+def _ransac(columns: Floats, heights: Floats) -> Floats:
+    """The surface that most pixels agree with, to within their scatter about the best median; fitted to those."""
+    columns, heights = _few(columns, heights)
+    residuals = np.abs(heights - _samples(columns, heights) @ columns.T)
+    limit = max(2.5 * _MAD * float(np.median(residuals, axis=1).min()), 1e-9)
+    inliers = residuals[(residuals <= limit).sum(axis=1).argmax()] <= limit
+    return _least_squares(columns[inliers], heights[inliers])
+
+
+def _few(columns: Floats, heights: Floats) -> tuple[Floats, Floats]:
+    step = max(1, len(heights) // _MOST_PIXELS)
+    chosen = np.random.default_rng(1).permutation(len(heights))[::step] if step > 1 else slice(None)
+    return columns[chosen], heights[chosen]
+
+
+FITS: Final[dict[str, Callable[..., Floats]]] = {  # from the terms, [pixel, term], and the heights to coefficients
+    "least-squares": _least_squares,
+    "huber": _huber,
+    "quantile": _quantile,
+    "theil-sen": _theil_sen,
+    "ransac": _ransac,
+}

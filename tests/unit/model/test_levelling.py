@@ -1,0 +1,63 @@
+"""Levelling: a tilted or curved substrate is flat afterwards, particles or not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from afspm.errors import InvalidValue
+from afspm.model import Region, Scan
+from afspm.model.levelling import FITS
+
+SHAPE = (48, 64)
+Y, X = np.meshgrid(np.linspace(-1, 1, SHAPE[0]), np.linspace(-1, 1, SHAPE[1]), indexing="ij")
+PARTICLES = ((X - 0.3) ** 2 + (Y + 0.2) ** 2 < 0.15) | ((X + 0.6) ** 2 + (Y - 0.5) ** 2 < 0.05)
+
+
+def scan(values: np.ndarray) -> Scan:
+    return Scan(Region((0.0, 0.0), (1e-6, 0.75e-6)), "Height", "m", values)
+
+
+def substrate(order: int) -> np.ndarray:
+    noise = np.random.default_rng(0).normal(0.0, 0.05, SHAPE)
+    curved = 8.0 * X * X - 5.0 * X * Y if order > 1 else 0.0
+    return 1e-9 * (40.0 + 20.0 * X - 12.0 * Y + curved + noise)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("fit", sorted(FITS))
+def test_a_substrate_is_flat_afterwards(fit: str, order: int) -> None:
+    flat = scan(substrate(order)).levelled(order, fit).values
+    assert np.abs(flat).max() < 1e-9
+    assert abs(np.median(flat)) < 0.1e-9
+
+
+@pytest.mark.parametrize("fit", sorted(set(FITS) - {"least-squares"}))
+def test_particles_do_not_lead_a_robust_fit_astray(fit: str) -> None:
+    values = substrate(1) + 30e-9 * PARTICLES
+    flat = scan(values).levelled(1, fit, 0.4).values
+    assert flat[~PARTICLES].std() < 0.35e-9
+    assert flat[PARTICLES].mean() - flat[~PARTICLES].mean() == pytest.approx(30e-9, rel=0.03)
+    plain = scan(values).levelled(1).values
+    assert plain[~PARTICLES].std() > 3.0 * flat[~PARTICLES].std()
+
+
+def test_what_was_not_measured_stays_so_and_takes_no_part() -> None:
+    values = substrate(1)
+    values[30:] = np.nan
+    flat = scan(values).levelled().values
+    assert np.isnan(flat[30:]).all()
+    assert np.abs(flat[:30]).max() < 1e-9
+
+
+def test_a_scan_of_one_height_is_level() -> None:
+    assert np.abs(scan(np.full(SHAPE, 7e-9)).levelled(1, "huber").values).max() < 1e-20
+
+
+def test_what_can_not_be_levelled_is_refused() -> None:
+    with pytest.raises(InvalidValue, match="no fit 'median'"):
+        scan(substrate(1)).levelled(1, "median")
+    with pytest.raises(InvalidValue, match="order 7"):
+        scan(substrate(1)).levelled(7)
+    with pytest.raises(InvalidValue, match="too little"):
+        scan(np.full(SHAPE, np.nan)).levelled()

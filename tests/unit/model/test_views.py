@@ -1,0 +1,46 @@
+"""Scans drawn with matplotlib, and given to and taken from sidpy."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from afspm.errors import InvalidValue
+from afspm.model import Region, Scan
+
+mpl.use("Agg")
+VALUES = np.arange(12.0).reshape(3, 4) * 1e-9
+SCAN = Scan(Region((1e-6, 2e-6), (3e-7, 2e-7), 0.1), "Height", "m", VALUES, 1_750_000_000_123_456_000, "a.sxm")
+
+
+@pytest.mark.parametrize("kind", ["image", "contour", "surface"])
+def test_a_scan_is_drawn_where_it_is(kind: str) -> None:
+    axes = SCAN.plot(kind)
+    assert axes.get_xlim() == pytest.approx((850, 1150), abs=60)
+    assert axes.get_ylim() == pytest.approx((1900, 2100), abs=60)
+    axes.figure.canvas.draw()
+    mpl.pyplot.close(axes.figure)
+
+
+def test_what_can_not_be_drawn_is_refused() -> None:
+    with pytest.raises(InvalidValue, match="'map'"):
+        SCAN.plot("map")
+    with pytest.raises(InvalidValue, match="no values"):
+        Scan(SCAN.region, "Height", "m", np.full((3, 4), np.nan)).plot()
+
+
+def test_a_scan_is_the_same_after_a_way_through_sidpy() -> None:
+    pytest.importorskip("sidpy", reason="sidpy, a gigabyte, is not installed")
+    dataset = SCAN.to_sidpy()
+    assert dataset.shape == (4, 3)
+    assert (dataset.data_type.name, dataset.quantity, dataset.units) == ("IMAGE", "Height", "m")
+    assert dataset.x.values[[0, -1]] == pytest.approx((850e-9, 1150e-9))
+    assert float(dataset[3, 0]) == VALUES[0, 3]
+    back = Scan.from_sidpy(dataset)
+    assert np.array_equal(back.values, VALUES)
+    assert (back.channel, back.unit, back.filename) == ("Height", "m", "a.sxm")
+    assert back.region.center_m == pytest.approx(SCAN.region.center_m)
+    assert back.region.angle_rad == 0.1
+    assert back.time_ns is not None
+    assert abs(back.time_ns - (SCAN.time_ns or 0)) < 1_000_000
