@@ -241,6 +241,7 @@ class VendorBench(Generic[Emulated]):
         self.clock = ExperimentClock.starting_now(speed=speed)
         self.data = folder / self.data_name
         self._said = Said()
+        stack.callback(lambda: print(self._said.text))  # noqa: T201 (shown of a test that failed)
         self._emulator_settings: dict[str, Any] = {"port": FreePorts().take(), "surface": "steps", **emulator}
         self._controller = stack.enter_context(ExitStack())
         self.start_controller_again()

@@ -26,6 +26,6 @@ class Bench(VendorBench[Emulated]):
     def __init__(self, folder: Path, stack: ExitStack, speed: float, emulator: dict[str, Any]) -> None:
         if emulator.get("transport") == "shm" and not sys.platform.startswith("linux"):
             pytest.skip("Gxsm4's shared memory is there on Linux alone")
-        self.settings = {**PATIENT, "result_timeout_s": 2.0 * speed}
+        self.settings = {**PATIENT, "result_timeout_s": 8.0 * speed}
         block = f"afspm_test_{os.getpid()}_{id(self)}"
         super().__init__(folder, stack, speed, {"block": block, **emulator})

@@ -237,7 +237,8 @@ class Activity:
 
     def _end(self, what: str) -> None:
         if what != SCAN:
-            self._harvest.end(self._clock.now_ns())
+            now_ns = self._clock.now_ns()
+            self._harvest.end(now_ns, now_ns)
             return
         is_whole = self._is_whole()
         if is_whole and self._saves:
@@ -246,7 +247,8 @@ class Activity:
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
         # only now: before, GXSM may still tell of the folder of the scan before
-        self._harvest.end(self._ended_ns, self._channels(), self._folder(), is_whole=is_whole)
+        channels, folder = self._channels(), self._folder()
+        self._harvest.end(self._ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
     def _is_whole(self) -> bool:
         """Return whether the scan that has ended came to its end, as far as GXSM's memory tells."""

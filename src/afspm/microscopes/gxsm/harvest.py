@@ -97,9 +97,15 @@ class Harvest(Measurements):
         self._begins(what, {**facts, **taken})
 
     def end(
-        self, now_ns: int, channels: Iterable[str] = (), folder: Path | None = None, *, is_whole: bool = True
+        self,
+        end_ns: int,
+        now_ns: int,
+        channels: Iterable[str] = (),
+        folder: Path | None = None,
+        *,
+        is_whole: bool = True,
     ) -> None:
-        """It has ended.
+        """It has ended, and its files are awaited from now on.
 
         Args:
             channels: where GXSM says that it saves each channel of a scan.
@@ -107,12 +113,13 @@ class Harvest(Measurements):
             is_whole: a scan came to its last row.
         """
         paths = [Path(path) for path in channels]
-        until_s = now_ns / NS_PER_S + self._patience_s
-        self._ends({"end_ns": now_ns, "until_s": until_s, "channels": sorted(endings(paths))})
+        now_s = now_ns / NS_PER_S
+        awaited = {"soon_s": now_s + self._soon_s, "until_s": now_s + self._patience_s}
+        self._ends({"end_ns": end_ns, **awaited, "channels": sorted(endings(paths))})
         ended = self._kept["ended"]
         if folder is not None and str(folder) != ended["folder"]:  # old scans in there are told by when they began
             ended["folder"] = str(folder)
-            ended["begun_ns"] = ended["begun_ns"] or now_ns
+            ended["begun_ns"] = ended["begun_ns"] or end_ns
         self._sizes, self._whole, self._before = {}, {}, set()
         if not is_whole:
             self._give_up("it was stopped, or never began: GXSM still has the scan before in its first or last row")
@@ -198,8 +205,7 @@ class Harvest(Measurements):
     def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
         """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
         missing = set(ended["channels"]) - endings(files).keys()
-        soon_s = ended["end_ns"] / NS_PER_S + self._soon_s
-        return not missing or (missing <= set(self._kept["absent"]) and now_s >= soon_s)
+        return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
 
     def _missing(self, ended: Mapping[str, Any]) -> str:
         folder = _folder(ended)
