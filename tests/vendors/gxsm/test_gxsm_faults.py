@@ -237,7 +237,7 @@ KINDS: list[dict[str, Any]] = [{"version": 3}, {}, SHM, {"card": "RPSPMC"}, {"ca
 @pytest.mark.parametrize("kind", KINDS, ids=["gxsm3", "gxsm4", "shm", "rpspmc", "simulator"])
 def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: dict[str, Any], saving: str) -> None:
     """GXSM keeps, and saves, the scan before in the rows that it did not come to, and nothing says so."""
-    made = bench(speed=5.0, **kind)
+    made = bench(speed=1.0, **kind)
     peer = small(made, saving=saving)
     if kind.get("card") == "simulator":
         assert peer.set("x-pixel-rate", 1000).ok
@@ -259,7 +259,7 @@ def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: di
     ids=["frame", "fewer-rows", "fewer-columns", "more-columns", "more-rows"],
 )
 def test_the_rows_of_another_frame_are_known_as_old_too(bench: Make, region: Region, shape: tuple[int, int]) -> None:
-    made = bench(speed=5.0)
+    made = bench(speed=1.0)
     peer = small(made)
     scanned(peer)
     assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, "")).ok
@@ -281,7 +281,7 @@ def test_a_scan_stopped_in_its_first_line_is_told_as_broken_off(bench: Make) -> 
 
 def test_a_first_scan_that_is_stopped_is_told_as_broken_off(bench: Make) -> None:
     """There was none before: its file has zeros."""
-    made = bench(speed=5.0)
+    made = bench(speed=1.0)
     peer = small(made)
     stopped_at_panel(made, peer)
     made.until_said("lacks lines")
@@ -290,7 +290,7 @@ def test_a_first_scan_that_is_stopped_is_told_as_broken_off(bench: Make) -> None
 @pytest.mark.parametrize("seen", [True, False])
 def test_a_scan_begun_and_stopped_at_the_panel_is_told_as_broken_off(bench: Make, seen: bool) -> None:
     """Also if the translator has not seen the scan before."""
-    made = bench(speed=5.0)
+    made = bench(speed=1.0)
     peer = small(made)
     scanned(peer)
     if not seen:
@@ -307,7 +307,7 @@ def test_a_scan_begun_and_stopped_at_the_panel_is_told_as_broken_off(bench: Make
 
 
 def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Make) -> None:
-    made = bench(speed=5.0)
+    made = bench(speed=1.0)
     peer = small(made)
     scanned(peer)
     assert peer.act(names.START_SCAN).ok
