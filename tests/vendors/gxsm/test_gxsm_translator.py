@@ -142,13 +142,15 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
     assert len(list(made.data.glob("*.nc"))) == 8
 
 
-@pytest.mark.parametrize(("version", "live_lines_s"), [(3, 1.0), (4, 1.0), (4, 0.05)])
-def test_lines_come_while_it_scans(bench: Make, version: int, live_lines_s: float) -> None:
+@pytest.mark.parametrize(
+    ("version", "live_lines_s", "speed", "rows"), [(3, 1.0, 5.0, 40), (4, 1.0, 5.0, 40), (4, 0.05, 1.0, 8)]
+)
+def test_lines_come_while_it_scans(bench: Make, version: int, live_lines_s: float, speed: float, rows: int) -> None:
     """Of the second scan on: only files tell what channels are called. Before its first line is in, GXSM tells of the
     scan before."""
-    made = bench(speed=5.0, version=version)
+    made = bench(speed=speed, version=version)
     peer = made.start(live_lines_s=live_lines_s)
-    ready(peer, shape=(40, 32))
+    ready(peer, shape=(rows, 32))
     assert peer.act(names.START_SCAN).ok
     assert not any(isinstance(one, ScanLines) for one in peer.until(FREE))
     assert peer.act(names.START_SCAN).ok
@@ -156,7 +158,7 @@ def test_lines_come_while_it_scans(bench: Make, version: int, live_lines_s: floa
     for whole in scans(heard):
         lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == whole.channel]
         assert len(lines) >= 2
-        assert lines[0].first_row + len(lines[0].values) == 40, "the highest first"
+        assert lines[0].first_row + len(lines[0].values) == rows, "the highest first"
         picture = None
         for one in lines:
             assert (one.unit, one.region) == (whole.unit, whole.region)
