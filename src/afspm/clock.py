@@ -149,6 +149,14 @@ def _shared_bytes(real_ns: int, shown_ns: int, *until_ns: int) -> bytes:
     return told + _CHECKSUM.pack(zlib.crc32(told))
 
 
+def _waiting_in(path: str | None) -> WaitingTime | None:
+    """Return the time that is shared in a file; None where that is gone with its run, or was cut off."""
+    try:
+        return WaitingTime(Path(path)) if path else None
+    except (OSError, ValueError):
+        return None
+
+
 @dataclass(frozen=True)
 class ExperimentClock:
     """experiment time = start + (real time - origin) · speed.
@@ -194,8 +202,7 @@ class ExperimentClock:
                     hint="set waits = false where the scheduler is started",
                 )
             return cls(*told)
-        waiting = WaitingTime(Path(waits)) if waits and Path(waits).exists() else None  # gone with its run
-        return cls(*told, float(values["wall_at_zero_s"]), waiting)
+        return cls(*told, float(values["wall_at_zero_s"]), _waiting_in(waits))
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON has it, for the other processes of the run."""

@@ -171,3 +171,10 @@ def test_who_is_killed_while_writing_stops_nobody(tmp_path: Path) -> None:
     with clock.late():  # writes it anew
         pass
     assert ExperimentClock.from_dict(clock.as_dict()).now_ns() >= before_ns
+
+
+def test_a_file_that_a_power_cut_has_emptied_stops_nobody(tmp_path: Path) -> None:
+    waiting = ExperimentClock.starting_now(speed=10.0).waiting_in(tmp_path / "clock")
+    told = waiting.as_dict()
+    (tmp_path / "clock").write_bytes(b"")
+    assert ExperimentClock.from_dict(told).speed == 10.0

@@ -305,7 +305,7 @@ class Writer:
         now_s, sure_ns = self._clock.monotonic_s(), None
         if not self._recorded or now_s >= self._recorded[-1][0] + QUIET_S:
             self._recorded.append((now_s, recorded_ns))
-        while self._recorded[0][0] <= now_s - SURE_S:
+        while self._recorded and self._recorded[0][0] <= now_s - SURE_S:
             sure_ns = self._recorded.popleft()[1]
         return sure_ns
 

@@ -94,7 +94,7 @@ class Shadow:
     def copy(self, into: Path) -> list[tuple[Path, str]]:
         """What the folder would be after a power cut, in another; returns each file with the name of its content."""
         copied = []
-        for known in [*self._names.iterdir()]:
+        for known in [known for known in self._names.iterdir() if not known.name.startswith(".")]:
             told = json.loads(known.read_text())
             folder = into / Path(told["folder"]).relative_to(self._folder)
             folder.mkdir(parents=True, exist_ok=True)

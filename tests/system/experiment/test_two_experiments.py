@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def test_who_means_another_run_is_refused_by_this_one(run: Run, tmp_path: Path) 
     assert facts["run"] == facts["guest"]["run"]
     facts["run"] = facts["guest"]["run"] = "0123456789abcdef"
     other = tmp_path / "other"
-    other.mkdir()
+    shutil.copytree(first.folder / "state", other / "state")  # the key that guests have
     (other / "run.json").write_text(json.dumps(facts), encoding="utf-8")
     with pytest.raises(ConfigError, match="of another run"), afspm.connect(other) as scope:
         scope.get("scan-speed")

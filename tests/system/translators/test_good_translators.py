@@ -48,6 +48,7 @@ component = true
 class = "DriftCompensatedScheduler"
 """
 SCHEDULER = """
+security = {{ plain = true }}
 router_url = "{router}"
 publish_url = "{publish}"
 

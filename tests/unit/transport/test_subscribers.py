@@ -23,7 +23,7 @@ ANY = "tcp://127.0.0.1:0"
 CLOCK = ExperimentClock.real()
 MB = 2**20
 MOST_WAITING, SCAN = 64 * MB, 4 * MB
-SOON_S = 3.0  # earlier than anything else disconnects it
+SOON_S = 10.0
 
 
 class Lab:

@@ -29,6 +29,9 @@ MOVED_S = 60.0
 _STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 
 
+_ANSWERS = "a scheduler that answers (of a run that goes on: one with `[security] plain = true`)"
+
+
 class Bench:
     """A component of a kind of its own: it is told everything, and hides nothing.
 
@@ -62,7 +65,7 @@ class Bench:
             Lost: that could not be.
         """
         try:
-            self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, "a scheduler that answers")
+            self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, _ANSWERS)
             self.wait(
                 lambda: self.story.newest(ScopeStatus) is not None, STARTED_S, "a ScopeStateMsg of the translator"
             )
