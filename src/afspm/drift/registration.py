@@ -88,6 +88,19 @@ class Matches:
 
 
 @dataclass(frozen=True, eq=False)
+class LinearSeen:
+    """A linear part as the scans alone tell it, where `Registration.linear` may be what is likely.
+
+    Attributes:
+        linear: (2, 2).
+        covariance: (4, 4) of its elements, row by row.
+    """
+
+    linear: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Registration:
     """A feature at `x` of the reference is found at `x + displacement_m + linear @ (x - center_m)` in the scan, both in
     tip coordinates.
@@ -101,6 +114,7 @@ class Registration:
         center_m: (2,) where the displacement holds, in tip coordinates of the reference: the middle of the overlap.
         quality: figures of merit by name (overlap, correlation, …), for a person and for studies.
         matches: of estimators that match features.
+        linear_seen: of estimators that know how uncertain the linear part is.
     """
 
     accepted: bool
@@ -111,6 +125,7 @@ class Registration:
     center_m: Array
     quality: Table[str, float] = field(default_factory=dict)
     matches: Matches | None = None
+    linear_seen: LinearSeen | None = None
 
     @classmethod
     def refused(cls, reason: str, quality: Table[str, float] | None = None) -> Registration:

@@ -30,6 +30,12 @@ class Waves:
         height = self._height_m[:, None]
         return (height * np.cos(column)).T @ np.cos(row) - (height * np.sin(column)).T @ np.sin(row)
 
+    def at_points(self, xy_m: Array) -> Array:
+        """At points (..., 2), wherever they lie."""
+        phase = xy_m @ self._k + self._phase
+        height: Array = np.cos(phase) @ self._height_m
+        return height
+
 
 def scanned(
     surface: Waves,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from afspm.drift.estimators import READY_MADE, Guarded, estimator
-from afspm.drift.registration import DriftScan, Prior, Registration
+from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
 from afspm.errors import ConfigError
 from afspm.model import Region
 
@@ -71,6 +71,11 @@ def test_what_is_right_passes_untouched() -> None:
         (replace(FOUND, linear=np.diag([-2.0, 0.0])), "mirrored"),
         (replace(FOUND, linear=np.diag([-1.0, 0.0])), "mirrored or flat"),
         (replace(FOUND, linear=np.diag([0.0, 1.5])), "stretched by 2.5"),
+        (replace(FOUND, linear_seen=np.zeros((2, 2))), "no LinearSeen"),
+        (replace(FOUND, linear_seen=LinearSeen(np.zeros((2, 2)), np.eye(2))), "shapes (2, 2) and (4, 4)"),
+        (replace(FOUND, linear_seen=LinearSeen(np.full((2, 2), np.nan), np.eye(4))), "finite"),
+        (replace(FOUND, linear_seen=LinearSeen(np.zeros((2, 2)), -np.eye(4))), "covariance that can't be"),
+        (replace(FOUND, linear_seen=LinearSeen(np.diag([0.0, 1.5]), np.eye(4))), "stretched by 2.5"),
         (replace(FOUND, displacement_m=np.array([-1.1e-6, 0.0])), "share nothing"),
     ],
 )

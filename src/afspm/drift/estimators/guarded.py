@@ -8,7 +8,7 @@ import numpy as np
 
 from afspm.drift.mapping import unlike_drift
 from afspm.drift.overlap import overlap_ratio
-from afspm.drift.registration import DriftScan, Estimator, Prior, Registration
+from afspm.drift.registration import DriftScan, Estimator, LinearSeen, Prior, Registration
 
 
 class Guarded:
@@ -61,7 +61,23 @@ def _wrong(found: object) -> str:
     largest = np.abs(covariance).max()
     if np.abs(covariance - covariance.T).max() > 1e-6 * largest or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         return f"accepted with a covariance that can't be: {covariance.tolist()}"
-    return ""
+    return _wrong_linear(found.linear_seen)
+
+
+def _wrong_linear(seen: object) -> str:
+    """What makes a linear part with its covariance unusable; empty for nothing, and for None."""
+    if seen is None:
+        return ""
+    if not isinstance(seen, LinearSeen):
+        return f"linear_seen is a {type(seen).__name__} and no LinearSeen"
+    linear, covariance = np.asarray(seen.linear), np.asarray(seen.covariance)
+    if (linear.shape, covariance.shape) != ((2, 2), (4, 4)) or not (
+        np.isfinite(linear).all() and np.isfinite(covariance).all()
+    ):
+        return "linear_seen has no finite matrices of shapes (2, 2) and (4, 4)"
+    if np.linalg.eigvalsh((covariance + covariance.T) / 2)[0] < 0.0:
+        return f"linear_seen has a covariance that can't be: {covariance.tolist()}"
+    return unlike_drift(np.eye(2) + linear)
 
 
 def _impossible(found: Registration, reference: DriftScan, scan: DriftScan) -> str:

@@ -18,6 +18,7 @@ from afspm.drift.trackers.forecast import BankForecast
 from afspm.drift.trackers.pairs import AGREEMENT, Comparison, Measured, Newest, agreeing
 from afspm.drift.trackers.references import Reference, References
 from afspm.drift.trackers.settings import BankSettings
+from afspm.drift.trackers.similarity import Measurement, Similarity
 from afspm.drift.tracking import Forecast, Prediction, Update
 from afspm.errors import InvalidValue
 
@@ -44,6 +45,8 @@ class BankTracker:
     is found again when a scan has a place; those adrift are then put right with it. A scan that can be compared with
     none, a zoom into an overview, begins a row of its own.
 
+    With the transform "similarity", scans are straightened before all that: see `Similarity`.
+
     Args:
         estimator: gets what is expected as prior.
         settings: fields of `BankSettings` and `Choice`.
@@ -57,6 +60,7 @@ class BankTracker:
         self._estimator = estimator
         self._references = References(choice)
         self._filters: Filters | None = None
+        self._similarity: Similarity | None = None
         self._newest_s: float | None = None
         self._compensation = Compensation()
         self._scans = 0
@@ -79,10 +83,15 @@ class BankTracker:
         self._scans += 1
         if self._filters is None:
             return self._first(scan)
+        if self._similarity is not None:
+            since_s = scan.mid_s - self._filters.time_s
+            self._similarity = self._similarity.moved(self._settings.linear_walk_per_s * since_s)
+            scan = self._similarity.straightened(scan)
         followed_m = self._compensation.followed_m(self._filters.time_s, scan.mid_s)
         filters = self._filters.moved(scan.mid_s, followed_m)
         before = self._known(filters)
-        newest = Newest(scan, self._turned(filters, scan), self._compensation.velocity_m_s(scan.mid_s))
+        compensated_m_s = self._compensation.velocity_m_s(scan.mid_s)
+        newest = Newest(scan, self._turned(filters, scan), compensated_m_s, self._similarity)
         anywhere = self._lost or self._is_blind(newest)
         tried = self._tried(newest, anywhere=anywhere)
         registrations = {self._references.kept[number].scan.key: found for number, found in tried.items()}
@@ -105,7 +114,7 @@ class BankTracker:
             lost=self._lost,
             registrations=registrations,
             forecast=self._forecast,
-            quality={"references": float(len(used.measured) if used else 0)},
+            quality={"references": float(len(used.measured) if used else 0), **self._linear_quality()},
         )
 
     def set_velocity(self, time_s: float, velocity_m_s: ArrayLike, covariance: ArrayLike) -> None:
@@ -119,7 +128,7 @@ class BankTracker:
         velocity = np.asarray(velocity_m_s, dtype=np.float64) + self._compensation.velocity_m_s(time_s)
         noise = np.asarray(covariance, dtype=np.float64)
         self._filters = self._with_velocity(self._filters, time_s, velocity, noise)
-        self._forecast = BankForecast.of(self._filters, self._compensation)
+        self._forecast = self._forecast_of(self._filters)
 
     def compensated(self, time_s: float, velocity_m_s: ArrayLike) -> None:
         """From a time on, the controller moves tip coordinates along with a velocity (2,) by itself.
@@ -144,10 +153,12 @@ class BankTracker:
         position_sd_m = settings.start_px * min(scan.pixel_m)
         self._filters = Filters.start(settings.models(), scan.mid_s, position_sd_m, settings.start_velocity_sd_m_s)
         self._matched_s = scan.mid_s
+        if settings.transform == "similarity":
+            self._similarity = Similarity.at_start(scan)
         now = self._known(self._filters)
         compensated_m_s = self._compensation.velocity_m_s(scan.mid_s)
         self._references.kept.append(Reference(scan, compensated_m_s, anchor=True, used=self._scans))
-        self._forecast = BankForecast.of(self._filters, self._compensation)
+        self._forecast = self._forecast_of(self._filters)
         return Update(
             scan.key, before, now, matched=True, reason="", lost=False, registrations={}, forecast=self._forecast
         )
@@ -233,6 +244,8 @@ class BankTracker:
             self._proven = True
             references.judged({number: number in numbers for number in tried}, self._scans)
             self._vouch(newest, {number: tried[number] for number in tried if tried[number].accepted})
+        if self._similarity is not None:
+            self._similarity = self._straightened(self._similarity, scan, used if placed else None)
         drift_m, drifts_m = _drifts(self._filters)
         adrift = bool(tried) and not placed
         anchor = not adrift and references.needs_anchor(scan, drift_m, drifts_m[:-1])
@@ -241,7 +254,17 @@ class BankTracker:
             self._drop(len(references) - 1)
         while (number := references.superfluous()) is not None:
             self._drop(number)
-        self._forecast = BankForecast.of(self._filters, self._compensation)
+        self._forecast = self._forecast_of(self._filters)
+
+    def _straightened(self, similarity: Similarity, scan: DriftScan, used: Comparison | None) -> Similarity:
+        """With a scan, and with what its registration with the best reference tells of rotation and scale."""
+        best = None if used is None else used.measured[0]
+        if best is None or best.found.linear_seen is None:
+            return similarity.with_scan()
+        pair = self._references.kept[best.link.number].scan, scan
+        seen = Measurement.of(best.found.linear_seen, pair, self._settings.inflation)
+        learned = similarity.learned(best.link.number, seen).with_scan()
+        return learned.straight_about(best.found.center_m + best.found.displacement_m)
 
     def _cut_off(self, filters: Filters, scan: DriftScan) -> Filters:
         """With the present and all that is adrift anywhere, and together: what lies between them is known still."""
@@ -267,6 +290,8 @@ class BankTracker:
         assert self._filters is not None
         del self._references.kept[number]
         self._filters = self._filters.without_scan(number)
+        if self._similarity is not None:
+            self._similarity = self._similarity.without_scan(number)
 
     def _why_not(self, tried: Table[int, Registration], found: Comparison | None, *, adrift: bool) -> str:
         if adrift:
@@ -284,8 +309,15 @@ class BankTracker:
         rarest = self._settings.rarest
         return filters.updated(filters.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
 
+    def _linear_quality(self) -> dict[str, float]:
+        return {} if self._similarity is None else {"linear_sd": self._similarity.sd}
+
+    def _forecast_of(self, filters: Filters) -> BankForecast:
+        straight = None if self._similarity is None else self._similarity.straight
+        return BankForecast.of(filters, self._compensation, straight)
+
     def _known(self, filters: Filters) -> Prediction:
-        return BankForecast.of(filters, self._compensation).at(filters.time_s)
+        return self._forecast_of(filters).at(filters.time_s)
 
     def _limit_m(self, scan: DriftScan) -> float:
         """Half of how far a scan may be off and still be compared."""
@@ -296,6 +328,7 @@ class BankTracker:
     def state(self) -> dict[str, Any]:
         """See `Tracker`."""
         filters = self._filters
+        similarity = {} if self._similarity is None else {"similarity": self._similarity.to_dict()}
         return {
             "kind": "bank",
             "version": VERSION,
@@ -309,15 +342,20 @@ class BankTracker:
             "lost": self._lost,
             "filters": None if filters is None else filters.to_dict(),
             "references": [one.to_dict() for one in self._references.kept],
+            **similarity,
         }
 
     def restore(self, state: Table[str, Any]) -> None:
         """See `Tracker`. Raises InvalidValue for the state of another tracker, or of one with other filters."""
         saving.must_be(state, "bank", VERSION)
-        models, filters = self._settings.models(), None
+        models, filters, similarity = self._settings.models(), None, None
+        if state["filters"] is not None and (self._settings.transform == "similarity") != ("similarity" in state):
+            raise InvalidValue(f"a saved tracker of another transform than {self._settings.transform!r}")
+        if "similarity" in state:
+            similarity = Similarity.from_dict(state["similarity"], len(state["references"]))
         if state["filters"] is not None:
             filters = Filters.from_dict(models, state["filters"])
-        self._filters, self._newest_s = filters, state["newest_s"]
+        self._filters, self._newest_s, self._similarity = filters, state["newest_s"], similarity
         self._compensation = Compensation.from_list(state["compensation"])
         self._scans, self._unmatched = int(state["scans"]), int(state["unmatched"])
         self._doubted_m = None if state["doubted_m"] is None else np.asarray(state["doubted_m"], dtype=np.float64)
@@ -326,7 +364,7 @@ class BankTracker:
         self._references.kept = [Reference.from_dict(one) for one in state["references"]]
         self._forecast = BankForecast.at_start()
         if filters is not None:
-            self._forecast = BankForecast.of(filters, self._compensation)
+            self._forecast = self._forecast_of(filters)
 
 
 def _drifts(filters: Filters) -> tuple[Array, Array]:

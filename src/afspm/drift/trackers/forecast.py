@@ -31,6 +31,7 @@ class BankForecast:
         mean: (n, 4) displacement and velocity of the sample.
         covariance: (n, 4, 4).
         compensation: with which tip coordinates follow the sample.
+        straight: from tip coordinates to those in which the sample is only displaced; None: they are the same.
     """
 
     time_s: float
@@ -39,6 +40,7 @@ class BankForecast:
     mean: Array
     covariance: Array
     compensation: Compensation
+    straight: Mapping | None = None
 
     @classmethod
     def at_start(cls) -> BankForecast:
@@ -47,7 +49,7 @@ class BankForecast:
         return cls(0.0, nothing, np.ones(1), np.zeros((1, 4)), np.zeros((1, 4, 4)), Compensation())
 
     @classmethod
-    def of(cls, filters: Filters, compensation: Compensation) -> BankForecast:
+    def of(cls, filters: Filters, compensation: Compensation, straight: Mapping | None = None) -> BankForecast:
         """What these filters know."""
         likely = filters.weight >= _LEAST_WEIGHT
         models = filters.models
@@ -58,6 +60,7 @@ class BankForecast:
             filters.mean[likely, :4],
             filters.covariance[likely, :4, :4],
             compensation,
+            straight,
         )
 
     def at(self, time_s: float) -> Prediction:
@@ -69,10 +72,14 @@ class BankForecast:
         means[:, 2:] -= self.compensation.velocity_m_s(time_s)
         covariances = transition @ self.covariance @ transition.transpose(0, 2, 1) + gained
         mean, covariance = mixed(self.weight, means, covariances)
-        return Prediction(time_s, Mapping.of_drift(mean[:2]), covariance[:2, :2], mean[2:], covariance[2:, 2:])
+        mapping = Mapping.of_drift(mean[:2])
+        if self.straight is not None:
+            mapping = mapping @ self.straight
+        return Prediction(time_s, mapping, covariance[:2, :2], mean[2:], covariance[2:, 2:])
 
     def to_dict(self) -> dict[str, Any]:
         """See `Forecast`."""
+        straight = {} if self.straight is None else {"straight": self.straight.matrix.tolist()}
         return {
             "kind": "bank",
             "time_s": self.time_s,
@@ -83,6 +90,7 @@ class BankForecast:
             "mean": self.mean.tolist(),
             "covariance": self.covariance.tolist(),
             "compensation": [list(change) for change in self.compensation.changes],
+            **straight,
         }
 
     @classmethod
@@ -91,7 +99,8 @@ class BankForecast:
         arrays = {name: np.array(table[name], dtype=np.float64) for name in _ARRAYS}
         models = Models(arrays.pop("density_m2_s3"), arrays.pop("fading_per_s"), float(table["walk_m2_s"]))
         compensation = Compensation.from_list(table["compensation"])
-        return cls(float(table["time_s"]), models, **arrays, compensation=compensation)
+        straight = Mapping(table["straight"]) if "straight" in table else None
+        return cls(float(table["time_s"]), models, **arrays, compensation=compensation, straight=straight)
 
 
 _ARRAYS = ("density_m2_s3", "fading_per_s", "weight", "mean", "covariance")

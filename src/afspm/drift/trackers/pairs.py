@@ -18,6 +18,7 @@ from afspm.drift.registration import DriftScan, Prior, Registration
 from afspm.drift.shear import delay_per_length_s_m, row_delay_s, slow_axis
 from afspm.drift.trackers.filters import Filters
 from afspm.drift.trackers.references import Reference
+from afspm.drift.trackers.similarity import Similarity
 
 Array = NDArray[np.float64]
 
@@ -59,11 +60,13 @@ class Newest:
 
     Attributes:
         compensated_m_s: (2,) velocity with which tip coordinates follow the sample; the state's is more by that.
+        similarity: rotation and scale, which the scan is straightened by; None: only translations are followed.
     """
 
     scan: DriftScan
     filters: Filters
     compensated_m_s: Array
+    similarity: Similarity | None = None
 
     def link(self, number: int, reference: Reference, center_m: Array, displacement_m: Array) -> Link:
         """For an overlap about a position of the reference."""
@@ -77,6 +80,8 @@ class Newest:
             noise += self._either_way(reference.scan, center_m, number, reference.compensated_m_s)
         else:
             offset += theirs_s * reference.compensated_m_s
+        if self.similarity is not None:
+            noise += self.similarity.lever_m2(number, center_m + displacement_m)
         return Link(number, ours_s or 0.0, theirs_s or 0.0, offset, noise)
 
     def _either_way(self, scan: DriftScan, position_m: Array, number: int | None, compensated_m_s: Array) -> Array:

@@ -14,6 +14,8 @@ from afspm.drift.trackers.motion import Models
 from afspm.drift.trackers.references import Choice
 from afspm.errors import ConfigError
 
+TRANSFORMS = ("translation", "similarity")
+
 
 @dataclass(frozen=True)
 class BankSettings:
@@ -34,6 +36,8 @@ class BankSettings:
         doubt: chi2 above which a result is not believed before the next scan says so too.
         second_looks: references that are searched without an expectation where none was found where it was expected.
         lost_after: scans in a row that should have matched something and did not.
+        transform: "translation"; or "similarity": rotation and scale are estimated as well.
+        linear_walk_per_s: variance that the angle (rad) and the logarithm of the scale gain in a second.
     """
 
     densities_m2_s3: tuple[float, ...] = (1e-26, 1e-25, 1e-24, 1e-23, 1e-22, 1e-21)
@@ -49,12 +53,20 @@ class BankSettings:
     doubt: float = 36.0
     second_looks: int = 2
     lost_after: int = 3
+    transform: str = "translation"
+    linear_walk_per_s: float = 2.8e-10
 
     def __post_init__(self) -> None:
         numbers = (self.walk_m2_s, self.jitter_m, self.start_velocity_sd_m_s, self.start_px, self.rarest, self.doubt)
+        if self.transform not in TRANSFORMS:
+            raise ConfigError(
+                f"the bank knows no transform {self.transform!r}",
+                where="transform",
+                hint=f"one of {', '.join(TRANSFORMS)}",
+            )
         if not (self.densities_m2_s3 and self.fadings_s):
             raise ConfigError("a bank without filters", where="densities_m2_s3, fadings_s")
-        if not min(*numbers, *self.densities_m2_s3, *self.fadings_s) > 0.0:
+        if not min(*numbers, self.linear_walk_per_s, *self.densities_m2_s3, *self.fadings_s) > 0.0:
             raise ConfigError("all settings of the bank are above zero")
         if not (0.0 < self.forget <= 1.0 and self.rarest < 1.0):
             raise ConfigError("weights: forget up to 1, rarest below it", where="forget, rarest")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ from afspm.drift.estimators.least_squares.score import Scorer
 from afspm.drift.estimators.least_squares.search import Correlation, candidates
 from afspm.drift.estimators.least_squares.spectra import FineFilter, shared_information
 from afspm.drift.estimators.least_squares.warp import COUNT, LINEAR, Box, Pair
-from afspm.drift.registration import DriftScan, Prior, Registration
+from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
 
 Array = NDArray[np.float64]
 
@@ -79,24 +79,23 @@ class LeastSquares:
         box = None if start is None else scene.box(start[0][:2])
         if start is None or box is None:
             return Registration.refused("the scans overlap too little")
-        theta, total = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
+        theta, total, seen = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
         if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
             return Registration.refused("no displacement fits: the scans hold nothing in common")
         found = _evidence(scene, box, theta, total, start[1:], expected)
-        return self._registration(theta, total, box, grid, found, expected=prior is not None)
+        registration = self._registration(theta, total, box, grid, found, expected=prior is not None)
+        return replace(registration, linear_seen=_in_m(seen, grid))
 
     def _registration(
         self, theta: Array, total: Array, box: Box, grid: Grid, found: Evidence, *, expected: bool
     ) -> Registration:
-        linear = theta[LINEAR].reshape(2, 2)
         reason = self._limits.reason(found, expected=expected)
         return Registration(
             accepted=not reason,
             reason=reason,
             displacement_m=grid.displacement_m(theta[:2]),
             covariance_m2=grid.to_m @ total[:2, :2] @ grid.to_m.T,
-            # d is given half-way between both scans, and asked for by where a feature is in the reference
-            linear=grid.linear_m(linear @ np.linalg.inv(np.eye(2) - linear / 2)),
+            linear=grid.linear_m(_from_reference(theta[LINEAR].reshape(2, 2))),
             center_m=grid.position_m(box.center - theta[:2] / 2),
             quality=asdict(found),
         )
@@ -121,14 +120,28 @@ def _coarse(scene: Scene, expected: Expected | None) -> tuple[Array, float, floa
 
 def _fine(
     scene: Scene, box: Box, theta: Array, expected: Expected | None, shears: tuple[Array, list[Array]]
-) -> tuple[Array, Array]:
-    """theta and its covariance."""
+) -> tuple[Array, Array, LinearSeen]:
+    """theta and its covariance, and its linear map before what shear is plausible was reckoned with."""
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
     pair = Pair(*scene.splines(values, order=5), box.without_border(BORDER_PX))
     believed = _believed(expected)
     fit = generalised_least_squares(pair, theta, believed, fine)
-    return shear.averaged(fit.theta, covariance(fit, believed), shears[1], shears[0])
+    spread = covariance(fit, believed)
+    seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
+    return *shear.averaged(fit.theta, spread, shears[1], shears[0]), seen
+
+
+def _in_m(seen: LinearSeen, grid: Grid) -> LinearSeen:
+    """The same in tip coordinates, by where a feature is in the reference."""
+    to_m = np.kron(grid.to_m, np.linalg.inv(grid.to_m).T)
+    return LinearSeen(grid.linear_m(_from_reference(seen.linear)), to_m @ seen.covariance @ to_m.T)
+
+
+def _from_reference(linear: Array) -> Array:
+    """A displacement d = A q is given half-way between both scans; here by where a feature is in the reference."""
+    whole: Array = linear @ np.linalg.inv(np.eye(2) - linear / 2)
+    return whole
 
 
 def _believed(expected: Expected | None) -> Believed:
