@@ -15,8 +15,10 @@ from afspm.transport.network import Network
 CONNECTED = int(zmq.EVENT_HANDSHAKE_SUCCEEDED)
 DISCONNECTED = int(zmq.EVENT_DISCONNECTED)
 ACCEPTED = int(zmq.EVENT_ACCEPTED)
-REFUSED = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH)
-"""Of both kinds: the peer has no key, or one that is not known."""
+REFUSED = int(
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
+"""The peer has no key, or one that is not known. One without keys may hang up first, which has no detail."""
 _HEADER = struct.Struct("=hi")
 _numbers = itertools.count()
 

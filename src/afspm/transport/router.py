@@ -217,8 +217,8 @@ class Router:
         if self._keys is not None and not self._has_refused:
             self._has_refused = True
             self._complaints.say(
-                f"refused a connection to {self.address}: it has no key that is known here; programs that know nothing "
-                "of keys are let in by [security] plain = true"
+                f"refused a connection to {self.address}: it has shown no key that is known here; programs that know "
+                "nothing of keys are let in by [security] plain = true"
             )
 
     def _new(self, descriptor: int) -> _Peer:

@@ -150,7 +150,7 @@ def test_an_experiment_whose_disk_hangs_is_steered_and_ended(
         switch = runs.with_name("runs.hangs")
         switch.touch()
         scope.flag("tip-shape-changed")
-        assert scope.wait_until(lambda: scope.state is not ScopeState.SCANNING, timeout_s=10.0)
+        assert scope.wait_until(lambda: scope.state is not ScopeState.SCANNING, timeout_s=30.0)
         one.wait_for("CRITICAL", "the disk has not answered")
         began_s = time.monotonic()
         one.process.send_signal(signal.SIGINT)

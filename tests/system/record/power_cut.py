@@ -37,7 +37,7 @@ from afspm.wire import KILL, decode_packet
 
 CLOCK = ExperimentClock.real()
 DEADLINE_S = 60.0
-LOSS_S = 0.5
+LOSS_S = 1.5
 """What was published so short a time before a power cut may be lost. It is a tenth of a second that is promised; the
 others are for a busy machine."""
 LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"

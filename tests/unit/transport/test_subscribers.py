@@ -126,19 +126,18 @@ def test_much_over_time_disconnects_nobody_who_takes_it(lab: Any, open_: Any, un
     assert lab.events == []
 
 
-def test_no_more_waits_for_a_plain_subscriber_that_takes_nothing_than_may(lab: Any, plain: Any, until: Any) -> None:
+def test_a_plain_subscriber_that_takes_nothing_is_disconnected_when_too_much_waits(
+    lab: Any, plain: Any, until: Any
+) -> None:
     slow = plain(zmq.SUB)
     slow.setsockopt(zmq.RCVHWM, 1)
     slow.subscribe(b"Scan")
     slow.connect(lab.publisher.address)
     lab.publish()
     until(lambda: slow.poll(0), (lab, lab.events))
-    most = 0
     for _ in range(MOST_WAITING // SCAN + 10):
         lab.publish()
-        most = max(most, lab.waiting_bytes())
     until(lambda: DISCONNECTED in lab.events, (lab, lab.events), timeout_s=SOON_S)
-    assert most <= MOST_WAITING + 2 * SCAN + 8 * MB
 
 
 def test_a_connection_may_ask_for_a_replay_a_second_and_some_at_once(open_: Any, plain: Any) -> None:
