@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import mmap
 import struct
+import threading
 import time
+import weakref
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -100,8 +102,10 @@ class WaitingTime:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with path.open("r+b") as file:
-            self._map = mmap.mmap(file.fileno(), _SHARED.size + _CHECKSUM.size)
+        self._file = path.open("r+b")  # stays open: a disk that hangs then hangs nobody who is late
+        weakref.finalize(self, self._file.close)
+        self._turn = threading.Lock()  # of this process, whose threads share the lock of the file
+        self._map = mmap.mmap(self._file.fileno(), _SHARED.size + _CHECKSUM.size)
         self._last: tuple[int, ...] = (0,) * (2 + _MOST_LATE)
 
     def now_ns(self, real_ns: int, speed: float) -> int:
@@ -120,7 +124,7 @@ class WaitingTime:
 
     def _change(self, before_ns: int, after_ns: int, speed: float) -> None:
         """Write one of the times until which somebody is waited for instead of another, and the time that it is now."""
-        with self.path.open("r+b") as file, locked(file):
+        with self._turn, locked(self._file):
             real_ns, (since_ns, shown_ns, *until_ns) = time.monotonic_ns(), self._read()
             shown_ns = _shown_ns((since_ns, shown_ns, *until_ns), real_ns, speed)
             until_ns = [until if until > real_ns else 0 for until in until_ns]

@@ -173,9 +173,9 @@ class Translator:
         self._temporary.end_if_due()
         if self._clock.monotonic_s() >= self._all_at_s:
             self._observe()
-        elif self._status() != self._sequence.said:
+        elif (status := self._status()) != self._sequence.said:
             # what ends a measurement changes nothing of what is in force; what else happens, may
-            self._observe(values=self._sequence.said.state not in MEASURING)
+            self._observe(values=self._sequence.said.state not in MEASURING, status=status)
         for name, payload in self._live.look(self._clock.now_s()):
             self._port.publish(name, payload, self._stamp(1)[0], keep=False)
 
@@ -241,17 +241,20 @@ class Translator:
             self._told_lost = True
             self._publish(ScopeStatus(ScopeState.UNDEFINED))
 
-    def _observe(self, announce: Sequence[str] = (), *, values: bool = True) -> None:
+    def _observe(
+        self, announce: Sequence[str] = (), *, values: bool = True, status: ScopeStatus | None = None
+    ) -> None:
         """Publish what is new.
 
         Args:
             announce: messages to publish even if nothing in them changed.
             values: whether to look at what is in force, too: that takes a question for each parameter.
+            status: as it was just seen: a microscope says once only that something was interrupted. None: it is asked.
         """
         if values:
             self._observe_values(announce)
         # the state first: a result that comes in between then waits for the next look, and is not lost
-        status = self._status()
+        status = self._status() if status is None else status
         is_over = self._sequence.said.state in MEASURING and status.state not in MEASURING
         if is_over:
             self._pace.over(self._clock.monotonic_s())
