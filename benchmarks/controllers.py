@@ -86,6 +86,9 @@ class Answers:
 
     def wake_up(self, incoming: Served | None = None) -> None: ...
 
+    def is_connected(self, connection: bytes) -> bool:
+        return True
+
     def close(self) -> None: ...
 
 
@@ -130,7 +133,7 @@ def controllers() -> Iterator[Row]:
             ):
                 times = []
                 for number in range(REQUESTS):
-                    request = Request(kind, subjects[number % len(subjects)], id=f"{what}/{number}")  # type: ignore[index]
+                    request = Request(kind, subjects[number % len(subjects)], id=f"{what}/{number}")
                     times.append(own_s(made, port, waiting, request))
                     while made.microscope.status().state is not ScopeState.FREE:
                         pass

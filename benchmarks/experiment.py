@@ -132,7 +132,7 @@ def _start_s(_: int) -> float:
         began_s = perf_counter()
         with running() as run:
             subscriber.connect(run.address)
-            if not subscriber.poll(DEADLINE_S * 1000):
+            if not subscriber.poll(round(DEADLINE_S * 1000)):
                 raise TimeoutError("no ScopeState came")
             return perf_counter() - began_s
     finally:

@@ -123,4 +123,4 @@ def picture(side: int, seed: int = 0) -> NDArray[np.float64]:
     """Values that are as hard to compress as those of a real scan."""
     rng = np.random.default_rng(seed)
     rough = rng.normal(size=(side, side)).cumsum(axis=1)
-    return 1e-10 * (rough - np.linspace(0, 1, side)[None, :] * rough[:, -1:])
+    return np.asarray(1e-10 * (rough - np.linspace(0, 1, side)[None, :] * rough[:, -1:]))

@@ -36,7 +36,7 @@ class AsylumFuzzer(Fuzzer[AsylumEmulator]):
         self._count = 0
 
     def _connection(self) -> zmq.Socket[bytes]:
-        connection = self._context.socket(zmq.DEALER)
+        connection: zmq.Socket[bytes] = self._context.socket(zmq.DEALER)
         connection.setsockopt(zmq.LINGER, 0)
         connection.connect(self._address)
         return connection

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+import select
+import signal
 import socket
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,10 @@ from gxsm_bench import Bench
 from raw_clients import MemoryClient, SocketClient, client
 from vendor_bench import DEADLINE_S
 
+from afspm.emulators.emulator import Crashed
+from afspm.emulators.faults import Faults
+from afspm.emulators.gxsm.block import FAULT_KINDS, Block
+from afspm.emulators.gxsm.saving import Saving
 from afspm.files import read
 
 Make = Callable[..., Bench]
@@ -334,7 +341,6 @@ def test_waiting_for_the_simulator_silences_gxsm_for_good(bench: Make) -> None:
     gxsm.ask("waitscan")
     until(made, lambda: made.emulator.silent)
     gxsm.ask("get", "PointsX")
-    until(made, lambda: len(made.emulator.unanswered) == 1)
     made.at_panel(lambda emulator: None)
     assert gxsm.status() == 1
     gxsm.close()
@@ -357,3 +363,92 @@ def test_a_spectrum_and_its_event(bench: Make) -> None:
         assert true is not None
         assert true.position_m == pytest.approx((12e-9, 2e-9))
         np.testing.assert_allclose(content.spectra[0].values[:, 0], true.values[:, 0], rtol=1e-9)
+
+
+def test_only_functions_of_the_module_can_be_called(bench: Make) -> None:
+    with calling(bench(transport="shm")) as gxsm:
+        for method in ("do", "bits", "pixel", "program", "answer", "_get"):
+            with pytest.raises(RuntimeError, match="status -4"):
+                gxsm.call(method)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+def test_arguments_that_c_does_not_convert_are_refused(bench: Make, kind: dict[str, Any]) -> None:
+    made = bench(**kind)
+    with calling(made) as gxsm:
+        for method, *arguments in (
+            ("get_slice", 0.0, 0, 0, 0, 1),
+            ("get_geometry", "0"),
+            ("chfname", 2**63),
+            ("moveto_scan_xy", 2**64, 0),
+            ("set", "RangeX\0", "1"),
+            ("set", "RangeX", "\ud800"),
+        ):
+            with pytest.raises(RuntimeError, match="SystemError" if "transport" not in kind else "status -1"):
+                gxsm.call(method, *arguments)
+        assert gxsm.call("get_slice", 0, 0, 0, -1, 1) == -1
+        assert gxsm.call("get_differentials", 99) == -1
+        assert gxsm.call("moveto_scan_xy", math.nan, 0.0) == -1
+        assert gxsm.call("set", "PointsX", "1e400") == 0
+        assert gxsm.call("get", "PointsX") == 64.0
+
+
+def test_a_scan_that_can_not_be_simulated_does_not_begin(bench: Make) -> None:
+    made = bench(speed=SEEN)
+    with calling(made) as gxsm:
+        small(gxsm)
+        gxsm.call("set", "dsp-fbs-mx0-current-set", "-1")
+        gxsm.call("startscan")
+        assert not bits(gxsm) & 2
+        gxsm.call("set", "dsp-fbs-mx0-current-set", "0.5")
+        gxsm.call("startscan")
+        until(made, lambda: bool(bits(gxsm) & 2))
+
+
+def test_files_are_counted_beyond_three_digits(tmp_path: Path) -> None:
+    saving = Saving(tmp_path, Faults([], {}, 0.0))
+    saving.counted([tmp_path / "scan1000-M-Xp-Topo.nc"])
+    assert saving.counter == 1001
+
+
+@contextmanager
+def answering(folder: Path, value: object) -> Iterator[tuple[Block, MemoryClient]]:
+    """Shared memory, every call of which is answered with a value, once it is taken."""
+    if not sys.platform.startswith("linux"):
+        pytest.skip("Gxsm4's shared memory is there on Linux alone")
+    name = f"afspm_test_{os.getpid()}_{id(value)}"
+    faults = Faults([], FAULT_KINDS, 0.0)
+    block = Block(name, "emulated", folder, faults, lambda: 0.0, lambda call: call.answered(value))
+    client = MemoryClient(f"shm:{name}@{block.pid}")
+    try:
+        yield block, client
+    finally:
+        client.close()
+        block.end()
+
+
+def test_a_result_larger_than_the_memory_is_not_passed_on(tmp_path: Path) -> None:
+    with answering(tmp_path, bytes(1 << 25)) as (block, gxsm):
+        for _ in range(2):
+            gxsm.ask("get_slice")
+            block.take()
+            with pytest.raises(RuntimeError, match="status -1"):
+                gxsm.answer()
+
+
+def test_a_call_written_over_another_does_not_block_its_answer(tmp_path: Path) -> None:
+    with answering(tmp_path, bytes(1 << 23)) as (block, gxsm):
+        gxsm.ask("get_slice")
+        assert select.select([block], [], [], DEADLINE_S)[0]
+        gxsm.ask("set", "x" * (1 << 22))
+        taking = Thread(target=block.take, daemon=True)
+        taking.start()
+        taking.join(DEADLINE_S)
+        assert not taking.is_alive()
+
+
+def test_the_emulator_ends_when_its_process_is_killed(tmp_path: Path) -> None:
+    with answering(tmp_path, None) as (block, _):
+        os.kill(block.pid, signal.SIGKILL)
+        with pytest.raises(Crashed):
+            block.take()

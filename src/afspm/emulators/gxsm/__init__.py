@@ -182,8 +182,11 @@ class GxsmEmulator(Emulator):
             except Silence:
                 self.silent = True
                 return
-            except Exception as error:  # what a script of the user's is to see
+            except (NameError, SystemError) as error:  # what a script of the user's is to see
                 found = error
+            except Exception as error:
+                self.log.exception("%s failed", call.method)
+                found = SystemError(str(error))
             call.answered(found)
 
 

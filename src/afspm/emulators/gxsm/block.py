@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import pickle
 import struct
@@ -13,9 +12,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from afspm.emulators.emulator import Crashed
 from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm.console import Call
+from afspm.emulators.gxsm.signalled import CONTENT, SIZE
 from afspm.errors import ConfigError
+from afspm.microscopes.gxsm import pickles
+from afspm.microscopes.gxsm.errors import BadReply
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "bad-pickle": "shared memory: the result is no pickle",
@@ -63,17 +66,17 @@ class Block:
         return self._process.stdout.fileno()
 
     def take(self) -> None:
-        """One call that has come."""
+        """Post one call that has come. Raises Crashed: somebody has killed the process."""
         frame = self._frame()
         if not frame:
-            return
+            raise Crashed("its process is gone")
         method = frame[:NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
         try:
-            arguments = tuple(_Arguments(io.BytesIO(frame[NAME_BYTES:])).load())
-        except Exception as error:  # whatever a client writes there
+            arguments = pickles.loads(frame[NAME_BYTES:])
+        except BadReply as error:
             self._answer(error)
             return
-        self._post(Call(method, arguments, self._answer))
+        self._post(Call(method, arguments if isinstance(arguments, tuple) else (arguments,), self._answer))
 
     def end(self, *, remains: bool = False) -> None:
         """GXSM is closed.
@@ -109,6 +112,8 @@ class Block:
                 content = pickle.dumps(found, 4)
             except Exception:
                 status = _NOT_PASSED_ON
+        if len(content) > SIZE - CONTENT:
+            status, content = _NOT_PASSED_ON, b""
         length = len(content)
         if self._faults.strikes("code", now_s):
             status = _NOT_PASSED_ON
@@ -126,13 +131,6 @@ class Block:
         with contextlib.suppress(OSError):  # it was killed
             self._process.stdin.write(struct.pack(">I", len(answer)) + answer)
             self._process.stdin.flush()
-
-
-class _Arguments(pickle.Unpickler):
-    """Plain values alone."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        raise pickle.UnpicklingError(f"{module}.{name}")
 
 
 class _Evil:

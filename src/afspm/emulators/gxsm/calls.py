@@ -6,8 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -32,7 +31,32 @@ _VOLT: Final = 532.0
 """Of the scanner, in ångström."""
 
 
-_signature = cache(inspect.signature)  # which takes longer than most calls
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+_LONGS: Final = range(-(2**63), 2**63)
+_FUNCTIONS: dict[str, tuple[Callable[..., Any], inspect.Signature]] = {}
+
+
+def _function(method: _Method) -> _Method:
+    """Offer a method, by its name without the underscore, as a function of the module."""
+    _FUNCTIONS[method.__name__[1:]] = method, inspect.signature(method)  # which takes longer than most calls
+    return method
+
+
+def _converts(value: object, kind: str) -> bool:
+    """Return whether C makes a value of that type of an argument."""
+    if kind == "str":
+        return isinstance(value, str) and "\0" not in value and not any("\ud800" <= one <= "\udfff" for one in value)
+    if kind == "int":
+        return isinstance(value, int) and value in _LONGS
+    return isinstance(value, float) or (isinstance(value, int) and value in _LONGS)
+
+
+def _fits(signature: inspect.Signature, arguments: tuple[Any, ...]) -> bool:
+    """Return whether C takes these arguments."""
+    takes = [*signature.parameters.values()][1:]  # without self
+    needed = sum(one.default is inspect.Parameter.empty for one in takes)
+    kinds = [one.annotation for one in takes]
+    return needed <= len(arguments) <= len(takes) and all(map(_converts, arguments, kinds))
 
 
 class Silence(Exception):
@@ -61,18 +85,16 @@ class Calls:
         Raises:
             Silence. NameError: there is none. Whatever else a user's script would get.
         """
-        function: Callable[..., Any] | None = getattr(self, f"_{method}", None)
-        if method.startswith("_") or function is None or method == "answer":
+        if method not in _FUNCTIONS:
             raise NameError(method)
         now_s = self._program.clock.now_s()
         if self._faults.strikes("error", now_s):
             raise SystemError("an emulated error")
+        function, signature = _FUNCTIONS[method]
+        if not _fits(signature, arguments):
+            raise SystemError(f"<built-in function {method}> returned a result with an exception set")
         try:
-            try:
-                _signature(getattr(Calls, f"_{method}")).bind(self, *arguments)
-            except TypeError as error:
-                raise SystemError(f"<built-in function {method}> returned a result with an exception set") from error
-            found = function(*arguments)
+            found = function(self, *arguments)
         except RigBusy as busy:
             raise SystemError(str(busy)) from busy
         if self._faults.strikes("wrong-type", now_s):
@@ -81,9 +103,11 @@ class Calls:
 
     # --- parameters ---
 
+    @_function
     def _list_refnames(self) -> tuple[str, ...]:
         return self._program.entries.names()
 
+    @_function
     def _list_actions(self) -> tuple[str, ...]:
         program = self._program
         found = ["CHECK-MainAutoSave", "UNCHECK-MainAutoSave", "CHECK-SCAN-REPEAT", "UNCHECK-SCAN-REPEAT"]
@@ -97,22 +121,24 @@ class Calls:
             found += ["GVP_CMD_UP_Z0", "GVP_CMD_DN_Z0"]
         return (*found, *self._feedback_actions)
 
+    @_function
     def _set(self, ref: str, value: str) -> int:
-        if not isinstance(value, str) or not isinstance(ref, str):
-            raise SystemError("<built-in function set> returned a result with an exception set")
         if self._faults.strikes("refused", self._program.clock.now_s()):
             self._program.dialogs.append(f"Valid Range of {ref}")
             return 0
         return self._program.entries.set(ref, value)
 
+    @_function
     def _get(self, ref: str) -> float | str:
         if self._faults.strikes("nan", self._program.clock.now_s()):
             return math.nan
         return self._program.entries.get(ref)
 
+    @_function
     def _gets(self, ref: str) -> str:
         return self._program.entries.gets(ref)
 
+    @_function
     def _action(self, name: str) -> Any:
         program = self._program
         kind, _, switch = name.partition("-")
@@ -149,6 +175,7 @@ class Calls:
 
     # --- what goes on ---
 
+    @_function
     def _rtquery(self, code: str) -> tuple[float, float, float]:
         program = self._program
         now_s = program.clock.now_s()
@@ -191,61 +218,75 @@ class Calls:
             bits += 4 * paused + 8 * probing + 16 * (doing == "move") + 128 * (doing == "approach")
         return bits
 
+    @_function
     def _y_current(self) -> int:
         return self._program.y_current(self._program.clock.now_s())
 
+    @_function
     def _startscan(self) -> int:
         self._program.start_scan()
         return 0
 
+    @_function
     def _stopscan(self) -> int:
         self._program.rig.stop_scan()
         return 0
 
-    def _waitscan(self, *how: int) -> int:
+    @_function
+    def _waitscan(self, how: int = 0) -> int:
         program = self._program
         if program.version == 4 and program.card == "simulator":
             raise Silence("waitscan")
         return -1 if not program.rig.busy(program.clock.now_s()) else self._y_current()
 
+    @_function
     def _autosave(self) -> int:
         self._program.save(self._program.clock.now_s())
         return self._y_current()
 
+    @_function
     def _chfname(self, channel: int) -> str:
         names = self._program.names(self._program.clock.now_s())
-        if not 0 <= channel % 100 < len(names):
+        if channel < 0 or channel % 100 >= len(names):
             return "EE: invalid channel"
         return self._program.shown(names[channel % 100])
 
+    @_function
     def _moveto_scan_xy(self, x: float, y: float) -> float:
-        if isinstance(x, str) or isinstance(y, str):
-            raise SystemError("<built-in function moveto_scan_xy> returned a result with an exception set")
         return self._program.move_tip(float(x), float(y))
 
     # --- data ---
 
+    @_function
     def _get_geometry(self, channel: int) -> tuple[float, ...]:
         x, y, width, height, angle_deg = self._program.last_frame
         return (width, height, x, y, angle_deg)
 
+    @_function
     def _get_dimensions(self, channel: int) -> tuple[int, ...]:
         scan = self._program.last
         return (_NOBODY,) * 4 if scan is None else (scan.shape[1], scan.shape[0], 1, 1)
 
-    def _get_differentials(self, channel: int) -> tuple[float, ...]:
+    @_function
+    def _get_differentials(self, channel: int) -> tuple[float, ...] | int:
+        if not 0 <= channel < len(self._program.channels):
+            return -1
         _, _, width, height, _ = self._program.last_frame
         columns, rows, _, _ = self._get_dimensions(channel)
         return (width / (columns - 1), height / (rows - 1), self._program.channels[channel].dz, 10.0)
 
+    @_function
     def _get_slice(self, channel: int, value: int, time: int, first: int, count: int) -> Any:
         program = self._program
         if program.last is None or not 0 <= channel < len(program.channels):
             return -1
         one = program.channels[channel]
         image = program.image(one)
-        return image[first : first + count].astype(np.float64) * one.dz if first + count <= len(image) else -1
+        if first < 0 or count < 0 or first + count > len(image):
+            return -1
+        return image[first : first + count].astype(np.float64) * one.dz
 
+    @_function
     def _get_probe_event(self, channel: int, nth: int) -> Any:
         program = self._program
         curve = program.rig.spectrum

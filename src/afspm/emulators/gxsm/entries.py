@@ -8,9 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 USER_UNITS: Final = {"Å": 1.0, "nm": 10.0, "µm": 1e4}
 """In ångström."""
-_FLOAT: Final = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_FLOAT: Final = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _ANGSTROM: Final = "Å"
 _PADDING: Final = " " * 4
 _DAC_STEP: Final = 0.422
@@ -80,7 +82,7 @@ class Entries:
         if entry is None:
             return 0
         value = self._atof(text) * self._factor(entry)
-        value = (float(int(value)) if entry.whole else value) or entry.zero
+        value = (float(np.trunc(value)) if entry.whole else value) or entry.zero
         if not entry.low <= value <= entry.high:
             self._dialogs(f"Valid Range of {ref}: {entry.low} to {entry.high}")
             return 0

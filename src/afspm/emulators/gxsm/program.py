@@ -18,6 +18,7 @@ from afspm.emulators.gxsm.entries import Entries, Entry, lengths, simulated_3
 from afspm.emulators.gxsm.saving import Saving
 from afspm.emulators.rig import Rig
 from afspm.emulators.running import RunningScan, RunningSpectrum
+from afspm.errors import InvalidValue
 from afspm.model import Region
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
@@ -172,8 +173,6 @@ class Program:
         if self.rig.busy(now_s) or not self.channels or self.faults.strikes("no-start", now_s):
             return
         entries, columns, rows = self.entries, int(self.entries["PointsX"]), int(self.entries["PointsY"])
-        self._memory = {one: _resized(self.image(one), (rows, columns)) for one in self.channels}
-        self._y_before = self.y_current(now_s)
         region = self.frame()
         self.rig.region, self.rig.shape, self.rig.upwards = region, (rows, columns), False
         if self.card == "simulator":
@@ -182,8 +181,15 @@ class Program:
             self.rig.line_s = _PIXELS_S + len(self.channels) * columns / entries["sim-stm-speed"]
         else:
             self.rig.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
+        try:
+            started = self.rig.start_scan()
+        except InvalidValue as error:
+            self.dialogs.append(str(error))
+            return
+        self._memory = {one: _resized(self.image(one), (rows, columns)) for one in self.channels}
+        self._y_before = self.y_current(now_s)
         self._before, self._own = self.names(now_s), []
-        self.last = self.rig.start_scan()
+        self.last = started
         self.last_frame = tuple(entries[ref] for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY", "Rotation"))  # type: ignore[assignment]
         self._scanning, self._saved = True, False
 
@@ -275,7 +281,8 @@ class Program:
 
     def move_tip(self, x: float, y: float) -> float:
         """Within the frame, in ångström from its centre: 0, or -1 if that is outside."""
-        if abs(x) > self.entries["RangeX"] / 2 * (1 + 1e-9) or abs(y) > self.entries["RangeY"] / 2 * (1 + 1e-9):
+        sides = self.entries["RangeX"], self.entries["RangeY"]
+        if not all(abs(value) <= side / 2 * (1 + 1e-9) for value, side in zip((x, y), sides, strict=True)):
             return -1
         self.entries.put("ScanX", x)
         self.entries.put("ScanY", y)
@@ -296,8 +303,12 @@ class Program:
 
     def take_curve(self, kind: str) -> None:
         """If it can; nobody is told whether."""
-        if not self.rig.busy(self.clock.now_s()):
+        if self.rig.busy(self.clock.now_s()):
+            return
+        try:
             self.curve = self.rig.start_spectrum(kind)
+        except InvalidValue as error:
+            self.dialogs.append(str(error))
 
     def columns(self, curve: RunningSpectrum) -> dict[str, np.ndarray]:
         """As GXSM labels them."""

@@ -51,7 +51,8 @@ class Saving:
 
     def counted(self, files: list[Path]) -> None:
         """A scan was saved: the next has the next number."""
-        self.counter = max((int(file.name[4:7]) for file in files), default=self.counter) + 1
+        numbers = (int(file.name.removeprefix("scan").partition("-")[0]) for file in files)
+        self.counter = max(numbers, default=self.counter) + 1
 
     def write(self, contents: list[tuple[Path, bytes]], now_s: float) -> None:
         """Begin to write files, the last one first."""

@@ -3,7 +3,8 @@
 Run by `block.py` as a script of its own, with the name of the block and of the process; frames of a length and
 content go out to standard output (a call: the function's name, 64 bytes, and the pickled arguments), and come in from
 standard input (a status of 8 bytes, and the pickled result). It ends when that does. A block that is there already is
-taken over as it is, with a request in it that nobody has answered.
+taken over as it is, with a request in it that nobody has answered. One call is passed on at a time: a request that is
+written over another one before that is answered is answered with it.
 """
 
 from __future__ import annotations
@@ -31,13 +32,15 @@ def read(count: int) -> bytes:
     return content
 
 
-def passed_on(memory: mmap.mmap) -> None:
-    """What is asked, if anything."""
-    if struct.unpack_from("<q", memory, STATUS)[0] == 1:
-        length = struct.unpack_from("<I", memory, LENGTH)[0]
-        call = memory[:64] + memory[CONTENT : CONTENT + min(length, SIZE - CONTENT)]
-        sys.stdout.buffer.write(struct.pack(">I", len(call)) + call)
-        sys.stdout.buffer.flush()
+def passed_on(memory: mmap.mmap) -> bool:
+    """Pass on what is asked. Returns whether anything is."""
+    if struct.unpack_from("<q", memory, STATUS)[0] != 1:
+        return False
+    length = struct.unpack_from("<I", memory, LENGTH)[0]
+    call = memory[:64] + memory[CONTENT : CONTENT + min(length, SIZE - CONTENT)]
+    sys.stdout.buffer.write(struct.pack(">I", len(call)) + call)
+    sys.stdout.buffer.flush()
+    return True
 
 
 def answered(memory: mmap.mmap) -> None:
@@ -58,13 +61,16 @@ def run(block: str, name: str) -> None:
     memory = mmap.mmap(descriptor, SIZE)
     sys.stdout.buffer.write(struct.pack(">I", 0))
     sys.stdout.buffer.flush()
+    asked = False
     while True:
-        ready = select.select([0, woken], [], [])[0]
-        if woken in ready:
-            os.read(woken, 4096)
-            passed_on(memory)
+        # while a call is out nothing else is passed on: whoever writes the answer does not read meanwhile
+        ready = select.select([0] if asked else [0, woken], [], [])[0]
         if 0 in ready:
             answered(memory)
+            asked = False
+        if woken in ready:
+            os.read(woken, 4096)
+            asked = passed_on(memory)
 
 
 if __name__ == "__main__":
