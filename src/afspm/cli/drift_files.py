@@ -159,8 +159,7 @@ def _number(value: float) -> str:
 
 def truth_m(found: Series, paths: Sequence[Path]) -> Array | None:
     """(n, 2) what the drift really was, where the scans are those of one simulated run."""
-    truth = true_drift(paths[0]) if len(paths) == 1 else None
-    return None if truth is None else truth(np.array([scan.mid_s for scan in found.scans]))
+    return true_drift(paths[0], found.scans) if len(paths) == 1 else None
 
 
 def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path, console: Console) -> Iterator[Path]:

@@ -137,13 +137,12 @@ class DriftPictures(DriftTable):
         record = DriftRecord.read(folder / self.file).chosen(list(readable))
         told, frames = [told[number] for number in readable], list(readable.values())
         scans = _AsSaved(told, self._scan)
-        truth = true_drift(folder) if self.simulated else None
         run = album.Run(
             scans=scans,
             record=record,
             parts=self._parts(told, record, frames),
             matched=self._matched(told, scans),
-            truth_m=None if truth is None else truth(np.array([frame.mid_s for frame in frames])),
+            truth_m=true_drift(folder, frames) if self.simulated else None,
         )
         title = f"{self.title} (simulated)".strip() if self.simulated else self.title
         for path in album.write(run, folder, title=title):

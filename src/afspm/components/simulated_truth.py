@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.drift.registration import DriftScan
 from afspm.errors import AfspmError, FileError
 from afspm.simulation import World
 
@@ -18,28 +19,29 @@ Array = NDArray[np.float64]
 TRUTH_FILE = "truth.jsonl"
 
 
-def true_drift(run_dir: Path) -> Callable[[Array], Array] | None:
-    """The displacement (n, 2) of the sample at experiment times (n,), in tip coordinates; None where nobody knows it.
+def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
+    """Return by how much the sample was displaced (n, 2) at the centre of each scan, since the first; None if unknown.
 
-    Tip coordinates go along with what the controller follows by itself, which is known at the ends of each scan.
+    It includes what rotation and expansion of the sample displace there. Tip coordinates go along with what the
+    controller follows by itself, which is known at the ends of each scan.
 
     Raises:
         FileError: there is such a file, but it is not one of a simulated run.
     """
     path = run_dir / TRUTH_FILE
-    if not path.exists():
+    if not path.exists() or not scans:
         return None
     try:
         start, followed = _read(path)
         world = World.from_settings(start["settings"], int(start["seed"]), float(start["time_s"]))
     except (OSError, KeyError, ValueError, AfspmError) as error:
         raise FileError(f"does not say what was simulated: {error}", where=str(path)) from error
-
-    def left(time_s: Array) -> Array:
-        moved_m: Array = world.drift_m(time_s)[..., :2]
-        return moved_m - np.stack([np.interp(time_s, followed[:, 0], followed[:, axis]) for axis in (1, 2)], axis=-1)
-
-    return left
+    time_s = np.array([scan.mid_s for scan in scans])
+    tip_m = np.array([scan.region.center_m for scan in scans])
+    followed_m = np.stack([np.interp(time_s, followed[:, 0], followed[:, axis]) for axis in (1, 2)], axis=-1)
+    on_sample_m = world.to_sample(tip_m + followed_m, time_s)
+    at_first_m: Array = world.to_tip(on_sample_m, time_s[0]) - followed_m[0]
+    return tip_m - at_first_m
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Array]:

@@ -1,7 +1,8 @@
-"""Thermal drift: how the sample wanders under the tip.
+"""Thermal drift: how the sample wanders, turns and expands under the tip.
 
 The sign, once and for all: drift is the displacement of the sample, so a feature that was at `x_sample` when the
-experiment started is found at `x_tip = x_sample + drift(t)`.
+experiment started is found at `x_tip = x_sample + drift(t)`. On a sample that turns or expands about a place, that
+holds for this place, and for any other `x_tip = turned(x_sample, t) + drift(t)`.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from afspm.errors import InvalidValue
+from afspm.errors import ConfigError, InvalidValue
 from afspm.simulation import chance
+from afspm.simulation.fields import Array
 from afspm.simulation.settings import check
 
 _LONGEST_S = 2.0**20  # twelve days: the random walk's coarsest interval
 _LEVELS = 22  # halvings of it; finer than a quarter of a second the walk is a straight line
+_FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and twelve days of it are still a number
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,9 @@ class DriftSettings:
         walk_m_per_sqrt_hour: standard deviation in x and y that a random walk gains in an hour.
         walk_z_m_per_sqrt_hour: the same for z.
         daily_m: amplitude of a sine of 24 hours.
+        rotation_rad_per_s: constant rotation of the sample, counter-clockwise, in rad/s.
+        expansion_per_s: constant expansion in 1/s, at most 1e-4 either way: the part that lengths grow by in a second.
+        about_m: the place (x, y) that rotation and expansion leave where it is, in tip coordinates at the start.
     """
 
     velocity_m_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -50,9 +56,15 @@ class DriftSettings:
     walk_m_per_sqrt_hour: float = 0.0
     walk_z_m_per_sqrt_hour: float = 0.0
     daily_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_rad_per_s: float = 0.0
+    expansion_per_s: float = 0.0
+    about_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         check(self, from_zero="walk_m_per_sqrt_hour walk_z_m_per_sqrt_hour")
+        if not abs(self.expansion_per_s) <= _FASTEST_EXPANSION_PER_S:
+            wanted = f"between {-_FASTEST_EXPANSION_PER_S:g} and {_FASTEST_EXPANSION_PER_S:g} 1/s"
+            raise ConfigError(f"{self.expansion_per_s!r} is not {wanted}", where="expansion_per_s")
 
 
 class Drift:
@@ -69,10 +81,7 @@ class Drift:
         Raises:
             InvalidValue: a time before the start.
         """
-        since = np.asarray(t_s, dtype=np.float64) - self._start_s
-        if since.size and not since.min() >= -1e-6:
-            raise InvalidValue(f"drift is not known {-since.min():g} s before the start of the experiment")
-        since = np.maximum(since, 0.0)[..., None]
+        since = self._since_s(t_s)[..., None]
         s = self._settings
         total = since * np.asarray(s.velocity_m_per_s)
         for relaxation in s.relaxing:
@@ -83,6 +92,37 @@ class Drift:
             if scale:
                 total[..., axis] += scale / 60.0 * random_walk(self._seed + axis, since[..., 0])
         return np.asarray(total)
+
+    def turn(self, t_s: ArrayLike) -> NDArray[np.complex128]:
+        """Return rotation and scale at experiment times as a complex factor about `about_m`: one at the start.
+
+        Raises:
+            InvalidValue: a time before the start.
+        """
+        rate = complex(self._settings.expansion_per_s, self._settings.rotation_rad_per_s)
+        return np.asarray(np.exp(rate * self._since_s(t_s)))
+
+    def turned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:
+        """Turn and expand places (x, y) of the sample up to times, which are broadcast with x and y."""
+        return self._about(x_m, y_m, self.turn(t_s))
+
+    def unturned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:
+        """Undo `turned`."""
+        return self._about(x_m, y_m, 1.0 / self.turn(t_s))
+
+    def _about(self, x_m: Array, y_m: Array, factor: NDArray[np.complex128]) -> tuple[Array, Array]:
+        s = self._settings
+        if s.rotation_rad_per_s == s.expansion_per_s == 0.0:
+            return x_m, y_m  # to the last digit
+        pivot = complex(*s.about_m)
+        moved = pivot + factor * (x_m + 1j * y_m - pivot)
+        return moved.real, moved.imag
+
+    def _since_s(self, t_s: ArrayLike) -> Array:
+        since = np.asarray(t_s, dtype=np.float64) - self._start_s
+        if since.size and not since.min() >= -1e-6:
+            raise InvalidValue(f"drift is not known {-since.min():g} s before the start of the experiment")
+        return np.maximum(since, 0.0)
 
 
 class Compensation:

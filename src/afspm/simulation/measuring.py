@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.simulation.feedback import Loop
 from afspm.simulation.fields import Array
@@ -33,6 +35,8 @@ class Setup:
     Attributes:
         sample: relief of the sample as it is now, from (x, y, resolution_m).
         drift_m: (x, y, z) at times.
+        turn: rotation and scale of the sample at times, as complex factors.
+        unturned: (x, y) with those undone, from (x, y, times).
         held_z_m: where z stands if the feedback is off.
         slope: (x, y) compensation of tilt set on the instrument, m/m.
         origin_m: (x, y) about which tilt and slope turn.
@@ -41,6 +45,8 @@ class Setup:
 
     sample: Callable[[Array, Array, float], Relief]
     drift_m: Callable[[Array], Array]
+    turn: Callable[[float], NDArray[np.complex128]]
+    unturned: Callable[[Array, Array, Array], tuple[Array, Array]]
     offset_m: Callable[[Array], Array]
     scanner: ScannerSettings
     noise: NoiseSettings
@@ -142,13 +148,14 @@ def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
 
 
 def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array, Array]:
-    """Where on the sample the tip is at each pixel: x_sample = x_tip - drift(t of the row)."""
+    """Where on the sample the tip is at each pixel, with the drift of its row."""
     x, y = course.region.pixels_m(course.shape)
     times = course.row_times_s(part)
     away = setup.drift_m(times)[:, :2] + setup.offset_m(times)
     lag = setup.scanner.backlash_m if part > 0.5 else 0.0
     angle = course.region.angle_rad
-    return x - away[:, :1] + lag * math.cos(angle), y - away[:, 1:2] + lag * math.sin(angle)
+    x, y = x - away[:, :1] + lag * math.cos(angle), y - away[:, 1:2] + lag * math.sin(angle)
+    return setup.unturned(x, y, times[:, None])
 
 
 def _pixel_times_s(course: Course) -> Array:
@@ -161,10 +168,12 @@ def _pixel_times_s(course: Course) -> Array:
 
 def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> tuple[Grid, tuple[float, float]]:
     """A grid that is fine enough and not too large, and the blur (y, x) in its steps."""
-    pixel = course.pixel_m
-    if course.region.angle_rad % (math.pi / 2) > 1e-9:
+    turn = complex(setup.turn(course.start_s))
+    pixel = (course.pixel_m[0] / abs(turn), course.pixel_m[1] / abs(turn))
+    angle_rad = course.region.angle_rad - cmath.phase(turn)  # on the sample
+    if angle_rad % (math.pi / 2) > 1e-9:
         pixel = (min(pixel), min(pixel))  # the grid does not turn with the scan
-    elif course.region.angle_rad % math.pi > 1e-9:
+    elif angle_rad % math.pi > 1e-9:
         pixel = (pixel[1], pixel[0])
     # A first look at coarse steps tells how high the sample is, thus how far the tip can touch beside its apex.
     extent = (float(np.ptp(x)) or pixel[0], float(np.ptp(y)) or pixel[1])

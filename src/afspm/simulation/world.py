@@ -7,6 +7,7 @@ stopped: tip changes, wear) is taken back. The same seed and the same calls give
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -126,6 +127,8 @@ class World:
             "tips": [{"t_s": t, **tip.to_dict()} for t, tip in tips],
             "drift_start_m": self.drift_m(start_s).tolist(),
             "drift_end_m": self.drift_m(course.end_s).tolist(),
+            "turn_start": self._turn(start_s),
+            "turn_end": self._turn(course.end_s),
             "compensated_start_m": self._compensation.at(start_s).tolist(),
             "compensated_end_m": self._compensation.at(course.end_s).tolist(),
             "pressed_m": measured.pressed_m,
@@ -279,12 +282,29 @@ class World:
     # -- the truth
 
     def drift_m(self, t_s: ArrayLike) -> Array:
-        """(x, y, z) by which the sample is displaced: x_tip = x_sample + drift. Shape t.shape + (3,)."""
+        """(x, y, z) by which the sample is displaced: x_tip = x_sample + drift. Shape t.shape + (3,).
+
+        On a sample that turns or expands that is so at the place that it does about: see `to_sample` and `to_tip`.
+        """
         return self._drift.at(t_s)
 
     def seen_drift_m(self, t_s: ArrayLike) -> Array:
         """The same as far as the scanner does not follow it by itself."""
         return self._drift.at(t_s) - self._compensation.at(t_s)
+
+    def to_sample(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
+        """Map positions (..., 2) at experiment times (...) from the tip's coordinates to the sample's.
+
+        The tip's are those of a scanner that does not follow drift by itself.
+        """
+        at = np.asarray(xy_m, dtype=np.float64) - self.drift_m(t_s)[..., :2]
+        return np.stack(self._drift.unturned(at[..., 0], at[..., 1], t_s), axis=-1)
+
+    def to_tip(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
+        """Undo `to_sample`."""
+        at = np.asarray(xy_m, dtype=np.float64)
+        turned = np.stack(self._drift.turned(at[..., 0], at[..., 1], t_s), axis=-1)
+        return np.asarray(turned + self.drift_m(t_s)[..., :2])
 
     @property
     def tip(self) -> TipState:
@@ -309,6 +329,7 @@ class World:
             "seed": self.seed,
             "surface": dict(self._surface_table),
             "drift_m": self.drift_m(t_s).tolist(),
+            "turn": self._turn(t_s),
             "compensated_m": self._compensation.at(t_s).tolist(),
             "tip": self._tips.at(t_s).to_dict(),
             "tip_changes": [
@@ -423,8 +444,12 @@ class World:
         self._marks.append(Mark(self._on_sample(position_m, t_s), depth_m, radius_m, t_s, kind))
 
     def _on_sample(self, position_m: tuple[float, float], t_s: float) -> tuple[float, float]:
-        drift = self.seen_drift_m(t_s)
-        return float(position_m[0] - drift[0]), float(position_m[1] - drift[1])
+        x, y = self.to_sample(np.add(position_m, self._compensation.at(t_s)[:2]), t_s)
+        return float(x), float(y)
+
+    def _turn(self, t_s: float) -> dict[str, Any]:
+        turn = complex(self._drift.turn(t_s))
+        return {"angle_rad": cmath.phase(turn), "scale": abs(turn), "about_m": list(self.settings.drift.about_m)}
 
     def _relief(self, x_m: Array, y_m: Array, resolution_m: float, t_s: float) -> Relief:
         relief = self._surface.relief(x_m, y_m, resolution_m, self._surface_seed)
@@ -437,6 +462,8 @@ class World:
         return Setup(
             sample=lambda x, y, resolution_m: self._relief(x, y, resolution_m, start_s),
             drift_m=self.seen_drift_m,
+            turn=self._drift.turn,
+            unturned=self._drift.unturned,
             offset_m=self._creep_m,
             scanner=self.settings.scanner,
             noise=self.settings.noise,

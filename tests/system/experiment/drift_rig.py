@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import csv
 import json
 import os
@@ -25,7 +26,7 @@ component = true
 class = "Simulator"
 seed = 5
 surface = {{ kind = "particles" }}
-drift = {{ velocity_m_per_s = [0.25e-9, -0.15e-9, 0.0] }}
+drift = {{ {sample} }}
 scanner = {{ flatten = "line" }}
 initial = {{ scan-speed = "8 um/s", "scan-top-left-x" = "-0.5 um", "scan-top-left-y" = "-0.5 um" }}
 
@@ -42,6 +43,7 @@ class = "Rescanner"
 component = true
 class = "surveyor.Surveyor"
 scans = {scans}
+pause_s = {pause_s}
 
 [table]
 component = true
@@ -68,17 +70,19 @@ FEATURE_M = (0.2e-6, 0.1e-6)
 
 
 class Surveyor(Component):
-    def __init__(self, scans: int):
+    def __init__(self, scans: int, pause_s: float):
         self.scans = scans
+        self.pause_s = pause_s
 
     def run(self):
         for i in range(self.scans):
             scan = self.scope.scan(REGION, shape=(64, 64), key=f"scan-{i}").first
-            self.note({"scan": scan.filename, "center_m": scan.region.center_m})
+            corners_m = scan.region.corners_m().tolist()
+            self.note({"scan": scan.filename, "center_m": scan.region.center_m, "corners_m": corners_m})
             spectrum = self.scope.spectrum(FEATURE_M, kind="IV", key=f"iv-{i}")
             self.note({"spectrum": spectrum.filename, "position_m": spectrum.position_m})
             self.log.info("round %d is done", i)
-            self.scope.sleep(180.0)
+            self.scope.sleep(self.pause_s)
         self.scope.end_experiment()
 
     def note(self, facts):
@@ -121,52 +125,79 @@ class Surveyed:
 
     Attributes:
         said_m, true_m: (n, 2) centres of the scans as they were published, and as they were.
+        corners_said_m, corners_true_m: (n, 4, 2) the same of their corners.
         spectra_said_m, spectra_true_m: the same of the spectra.
-        drift_m: (n, 2) of the sample at the scans.
+        drift_m: (n, 2) of the sample under the centres of the scans.
     """
 
     said_m: np.ndarray
     true_m: np.ndarray
+    corners_said_m: np.ndarray
+    corners_true_m: np.ndarray
     spectra_said_m: np.ndarray
     spectra_true_m: np.ndarray
     drift_m: np.ndarray
+
+
+@dataclass(frozen=True)
+class Lay:
+    """How the sample lay under the tip, by truth.jsonl: x_tip = about + turn * (x_sample - about) + drift, as x + iy.
+
+    The drift is less what the controller follows by itself.
+    """
+
+    about_m: complex
+    turn: complex
+    drift_m: complex
+
+    @classmethod
+    def of(cls, event: dict[str, Any]) -> Lay:
+        """In the middle of a scan, or at the end of a spectrum."""
+        if "scan" in event:
+            scan = event["scan"]
+            start, end = (
+                cls._at(scan[f"turn_{when}"], scan[f"drift_{when}_m"], scan[f"compensated_{when}_m"])
+                for when in ("start", "end")
+            )
+            return cls(start.about_m, (start.turn + end.turn) / 2, (start.drift_m + end.drift_m) / 2)
+        truth = event["truth"]
+        return cls._at(truth["turn"], truth["drift_m"], truth["compensated_m"])
+
+    @classmethod
+    def _at(cls, turn: dict[str, Any], drift_m: list[float], compensated_m: list[float]) -> Lay:
+        seen_m = np.subtract(drift_m, compensated_m)
+        return cls(complex(*turn["about_m"]), cmath.rect(turn["scale"], turn["angle_rad"]), complex(*seen_m[:2]))
+
+    def to_tip_of(self, first: Lay, xy_m: np.ndarray) -> np.ndarray:
+        """Where in the tip coordinates of a first scan is what is at positions (..., 2) now."""
+        x_m, y_m = np.moveaxis(np.asarray(xy_m), -1, 0)
+        on_sample = self.about_m + (x_m + 1j * y_m - self.about_m - self.drift_m) / self.turn
+        at_first = first.about_m + first.turn * (on_sample - first.about_m) + first.drift_m
+        return np.stack([at_first.real, at_first.imag], axis=-1)
 
 
 def surveyed(run: AfspmRun) -> Surveyed:
     """What the surveyor was told, beside the truth."""
     noted = [json.loads(line) for line in (run.folder / "surveyed.jsonl").read_text().splitlines()]
     events = [json.loads(line) for line in (run.folder / "truth.jsonl").read_text().splitlines()]
-    truth = {event["file"]: event for event in events if "file" in event}
-    drift = {name: _drift_m(event) for name, event in truth.items()}
-    scans = [one for one in noted if "scan" in one]
-    spectra = [one for one in noted if "spectrum" in one]
-    start_m = drift[Path(scans[0]["scan"]).name]
-
-    def tips(ones: list[dict[str, str]], key: str) -> np.ndarray:
-        found = [files.load(Path(one[key]))[0] for one in ones]
-        return np.array([one.region.center_m if key == "scan" else one.position_m for one in found])  # type: ignore[union-attr]
-
-    drifts = {key: np.array([drift[Path(one[key]).name] - start_m for one in ones]) for key, ones in
-              (("scan", scans), ("spectrum", spectra))}  # fmt: skip
+    lay = {event["file"]: Lay.of(event) for event in events if "file" in event}
+    scans = [Path(one["scan"]) for one in noted if "scan" in one]
+    spectra = [Path(one["spectrum"]) for one in noted if "spectrum" in one]
+    first = lay[scans[0].name]
+    regions = [files.load(path)[0].region for path in scans]  # type: ignore[union-attr]
+    true = [lay[path.name].to_tip_of(first, region.center_m) for path, region in zip(scans, regions, strict=True)]
+    corners = [lay[path.name].to_tip_of(first, region.corners_m()) for path, region in zip(scans, regions, strict=True)]
+    positions = [files.load(path)[0].position_m for path in spectra]  # type: ignore[union-attr]
+    at = [lay[path.name].to_tip_of(first, at_m) for path, at_m in zip(spectra, positions, strict=True)]
     return Surveyed(
-        np.array([one["center_m"] for one in scans]),
-        tips(scans, "scan") - drifts["scan"],
-        np.array([one["position_m"] for one in spectra]),
-        tips(spectra, "spectrum") - drifts["spectrum"],
-        drifts["scan"],
+        said_m=np.array([one["center_m"] for one in noted if "scan" in one]),
+        true_m=np.array(true),
+        corners_said_m=np.array([one["corners_m"] for one in noted if "scan" in one]),
+        corners_true_m=np.array(corners),
+        spectra_said_m=np.array([one["position_m"] for one in noted if "spectrum" in one]),
+        spectra_true_m=np.array(at),
+        drift_m=np.array([region.center_m for region in regions]) - np.array(true),
     )
-
-
-def _drift_m(event: dict[str, Any]) -> np.ndarray:
-    """Of the sample under the tip, less what the controller follows by itself."""
-    if "scan" in event:
-        scan = {
-            name: np.array(value)[:2] for name, value in event["scan"].items() if name.endswith(("start_m", "end_m"))
-        }
-        seen = [scan[f"drift_{when}_m"] - scan[f"compensated_{when}_m"] for when in ("start", "end")]
-        return np.asarray((seen[0] + seen[1]) / 2)
-    truth = event["truth"]
-    return np.subtract(truth["drift_m"], truth["compensated_m"])[:2]
 
 
 def table(run: AfspmRun) -> list[dict[str, str]]:
@@ -192,11 +223,19 @@ class Rig:
         self._folder = folder
         self._runs: list[AfspmRun] = []
 
-    def start(self, drift: str = "", scans: int = 5, speed: float = 60.0) -> AfspmRun:
+    def start(
+        self,
+        drift: str = "",
+        scans: int = 5,
+        speed: float = 60.0,
+        sample: str = "velocity_m_per_s = [0.25e-9, -0.15e-9, 0.0]",
+        pause_s: float = 180.0,
+    ) -> AfspmRun:
         """What a busy computer is late by, in real time, the sample has drifted on by at the speed of the clock."""
         (self._folder / "surveyor.py").write_text(SURVEYOR, encoding="utf-8")
+        settings = {"drift": drift, "scans": scans, "speed": speed, "sample": sample, "pause_s": pause_s}
         file = self._folder / "experiment.toml"
-        file.write_text(EXPERIMENT.format(drift=drift, scans=scans, speed=speed), encoding="utf-8")
+        file.write_text(EXPERIMENT.format(**settings), encoding="utf-8")
         options = ("--runs", str(self._folder / "runs"), "--verbose", "--no-report", "--without", "recorder")
         command = (*AFSPM, "run", str(file), *options)
         process = subprocess.Popen(

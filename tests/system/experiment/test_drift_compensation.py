@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from drift_rig import Rig, Surveyed, surveyed, table, worker_of
 
+from afspm.model import Region
+
 pytestmark = pytest.mark.timeout(180)
 KNOWN_M = 2e-9
 """How well a scan is known to lie; a pixel is 16 nm."""
@@ -123,3 +125,26 @@ def test_a_user_s_own_estimator_that_fails_or_hangs_costs_no_scan(rig: Rig) -> N
     found = surveyed(run)
     assert len(found.said_m) == 5
     assert (away_m(found.said_m, found.true_m)[[0, 3, 4]] < KNOWN_M).all(), found
+
+
+@pytest.mark.parametrize("transform", ["translation", "similarity"])
+def test_on_a_sample_that_turns_and_expands_a_similarity_keeps_corners_in_place(rig: Rig, transform: str) -> None:
+    """It turns about a place two frames away. Where a frame is placed lags by one interval; what is known does not."""
+    tracker = f'{{ class = "bank", transform = "{transform}", compared = 2 }}'
+    sample = "rotation_rad_per_s = 1.8e-6, expansion_per_s = 0.7e-6, about_m = [-1.6e-6, -1.2e-6]"
+    options = f'tracker = {tracker}, rescan = {{ rule = "never" }}'
+    run = rig.start(options, scans=7, speed=1200.0, sample=sample, pause_s=1200.0)
+    assert run.end() == 0, run.output
+    found = surveyed(run)
+    assert away_m(found.drift_m[-1:], found.drift_m[:1])[0] > 20e-9
+    assert (away_m(found.said_m, found.true_m) < KNOWN_M).all(), found  # the centres, either way
+    wanted_m = Region((0.0, 0.0), (1e-6, 1e-6)).corners_m()
+    mistaken_m = away_m(found.corners_said_m, found.corners_true_m).T.max(axis=1)
+    misplaced_m = away_m(found.corners_true_m, wanted_m).T.max(axis=1)
+    if transform == "similarity":
+        assert (mistaken_m < 1e-9).all(), mistaken_m
+        assert (misplaced_m[2:] < 6e-9).all(), misplaced_m
+        assert (away_m(found.spectra_said_m, found.spectra_true_m) < 0.5e-9).all(), found
+    else:
+        assert mistaken_m[-1] > 8e-9, mistaken_m
+        assert misplaced_m[-1] > 8e-9, misplaced_m

@@ -16,6 +16,7 @@ from afspm.components import records
 from afspm.components.drift_pictures import DriftPictures, Told, parts
 from afspm.components.simulated_truth import true_drift
 from afspm.drift.record import DriftRecord
+from afspm.drift.registration import DriftScan
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
 from afspm.microscopes.simulator.files import Measured, encode_scan
@@ -197,19 +198,35 @@ def test_a_channel_that_is_not_there_is_told_at_once(tmp_path: Path, caplog: pyt
     assert "no pictures: only 0 of 9 scans can be read" in caplog.text
 
 
+def true_m(folder: Path, *at: tuple[float, tuple[float, float]]) -> object:
+    """What was true of scans at times and places."""
+    places = [(mid_s, Region(center_m, (1e-6, 1e-6))) for mid_s, center_m in at]
+    return true_drift(folder, [DriftScan(np.zeros((4, 4)), region, mid_s, mid_s) for mid_s, region in places])
+
+
 def test_the_truth_is_that_of_the_simulated_world(tmp_path: Path) -> None:
-    assert true_drift(tmp_path) is None
+    assert true_m(tmp_path, (0.0, (0.0, 0.0))) is None
     saved(tmp_path)
-    truth = true_drift(tmp_path)
-    assert truth is not None
-    np.testing.assert_allclose(truth(np.array([0.0, 100.0])), [(0.0, 0.0), (6e-9, -3e-9)], atol=1e-15)
+    a, b, c = (1e-6, 0.0), (0.0, 2e-6), (0.0, 0.0)
+    np.testing.assert_allclose(true_m(tmp_path, (0.0, a), (100.0, b)), [(0.0, 0.0), (6e-9, -3e-9)], atol=1e-15)
     scan = {"start_s": 0.0, "end_s": 50.0, "compensated_start_m": [0.0, 0.0], "compensated_end_m": [2e-9, 1e-9]}
     with (tmp_path / "truth.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps({"n": 2, "time_s": 50.0, "event": "scan", "scan": scan}) + "\n")
-    truth = true_drift(tmp_path)
-    assert truth is not None
     left = [(0.0, 0.0), (1.5e-9 - 1e-9, -0.75e-9 - 0.5e-9), (6e-9 - 2e-9, -3e-9 - 1e-9)]
-    np.testing.assert_allclose(truth(np.array([0.0, 25.0, 100.0])), left, atol=1e-15)
+    np.testing.assert_allclose(true_m(tmp_path, (0.0, a), (25.0, b), (100.0, c)), left, atol=1e-15)
+
+
+def test_the_truth_of_a_sample_that_turns_depends_on_the_place(tmp_path: Path) -> None:
+    turning = {**SETTINGS, "drift": {"rotation_rad_per_s": 1e-5, "expansion_per_s": 2e-5, "about_m": (1e-6, 0.0)}}
+    start = {"n": 1, "time_s": 0.0, "event": "start", "settings": turning, "seed": 1}
+    (tmp_path / "truth.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")
+    feature_m = (1e-6 + 3e-6 * np.exp(4e-3) * np.cos(2e-3), 3e-6 * np.exp(4e-3) * np.sin(2e-3))
+    moved_m = np.subtract(feature_m, (4e-6, 0.0))
+    true = true_m(tmp_path, (100.0, (0.0, 0.0)), (300.0, feature_m), (300.0, (1e-6, 0.0)))
+    np.testing.assert_allclose(true, [(0.0, 0.0), moved_m, (0.0, 0.0)], atol=1e-15)
+
+
+def test_a_truth_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "truth.jsonl").write_text("{}\n", encoding="utf-8")
     with pytest.raises(FileError, match="what was simulated"):
-        true_drift(tmp_path)
+        true_m(tmp_path, (0.0, (0.0, 0.0)))

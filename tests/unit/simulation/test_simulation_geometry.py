@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.errors import InvalidValue
+from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Frame, Region
 from afspm.simulation import World
 
@@ -85,6 +85,56 @@ def test_every_row_has_the_drift_of_its_own_time(direction: str) -> None:
     assert relative_error(scan.channels()["Height"][1], expected) < 0.05
     np.testing.assert_allclose(scan.drift_m[:, 0], 4e-9 * since[:, 0], atol=1e-15)
     assert relative_error(scan.channels()["Height"][1], world.surface_m(x - 4e-9 * (58 - since), y)) > 0.3
+
+
+TURNS = {"rotation_rad_per_s": 2e-3, "expansion_per_s": -5e-5, "about_m": [1.2e-6, -0.4e-6]}
+
+
+def turned(x: Any, y: Any, since_s: Any) -> tuple[Any, Any]:
+    """Where `TURNS` has brought places of the sample, written out."""
+    scale, angle, (x0, y0) = np.exp(-5e-5 * since_s), 2e-3 * since_s, (1.2e-6, -0.4e-6)
+    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
+    return x0 + cos * (x - x0) - sin * (y - y0), y0 + sin * (x - x0) + cos * (y - y0)
+
+
+@pytest.mark.parametrize("start_s", [1000.0, 3000.0])
+def test_a_sample_that_turns_and_shrinks_is_seen_turned_and_smaller(start_s: float) -> None:
+    """Row by row: it moves what is seen by a feature while it is scanned."""
+    world = hills(drift={"velocity_m_per_s": [0.3e-9, 0.2e-9, 0.0], **TURNS})
+    on_sample = Region((-0.5e-6, 0.8e-6), (900e-9, 500e-9))
+    since_s = start_s - 1000.0 + (np.arange(48) + 0.25)[:, None]
+    x, y = turned(*on_sample.center_m, start_s - 1000.0)
+    region = Region((float(x), float(y)), on_sample.size_m)
+    values = height(world, region, start_s=start_s)
+    x, y = region.pixels_m(values.shape)
+    times_s = np.broadcast_to(1000.0 + since_s, x.shape)
+    at = world.to_sample(np.stack([x, y], axis=-1), times_s)
+    back = np.stack(turned(at[..., 0], at[..., 1], since_s), axis=-1)
+    drift = np.stack([0.3e-9 * since_s, 0.2e-9 * since_s], axis=-1)
+    np.testing.assert_allclose(back + drift, np.stack([x, y], axis=-1), atol=1e-16)
+    np.testing.assert_allclose(world.to_tip(at, times_s), np.stack([x, y], axis=-1), atol=1e-16)
+    assert relative_error(values, world.surface_m(at[..., 0], at[..., 1])) < 0.05
+    at_first = world.to_sample(np.stack([x, y], axis=-1), np.full(x.shape, start_s))
+    assert relative_error(values, world.surface_m(at_first[..., 0], at_first[..., 1])) > 0.3
+
+
+def test_what_is_done_at_a_place_is_done_where_the_sample_has_turned_to() -> None:
+    world = hills(drift=TURNS)
+    world.compensate((1e-10, 0.0), 1500.0)
+    world.crash((2e-6, 1e-6), 10e-9, 1e-6, 3000.0)
+    truth = world.truth(3000.0)
+    x, y = turned(*truth["marks"][0]["sample_xy_m"], 2000.0)
+    np.testing.assert_allclose((x, y), (2e-6 + 150e-9, 1e-6), atol=1e-15)
+    assert truth["turn"]["angle_rad"] == pytest.approx(4.0 - 2.0 * np.pi)
+    assert truth["turn"]["scale"] == pytest.approx(np.exp(-0.1))
+    assert truth["turn"]["about_m"] == [1.2e-6, -0.4e-6]
+
+
+def test_a_sample_that_bursts_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"expansion_per_s: 0\.01 is not between -0\.0001 and 0\.0001 1/s"):
+        hills(drift={"expansion_per_s": 1e-2})
+    with pytest.raises(ConfigError, match="rotation_rad_per_s"):
+        hills(drift={"rotation_rad_per_s": float("nan")})
 
 
 def test_z_drift_raises_the_later_rows() -> None:

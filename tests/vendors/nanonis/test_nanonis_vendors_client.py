@@ -12,6 +12,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from inspect import isfunction, signature
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,18 @@ SEEN = pytest.mark.parametrize("client", [2.0], indirect=True)
 @pytest.fixture
 def client(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
     """Of an emulator at speed 100, or as marked."""
-    speed = getattr(request, "param", 100.0)
-    emulator = NanonisEmulator(port=0, surface="lattice")
-    with emulator.running(tmp_path, ExperimentClock.starting_now(speed=speed)) as address:
+    with connected(tmp_path, getattr(request, "param", 100.0)) as client:
+        yield client
+
+
+@contextmanager
+def connected(folder: Path, speed: float, **settings: Any) -> Iterator[Any]:
+    emulator = NanonisEmulator(port=0, surface="lattice", **settings)
+    with emulator.running(folder, ExperimentClock.starting_now(speed=speed)) as address:
         host, port = address.split(":")
         with socket.create_connection((host, int(port)), timeout=20.0) as connection:
             client = Client(connection)
-            client.folder = tmp_path
+            client.folder = folder
             yield client
 
 
@@ -258,6 +264,16 @@ def test_it_has_the_drift_compensated(client: Any) -> None:
     assert ask(client, "Piezo_DriftCompGet") == pytest.approx([1, 1e-11, -2e-11, 0.0, 0, 0, 0, 10.0], rel=1e-6)
     ask(client, "Piezo_DriftCompSet", off, 1e-11, -2e-11, 0.0, 10.0)
     assert ask(client, "Piezo_DriftCompGet")[0] == 0
+
+
+def test_a_tracked_atom_tells_how_fast_the_sample_drifts_and_turns_under_the_tip(tmp_path: Path) -> None:
+    """A minute of it is over at once: a millimetre from where it turns, that moves it by 10 pm/s."""
+    turns = {"rotation_rad_per_s": 1e-8, "about_m": [-1e-3, 0.0], "velocity_m_per_s": [3e-12, 0.0, 1e-12]}
+    with connected(tmp_path, 1e5, drift=turns) as client:
+        ask(client, "AtomTrack_QuickCompStart", 1)
+        on, *velocity_m_s = ask(client, "Piezo_DriftCompGet")[:4]
+    assert on == 1
+    assert velocity_m_s == pytest.approx([3e-12, 10e-12, 1e-12], abs=0.2e-12)
 
 
 def test_it_has_a_scan_saved_that_was_stopped(client: Any) -> None:

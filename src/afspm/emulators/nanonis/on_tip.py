@@ -223,12 +223,14 @@ def _drift_get(panel: Panel) -> Answer:
 
 @answers("AtomTrack.QuickCompStart", "AtomTrack.DriftComp")
 def _compensate(panel: Panel, *which: int) -> Answer:
-    """The drift that tracking an atom would have found is compensated from now on; a tilt there is none of."""
+    """Compensate the drift that tracking the atom under the tip would have found; a tilt there is none of."""
     drift = 1
     if which in ((), (drift,)):
-        now_s = panel.clock.now_s()
-        moved_m = panel.rig.world.drift_m([now_s - _TRACKED_S, now_s])
-        x, y, z = ((moved_m[1] - moved_m[0]) / _TRACKED_S).tolist()
+        world, now_s = panel.rig.world, panel.clock.now_s()
+        times_s = np.array([now_s - _TRACKED_S, now_s])
+        atom_m = world.to_sample(panel.rig.probe_at(now_s), now_s)
+        tracked_m = np.column_stack([world.to_tip([atom_m, atom_m], times_s), world.drift_m(times_s)[:, 2]])
+        x, y, z = ((tracked_m[1] - tracked_m[0]) / _TRACKED_S).tolist()
         return _drift_set(panel, 1, x, y, z)
     return ()
 
