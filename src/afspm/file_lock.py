@@ -37,3 +37,7 @@ def locked(file: IO[bytes]) -> Iterator[None]:
 
             file.seek(0)
             msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_UN)
