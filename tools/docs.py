@@ -76,11 +76,14 @@ def _table_page(title: str, cls: type) -> str:
     """A table of settings that is a dataclass in the code."""
     text, meanings = _docstring(cls, "Attributes")
     lines = [f"### {title}", "", text, "", "| key | default | meaning |", "| --- | --- | --- |"]
+    within = []
     for one in dataclasses.fields(cls):
         default = one.default if one.default_factory is dataclasses.MISSING else one.default_factory()
         told = "(needed)" if default is dataclasses.MISSING else _plain(default)
+        if dataclasses.is_dataclass(default):
+            told, within = "(below)", [*within, _table_page(f"{one.name}, in {title}", type(default))]
         lines.append(f"| `{one.name}` | {told} | {meanings.get(one.name, '')} |")
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, "", *within])
 
 
 def _plain(value: Any) -> str:

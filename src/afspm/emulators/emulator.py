@@ -74,6 +74,9 @@ class Emulator(ABC):
     fault_kinds: ClassVar[Mapping[str, str]] = {}
     """Every fault that can be had, with what it does."""
 
+    modes: ClassVar[Sequence[str]] = ("amplitude", "current", "frequency-shift")
+    """Of the simulated feedback: those that the controller has."""
+
     emulated: ClassVar[bool] = True
     """An experiment with it is a simulated one: its clock may go at another speed than the real one."""
     listens: ClassVar[tuple[str, ...]] = ()
@@ -109,10 +112,12 @@ class Emulator(ABC):
             ConfigError: of the world or the faults. FileError: a sample that can't be read.
         """
         from afspm.simulation import World
+        from afspm.simulation.settings import one_of
 
         errors = Gathered()
         with errors:
-            World.from_settings(self._world_settings, self.seed, 0.0)
+            world = World.from_settings(self._world_settings, self.seed, 0.0)
+            one_of(world.settings.feedback.mode, self.modes, "feedback.mode")
         with errors:
             Faults(self._faults, self.fault_kinds, 0.0)
         errors.raise_all()

@@ -9,18 +9,20 @@ never below zero nor above the free one, so z can only follow so fast down a slo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.errors import InvalidValue
+from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Feedback
 from afspm.simulation.fields import Array
+from afspm.simulation.sensor import SensorSettings
 from afspm.simulation.settings import check, one_of
 
-MODES = ("amplitude", "current")
+MODES = ("amplitude", "current", "frequency-shift")
 _GENTLE = 0.3  # share of the free amplitude that a gentle setpoint takes away
+_GENTLE_M = 1e-9  # distance of a sensor that a gentle frequency shift is met at
 _GROWN = 10.0  # e-foldings in one step, after which nothing is left but the saturated oscillation
 
 
@@ -29,7 +31,8 @@ class FeedbackSettings:
     """What is in force until it is set otherwise, and the loop's hardware.
 
     Attributes:
-        mode: "amplitude" (tapping; the setpoint is an amplitude in V) or "current" (tunnelling; in A).
+        mode: "amplitude" (tapping; the setpoint is an amplitude in V), "current" (tunnelling; in A) or
+            "frequency-shift" (non-contact; in Hz, below zero).
         integral_gain: in 1/s: an error is gone after about 1 / gain.
         free_amplitude_v: far from the sample.
         sensitivity_m_per_v: of the detector.
@@ -37,6 +40,7 @@ class FeedbackSettings:
         range_m: of the z actuator: so far the tip withdraws when the setpoint is never met.
         decay_m: the gap over which a tunnelling current falls by e.
         current_floor_a: the smallest current the logarithm sees.
+        sensor: a table of its own, of the mode "frequency-shift".
     """
 
     mode: str = "amplitude"
@@ -51,11 +55,23 @@ class FeedbackSettings:
     range_m: float = 5e-6
     decay_m: float = 0.05e-9
     current_floor_a: float = 0.2e-12
+    sensor: SensorSettings = field(default_factory=SensorSettings)
 
     def __post_init__(self) -> None:
         one_of(self.mode, MODES, "mode")
         check(self, above_zero="free_amplitude_v sensitivity_m_per_v lag_s delay_s range_m decay_m current_floor_a")
-        check(self, from_zero="proportional_gain integral_gain", above_zero="setpoint")
+        check(self, from_zero="proportional_gain integral_gain")
+        if refusal := self.refusal_of(self.setpoint):
+            raise ConfigError(refusal, where="setpoint")
+
+    def refusal_of(self, setpoint: float) -> str:
+        """Return why there can be no such setpoint in this mode; empty if there can."""
+        if self.mode != "frequency-shift":
+            return "" if 0 < setpoint < math.inf else f"a setpoint is above zero, not {setpoint:g}"
+        largest = self.sensor.largest_hz
+        if largest < setpoint < 0:
+            return ""
+        return f"a frequency shift as a setpoint is between {largest:.4g} Hz and zero, not {setpoint:g}"
 
 
 @dataclass(frozen=True)
@@ -73,7 +89,7 @@ class Loop:
         """The settings with what `feedback` says instead.
 
         Raises:
-            InvalidValue: a gain below zero, a setpoint that is not above zero, or what is not finite.
+            InvalidValue: a gain below zero, a setpoint that there can't be in this mode, or what is not finite.
         """
         said = feedback or Feedback()
         on = settings.on if said.on is None else said.on
@@ -83,14 +99,14 @@ class Loop:
         )
         if not (math.isfinite(p) and math.isfinite(i) and p >= 0 and i >= 0):
             raise InvalidValue(f"feedback gains are zero or more, not {p:g} and {i:g}", where="feedback")
-        if not (math.isfinite(setpoint) and setpoint > 0):
-            raise InvalidValue(f"a setpoint is above zero, not {setpoint:g}", where="feedback")
+        if refusal := settings.refusal_of(setpoint):
+            raise InvalidValue(refusal, where="feedback")
         return cls(settings, on, p, i, setpoint)
 
     @property
     def engages(self) -> bool:
         """Whether the setpoint can be met at all: an amplitude above the free one never is."""
-        return self.settings.mode == "current" or self.setpoint < self.settings.free_amplitude_v
+        return self.settings.mode != "amplitude" or self.setpoint < self.settings.free_amplitude_v
 
     @property
     def force(self) -> float:
@@ -98,6 +114,8 @@ class Loop:
         s = self.settings
         if s.mode == "current":
             return math.log1p(self.setpoint / 50e-12) / math.log(2.0)
+        if s.mode == "frequency-shift":
+            return (_GENTLE_M / s.sensor.distance_m(self.setpoint)) ** 2
         return max(0.0, (s.free_amplitude_v - self.setpoint) / s.free_amplitude_v / _GENTLE)
 
     @property
@@ -107,6 +125,9 @@ class Loop:
         if s.mode == "current":
             below = math.log(max(self.setpoint / s.current_floor_a, math.e)) * s.decay_m
             return below, 3.0 * below
+        if s.mode == "frequency-shift":
+            slope = s.sensor.slope_hz_per_m(s.sensor.distance_m(self.setpoint))
+            return -self.setpoint / slope, (self.setpoint - s.sensor.largest_hz) / slope
         return (s.free_amplitude_v - self.setpoint) * s.sensitivity_m_per_v, self.setpoint * s.sensitivity_m_per_v
 
     def follow(self, height_m: Array, step_s: float, start_v: Array) -> Array:
@@ -145,6 +166,11 @@ class Loop:
         """What the detector shows; gap is z less the height at which the setpoint is met."""
         s = self.settings
         return np.clip(self.setpoint + gap_m / s.sensitivity_m_per_v, 0.0, s.free_amplitude_v)
+
+    def frequency_shift_hz(self, gap_m: Array) -> Array:
+        """Return the shift that the sensor shows; gap as of `amplitude_v`."""
+        sensor = self.settings.sensor
+        return sensor.shift_hz(sensor.distance_m(self.setpoint) + gap_m)
 
     @property
     def oscillates(self) -> bool:

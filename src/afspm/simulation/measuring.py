@@ -230,7 +230,7 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
 
 
 def _signals(gap_m: Array, heights: Felt, course: Course, setup: Setup, random: np.random.Generator) -> Channels:
-    """Amplitude and phase (when tapping) and current, of the trace."""
+    """Amplitude and phase (when tapping), frequency shift (without contact) and current, of the trace."""
     loop, noise, material = setup.loop, setup.noise, heights.material[0]
     ny, nx = course.shape
 
@@ -244,6 +244,8 @@ def _signals(gap_m: Array, heights: Felt, course: Course, setup: Setup, random: 
         phase = phase_deg(setup.signals, loop, amplitude, material, slope)
         channels["Amplitude"] = ("V", amplitude + white(noise.amplitude_v))
         channels["Phase"] = ("deg", phase + white(noise.phase_deg))
+    if loop.settings.mode == "frequency-shift":
+        channels["Frequency Shift"] = ("Hz", loop.frequency_shift_hz(gap_m) + white(noise.frequency_hz))
     current = current_a(setup.signals, loop, gap_m, material, setup.bias_v)
     channels["Current"] = ("A", current + white(noise.current_a))
     return channels

@@ -23,7 +23,7 @@ class NoiseSettings:
         scar_m: by how much.
         hum_m, hum_hz: amplitude and frequency of the mains in the height.
         debris_jumps_per_s: how often what sticks to a contaminated tip moves.
-        amplitude_v, phase_deg, current_a: white, in those channels.
+        amplitude_v, phase_deg, current_a, frequency_hz: white, in those channels.
     """
 
     white_m: float = 0.05e-9
@@ -37,10 +37,11 @@ class NoiseSettings:
     amplitude_v: float = 0.002
     phase_deg: float = 0.25
     current_a: float = 1e-12
+    frequency_hz: float = 0.1
 
     def __post_init__(self) -> None:
         check(self, from_zero="white_m one_over_f_m line_offset_m scar_m hum_m hum_hz debris_jumps_per_s")
-        check(self, from_zero="amplitude_v phase_deg current_a", fraction="scar_probability")
+        check(self, from_zero="amplitude_v phase_deg current_a frequency_hz", fraction="scar_probability")
 
 
 def disturbances(

@@ -10,6 +10,7 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.emulators import known
+from afspm.emulators.asylum import AsylumEmulator
 from afspm.emulators.emulator import Emulator
 from afspm.errors import ConfigError
 
@@ -70,6 +71,8 @@ def test_settings_without_sense_are_refused_before_it_runs() -> None:
         Tiny(drifft={}).check()
     with pytest.raises(ConfigError, match="no fault 'crush'"):
         Tiny(faults=["crush"]).check()
+    with pytest.raises(ConfigError, match="unknown: 'frequency-shift'"):
+        AsylumEmulator(feedback={"mode": "frequency-shift", "setpoint": -20.0}).check()
 
 
 def test_an_emulator_has_a_name_or_is_one_of_the_users() -> None:

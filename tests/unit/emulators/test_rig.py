@@ -241,6 +241,45 @@ def test_with_the_feedback_off_the_current_follows_where_z_is_held(clock: Any) -
     assert np.log(at / above) == pytest.approx(0.1e-9 / decay_m, abs=0.3)
 
 
+@pytest.fixture
+def sensor(clock: Any) -> Rig:
+    """An instrument with an oscillating sensor, on flat ground."""
+    settings = {"feedback": {"mode": "frequency-shift", "setpoint": -20.0}, "noise": {"scar_probability": 0.0}}
+    rig = Rig(settings, 3, clock, background=False)
+    rig.region, rig.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
+    rig.move_probe((30e-9, -20e-9))
+    clock.t_s += 10.0
+    return rig
+
+
+def _shift_hz(rig: Rig, clock: Any) -> float:
+    return float(np.mean([rig.signals(clock.t_s)["Frequency Shift"] for _ in range(100)]))
+
+
+def test_a_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_setpoint(sensor: Rig, clock: Any) -> None:
+    for setpoint_hz in (-20.0, -5.0):
+        sensor.feedback = replace(sensor.feedback, setpoint=setpoint_hz)
+        unit, picture_hz = sensor.start_scan().channels()["Frequency Shift"]
+        clock.t_s += 100.0
+        assert unit == "Hz"
+        assert _shift_hz(sensor, clock) == pytest.approx(setpoint_hz, abs=0.05)
+        assert np.median(picture_hz) == pytest.approx(setpoint_hz, abs=0.2)
+
+
+def test_a_sensor_that_is_lifted_shows_what_is_left_of_the_attraction(sensor: Rig, clock: Any) -> None:
+    z_m = float(np.mean([sensor.signals(clock.t_s)["Height"] for _ in range(400)]))
+    sensor.feedback = replace(sensor.feedback, on=False)
+    shifts_hz = []
+    for lift_m in (0.0, 1e-9, 1e-6):
+        sensor.hold(z_m + lift_m)
+        shifts_hz.append(_shift_hz(sensor, clock))
+    physics = sensor.world.settings.feedback.sensor
+    lifted_hz = float(physics.shift_hz(np.array(physics.distance_m(-20.0) + 1e-9)))
+    assert shifts_hz == [pytest.approx(-20.0, abs=0.5), pytest.approx(lifted_hz, abs=0.3), pytest.approx(0.0, abs=0.05)]
+    sensor.withdraw()
+    assert _shift_hz(sensor, clock) == pytest.approx(0.0, abs=0.05)
+
+
 def test_a_scan_that_can_not_be_simulated_is_one_broken_off(
     rig: Rig, clock: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

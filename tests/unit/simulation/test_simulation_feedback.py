@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.errors import InvalidValue
+from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
 from afspm.simulation.feedback import FeedbackSettings, Loop
+from afspm.simulation.sensor import SensorSettings
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 DT = 1e-4
@@ -136,3 +137,43 @@ def test_beyond_stability_the_signal_swings_from_pixel_to_pixel_however_high_the
     scan = world.scan(REGION, (16, 64), line_s, 0.0, Feedback(integral_gain=gain)).channels()
     amplitude = scan["Amplitude"][1]
     assert amplitude.std(axis=1).min() > 0.1  # in every line, and not only from line to line
+
+
+# --- without contact: the frequency shift of a sensor ---
+
+
+def test_with_a_small_amplitude_the_shift_is_the_gradient_of_the_force() -> None:
+    sensor = SensorSettings(oscillation_m=1e-13)
+    distances_m = np.array([1e-9, 2e-9, 5e-9])
+    gradients = sensor.hamaker_j * sensor.radius_m / (3.0 * distances_m**3)
+    expected_hz = -sensor.resonance_hz / (2.0 * sensor.spring_n_per_m) * gradients
+    np.testing.assert_allclose(sensor.shift_hz(distances_m), expected_hz, rtol=1e-3)
+
+
+def test_distance_shift_and_slope_of_a_sensor_belong_together() -> None:
+    sensor = SensorSettings()
+    for shift_hz in (-100.0, -20.0, -0.1):
+        distance_m = sensor.distance_m(shift_hz)
+        assert sensor.shift_hz(np.array(distance_m)) == pytest.approx(shift_hz)
+        near = sensor.shift_hz(np.array([distance_m - 1e-12, distance_m + 1e-12]))
+        assert sensor.slope_hz_per_m(distance_m) == pytest.approx(np.diff(near)[0] / 2e-12, rel=1e-4)
+
+
+@pytest.mark.parametrize("setpoint_hz", [0.0, 20.0, -1e4, float("nan"), float("-inf")])
+def test_a_shift_that_no_sensor_has_is_no_setpoint(setpoint_hz: float) -> None:
+    settings = FeedbackSettings(mode="frequency-shift", setpoint=-20.0)
+    with pytest.raises(InvalidValue, match="between -18"):
+        Loop.of(settings, Feedback(setpoint=setpoint_hz))
+    with pytest.raises(ConfigError, match="between -18"):
+        FeedbackSettings(mode="frequency-shift", setpoint=setpoint_hz)
+
+
+def test_what_the_loop_does_not_follow_is_seen_in_the_frequency_shift() -> None:
+    settings = {"surface": "particles", "feedback": {"mode": "frequency-shift", "setpoint": -20.0}}
+    spreads = []
+    for gain in (1500.0, 150.0):
+        scan = World.from_settings(settings, 3, 0.0).scan(REGION, (32, 96), 2.0, 0.0, Feedback(integral_gain=gain))
+        shift_hz = scan.channels()["Frequency Shift"][1]
+        assert np.median(shift_hz) == pytest.approx(-20.0, abs=2.0)
+        spreads.append(float(np.std(shift_hz)))
+    assert spreads[1] > 2.0 * spreads[0]

@@ -372,7 +372,7 @@ def test_a_channel_that_does_not_come_is_named_and_the_others_are_published(benc
     made.strike(kind, duration_s=1e6)
     found = scanned(peer)  # the last channel is written first
     assert found == ["scan001-M-Xp-ZSmTopo.nc", "scan001-Xm-ZSmTopo.nc", "scan001-Xp-ImTunnel.nc"]
-    made.until_said("GXSM did not save Xp-dFreq.nc")
+    made.until_said("GXSM did not save Xp-Phase.nc")
     assert len(scanned(peer)) == 4, "it is not given up for ever"
 
 

@@ -29,6 +29,7 @@ from afspm.files import read
 Make = Callable[..., Bench]
 KINDS: list[dict[str, Any]] = [{"version": 3}, {"version": 4}, {"version": 4, "transport": "shm"}]
 KIND_IDS = ["gxsm3", "gxsm4", "gxsm4-shm"]
+NON_CONTACT: dict[str, Any] = {"feedback": {"mode": "frequency-shift", "setpoint": -20.0}}
 SEEN = 2.0
 """A speed at which what takes a second is seen while it lasts, on a busy computer too."""
 
@@ -229,7 +230,7 @@ def test_the_bits_of_the_redpitaya_mean_other_things(bench: Make) -> None:
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_gxsms_own_simulator_has_its_own_names(bench: Make, version: int) -> None:
-    made = bench(speed=SEEN, card="simulator", version=version)
+    made = bench(speed=SEEN, card="simulator", version=version, **({} if version == 3 else NON_CONTACT))
     with calling(made) as gxsm:
         assert gxsm.call("get", "sim-stm-speed") == 1.0
         assert gxsm.call("set", "sim-stm-speed", "0") == 0
@@ -363,6 +364,30 @@ def test_a_spectrum_and_its_event(bench: Make) -> None:
         assert true is not None
         assert true.position_m == pytest.approx((12e-9, 2e-9))
         np.testing.assert_allclose(content.spectra[0].values[:, 0], true.values[:, 0], rtol=1e-9)
+
+
+def test_the_frequency_shift_is_that_of_the_picture_and_of_the_setpoint(bench: Make) -> None:
+    made = bench(surface="steps", **NON_CONTACT)
+
+    def told(code: str) -> float:
+        return float(np.mean([gxsm.call("rtquery", code)[0] for _ in range(30)]))
+
+    with calling(made) as gxsm:
+        small(gxsm)
+        gxsm.call("set", "RangeX", "100")
+        gxsm.call("startscan")
+        until(made, lambda: bool(bits(gxsm) & 2))
+        until(made, lambda: not bits(gxsm) & 2)
+        labels = [one.label for one in made.emulator.program.channels]
+        pictures = {label: gxsm.call("get_slice", labels.index(label), 0, 0, 3, 2) for label in set(labels)}
+        assert np.median(pictures["dFreq"]) == pytest.approx(-20.0, abs=0.2)
+        assert told("f") == pytest.approx(np.median(pictures["dFreq"]), abs=0.3)
+        assert told("R") == pytest.approx(pictures["ZS-Topo"][:, 7:9].mean(), abs=2.0)
+        assert gxsm.call("gets", "dsp-fbs-mx1-freq-set") == "-20 Hz"
+        gxsm.call("set", "dsp-fbs-mx1-freq-set", "-35")
+        assert told("f") == pytest.approx(-35.0, abs=0.2)
+        gxsm.call("set", "dsp-fbs-mx1-freq-set", "35")
+        assert told("f") == pytest.approx(0.0, abs=0.1), "never met: there is no contact"
 
 
 def test_only_functions_of_the_module_can_be_called(bench: Make) -> None:

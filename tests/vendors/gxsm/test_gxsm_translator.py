@@ -49,7 +49,7 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make, kind: dic
     found = scanned(peer)
     expected = {"Topo", "Topo Backward", "ADC1"}
     if kind["version"] == 4:
-        expected = {"ZS-Topo", "ZS-Topo Backward", "I-Tunnel", "dFreq"}
+        expected = {"ZS-Topo", "ZS-Topo Backward", "I-Tunnel", "Phase"}
     assert found.keys() == expected
     for scan in found.values():
         assert scan.region == TURNED
@@ -112,12 +112,12 @@ def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
     made = bench()
     (made.data / "scan001-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
     (made.data / "scan002-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
-    (made.data / "scan001-Xp-dFreq.nc").write_bytes(b"of last year")
+    (made.data / "scan001-Xp-Phase.nc").write_bytes(b"of last year")
     peer = made.start()
     ready(peer)
     found = scanned(peer)
     assert found["ZS-Topo"].filename.endswith("scan003-M-Xp-ZSmTopo.nc")
-    assert found["dFreq"].filename.endswith("scan002-Xp-dFreq.nc")
+    assert found["Phase"].filename.endswith("scan002-Xp-Phase.nc")
     assert found["I-Tunnel"].filename.endswith("scan001-Xp-ImTunnel.nc")
 
 

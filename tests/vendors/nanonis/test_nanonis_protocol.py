@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from afspm.clock import ExperimentClock
 from afspm.emulators.nanonis import RELEASES, NanonisEmulator, wire
 from afspm.errors import InvalidValue
+from afspm.files import read
 from afspm.microscopes.nanonis import protocol
 from afspm.microscopes.nanonis.protocol import BadReply, NanonisError
 
@@ -254,6 +255,43 @@ def test_a_session_goes_on_in_a_folder_within_its_own(tmp_path: Path) -> None:
         assert str(session / "night").encode() in _asked(address, "Util.SessionPathGet")
     assert (session / "night").is_dir()
     assert [path.name for path in tmp_path.iterdir()] == ["session"]
+
+
+def test_the_frequency_shift_is_that_of_the_setpoint_and_of_the_picture(tmp_path: Path) -> None:
+    """All clients read the same sensor: signals, PLL, the picture, and the file's header."""
+    emulator = NanonisEmulator(feedback={"mode": "frequency-shift", "setpoint": -20.0})
+    with emulator.running(tmp_path, ExperimentClock.starting_now(speed=100.0)) as address:
+
+        def told_hz(name: str, body: bytes) -> float:
+            return float(np.mean([struct.unpack_from(">f", _asked(address, name, body))[0] for _ in range(40)]))
+
+        names = _asked(address, "Signals.NamesGet")
+        index = next(k for k, name in enumerate(_texts(names)) if name == "OC M1 Freq. Shift (Hz)")
+        assert b"OC M1 Freq. Shift" in _asked(address, "ZCtrl.CtrlListGet")
+        for setpoint_hz in (-20.0, -5.0):
+            _asked(address, "ZCtrl.SetpntSet", struct.pack(">f", setpoint_hz))
+            assert told_hz("Signals.ValGet", struct.pack(">iI", index, 1)) == pytest.approx(setpoint_hz, abs=0.1)
+            assert told_hz("PLL.FreqShiftGet", struct.pack(">i", 1)) == pytest.approx(setpoint_hz, abs=0.1)
+        _asked(address, "Scan.BufferSet", struct.pack(">iiii", 1, index, 16, 16))
+        _asked(address, "Scan.FrameSet", struct.pack(">5f", 0.0, 0.0, 1e-8, 1e-8, 0.0))
+        _asked(address, "Scan.Action", struct.pack(">HI", 0, 1))
+        ended = _asked(address, "Scan.WaitEndOfScan", struct.pack(">i", -1))
+        (scan,) = read(Path(ended[8:-8].decode())).scans[:1]
+        assert scan.channel == "OC_M1_Freq._Shift Forward"
+        assert np.median(scan.values) == pytest.approx(-5.0, abs=0.2)
+        assert "OC M1 Freq. Shift\t1\t-5.000E+0 Hz" in Path(ended[8:-8].decode()).read_bytes()[:5000].decode("latin-1")
+        _asked(address, "ZCtrl.Withdraw", struct.pack(">Ii", 1, -1))
+        assert told_hz("PLL.FreqShiftGet", struct.pack(">i", 1)) == pytest.approx(0.0, abs=0.1)
+
+
+def _texts(reply: bytes) -> list[str]:
+    """The texts of a list that a reply begins with."""
+    found, at = [], 8
+    for _ in range(struct.unpack_from(">i", reply, 4)[0]):
+        length = struct.unpack_from(">i", reply, at)[0]
+        found.append(reply[at + 4 : at + 4 + length].decode())
+        at += 4 + length
+    return found
 
 
 def _asked(address: str, name: str, body: bytes = b"") -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
@@ -64,6 +65,8 @@ class AsylumEmulator(Emulator):
         "crash": "Igor vanishes",
         **FAULT_KINDS,
     }
+
+    modes: ClassVar[Sequence[str]] = ("amplitude", "current")
 
     def __init__(
         self,

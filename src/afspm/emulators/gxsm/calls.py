@@ -186,16 +186,17 @@ class Calls:
         if code in ("o", "O"):
             volts = program.entries["OffsetX"] / _VOLT, program.entries["OffsetY"] / _VOLT
             return (0.0, *volts)
+        shown = program.rig.signals(now_s) if code in ("f", "R", "z") else {}
         if code == "f":
-            return (0.0, 0.0, 0.0)
+            return (shown.get("Frequency Shift", 0.0), shown["Current"] * 1e9, 0.0)
         if code in ("p", "P"):
             return self._pixel(now_s, centred=code == "p")
         if code == "R":
-            return (0.0, program.entries["ScanX"], program.entries["ScanY"])
+            return (shown["Height"] / ANGSTROM_M, program.entries["ScanX"], program.entries["ScanY"])
         if code == "z":
             x_m, y_m = program.rig.probe_at(now_s)
             volt_m = _VOLT * ANGSTROM_M
-            return (0.0, x_m / volt_m, y_m / volt_m)
+            return (shown["Height"] / volt_m, x_m / volt_m, y_m / volt_m)
         return (_NEVER_WRITTEN, _NEVER_WRITTEN, _NEVER_WRITTEN)
 
     def _pixel(self, now_s: float, *, centred: bool) -> tuple[float, float, float]:

@@ -53,7 +53,8 @@ CHANNELS: Final = {
         Channel("Height", "ZS-Topo", "Xp", *_ANGSTROM, 1.0),
         Channel("Height Retrace", "ZS-Topo", "Xm", *_ANGSTROM, 1.0),
         Channel("Current", "I-Tunnel", "Xp", ("nA", "nA"), 1e9, 1.0),
-        Channel("Phase", "dFreq", "Xp", ("Hz", "Hz"), 1.0, 1.0),
+        Channel("Frequency Shift", "dFreq", "Xp", ("Hz", "Hz"), 1.0, 1.0),
+        Channel("Phase", "Phase", "Xp", ("deg", "°"), 1.0, 1.0),
     ),
 }
 """By the version of GXSM."""

@@ -41,6 +41,12 @@ _PIXELS_S: Final = 0.045
 _EARLY_LINE_S, _EARLY_S = 0.2, 1.0
 """It ends a scan with lines longer than this after so long, and tells nobody."""
 _PULSE_S: Final = 1.0
+_MIXER: Final = ("dsp-fbs-mx0-current-set", "nA", 1.0)
+_MIXERS: Final = {
+    "current": ("dsp-fbs-mx0-current-set", "nA", 1e-9),
+    "frequency-shift": ("dsp-fbs-mx1-freq-set", "Hz", 1.0),
+}
+"""By the mode of the feedback: the entry of its setpoint, the unit, and a simulated one for one of GXSM's."""
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
@@ -122,9 +128,12 @@ class Program:
             return lambda value: setattr(rig, "slope", (*rig.slope[:axis], value, *rig.slope[axis + 1 :]))
 
         speed = Entry(2e4, 1e-3, 1e7, told=lambda value: setattr(rig, "move_speed_m_s", value * ANGSTROM_M))
+        mixer, unit, factor = _MIXERS.get(rig.world.settings.feedback.mode, _MIXER)
+        setpoint = Entry((loop.setpoint or 0.0) / factor, -1e3, 1e3, unit, told=fed_back("setpoint", factor))
         found = {
             "dsp-fbs-bias": bias,
-            "dsp-fbs-mx0-current-set": Entry(loop.setpoint or 0.0, -100.0, 100.0, "nA", told=fed_back("setpoint")),
+            "dsp-fbs-mx0-current-set": Entry(0.0, -100.0, 100.0, "nA"),
+            mixer: setpoint,
             "dsp-fbs-mx0-current-level": Entry(0.0, -100.0, 100.0, "nA"),
             "dsp-fbs-cp": Entry(loop.proportional_gain or 0.0, -100.0, 200.0, told=fed_back("proportional_gain")),
             "dsp-fbs-ci": Entry((loop.integral_gain or 0) / IGAIN, -100, 200, told=fed_back("integral_gain", IGAIN)),

@@ -155,6 +155,13 @@ def _log_status(panel: Panel) -> Answer:
     return (panel.logger.status(),)
 
 
+@answers("PLL.FreqShiftGet")
+def _frequency_shift(panel: Panel, modulator: int) -> Answer:
+    """Of the first modulator where the sensor has one; else what was set."""
+    measured = panel.frequency_shift_hz(panel.clock.now_s()) if modulator == 1 else None
+    return panel.registers.got("PLL.FreqShiftGet", [modulator]) if measured is None else (measured,)
+
+
 @answers("PLL.FreqShiftAutoCenter")
 def _center(panel: Panel, modulator: int) -> Answer:
     """The centre is where the frequency has shifted to."""

@@ -116,7 +116,7 @@ def _gain_get(panel: Panel) -> Answer:
 
 @answers("ZCtrl.CtrlListGet")
 def _z_controllers(panel: Panel) -> Answer:
-    return ["log Current"], 0
+    return [panel.z_controller_name[0]], 0
 
 
 @answers("ZCtrl.Withdraw")

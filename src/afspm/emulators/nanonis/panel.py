@@ -40,7 +40,8 @@ MOST_POINTS: Final = 1 << 16
 """Of a spectrum."""
 CURRENT: Final = 0
 _BIAS: Final = 24
-_SIGNALS: Final = {"Current": CURRENT, "Height": 14, "Phase": 16, "Amplitude": 17}
+_SIGNALS: Final = {"Current": CURRENT, "Height": 14, "Phase": 16, "Amplitude": 17, "Frequency Shift": 18}
+_UNITS: Final = {"Current": "A", "Height": "m", "Phase": "deg", "Amplitude": "V", "Frequency Shift": "Hz"}
 _OF_CURVES: Final = {"Deflection": (20, "m"), "Force": (21, "N"), "dI/dV": (22, "S")}
 """Signals of spectra alone, with their units."""
 _SLOTS: Final = 24
@@ -48,7 +49,7 @@ _NO_FILE_NAME: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in rang
 _LONGEST_NAME: Final = 200
 _STEP_M: Final = 100e-9
 _STEP_S: Final = 1e-3
-_NAMES: Final = {"Height": "Z"}
+_NAMES: Final = {"Height": "Z", "Frequency Shift": "OC M1 Freq. Shift"}
 _SWEPT: Final = {"Bias": "Bias calc", "Z": "Z rel"}
 _CURVE_CHANNELS: Final = {"BiasSpectr": (CURRENT, 22), "ZSpectr": (20, 21)}
 """What the simulated curves have."""
@@ -101,7 +102,7 @@ class Panel:
         self.folder, self.session_path = folder, session_path or str(folder)
         self._root, self._root_path = self.folder, self.session_path
         self.range_m = (range_m, range_m, 2e-6)
-        self.signals = _signal_names(rig.channels)
+        self.signals = _signal_names()
         self.channels = sorted(_SIGNALS[name] for name in rig.channels if name in _SIGNALS)
         self.pixels, self.lines = 128, 128
         self.frame = (0.0, 0.0, 1e-6, 1e-6, 0.0)
@@ -126,6 +127,11 @@ class Panel:
         self.z_follows_s = 0.0
         self.own_speed, self.own_speed_m_s = True, rig.move_speed_m_s
         self.registers = Registers()
+        self._shifts = "Frequency Shift" in rig.channels
+        if self._shifts:
+            sensor = rig.world.settings.feedback.sensor
+            self.registers.set("PLL.CenterFreqSet", [1, sensor.resonance_hz])
+            self.registers.set("PLL.AmpCtrlSetpntSet", [1, sensor.oscillation_m])
         self._late: list[tuple[float, Path, bytes]] = []
         self._starts: tuple[float, bool] | None = None
         self._saved: dict[tuple[str, str], int] = {}
@@ -320,6 +326,16 @@ class Panel:
         values |= {_SIGNALS["Height"]: self._z_m(shown["Height"]), _BIAS: self.rig.bias_v}
         return [values.get(index, 0.0) for index in indexes]
 
+    def frequency_shift_hz(self, now_s: float) -> float | None:
+        """Of the sensor; None where the feedback's mode has none."""
+        index = _SIGNALS["Frequency Shift"]
+        return self.signal_values([index], now_s)[0] if self._shifts else None
+
+    @property
+    def z_controller_name(self) -> tuple[str, str]:
+        """Name and unit of what it holds."""
+        return ("OC M1 Freq. Shift", "Hz") if self._shifts else ("log Current", "A")
+
     def z_m(self, now_s: float) -> float:
         """Where the tip is in z."""
         return self._z_m(self.rig.signals(now_s)["Height"])
@@ -372,11 +388,12 @@ class Panel:
         images = self.images(ended, scan.stopped_s)
         x, y, width, height, angle_deg = ended.frame
         integral = feedback.integral_gain or 0.0
+        controller, unit = self.z_controller_name
         z = (
-            "log Current",
+            controller,
             bool(feedback.on),
             feedback.setpoint or 0.0,
-            "A",
+            unit,
             feedback.proportional_gain or 0.0,
             integral,
         )
@@ -472,11 +489,11 @@ def curve_columns(curve: RunningSpectrum) -> list[str]:
     return columns
 
 
-def _signal_names(units: Mapping[str, str]) -> list[str]:
+def _signal_names() -> list[str]:
     """128 of them, as the signals manager has."""
     signals = [f"Input {number + 1} (V)" for number in range(128)]
     for name, index in _SIGNALS.items():
-        signals[index] = f"{_NAMES.get(name, name)} ({units.get(name, 'V')})"
+        signals[index] = f"{_NAMES.get(name, name)} ({_UNITS[name]})"
     for name, (index, unit) in _OF_CURVES.items():
         signals[index] = f"{name} ({unit})"
     signals[_BIAS] = "Bias (V)"

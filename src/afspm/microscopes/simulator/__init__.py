@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from afspm.errors import AfspmError, ConfigError, Gathered, Refused
 from afspm.microscopes.microscope import Action, Microscope, action
@@ -298,12 +298,16 @@ class Simulator(Microscope):
         return run_translator(self, context, FaultyTranslator)
 
 
+_SETPOINTS: Final[dict[str, dict[str, Any]]] = {
+    "amplitude": {"unit": "V", "range": ["1 mV", "10 V"]},
+    "current": {"unit": "A", "range": ["1 pA", "100 nA"]},
+    "frequency-shift": {"unit": "Hz", "range": ["-100 kHz", "-1 mHz"]},
+}
+
+
 def _rows_for(mode: str) -> dict[str, dict[str, Any]]:
-    """What depends on the operating mode: tapping has an amplitude as its setpoint, tunnelling a current."""
-    setpoint = (
-        {"unit": "A", "range": ["1 pA", "100 nA"]} if mode == "current" else {"unit": "V", "range": ["1 mV", "10 V"]}
-    )
-    return {names.ZCTRL_SETPOINT: setpoint, names.SPEC_KIND: {"choices": ["IV", "force"]}}
+    """Return the rows that depend on the operating mode: what its setpoint is."""
+    return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": ["IV", "force"]}}
 
 
 def _merged(*tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
