@@ -13,6 +13,7 @@ from typing import Any
 
 from afspm.logic.arbitration import Cause
 from afspm.logic.danger import FEEDBACK_OFF, Danger
+from afspm.logic.tip_duty import TipDuties, TipDuty, TipEvent
 from afspm.model import ControlResponse, Feedback, Parameter, Request, ScopeState, names
 
 _STOP = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
@@ -58,7 +59,7 @@ class Watchdog:
 
     The caller sends `next_action()` before anything else, reports by `answered` or `unsent`, and calls `look_again`
     when it is `due_s`. While it `owes_retract` nobody commands; but when that is `put_off`, since the microscope does
-    not do it, whoever is there to see to the tip may.
+    not do it, whoever is there to see to the tip may. What is owed to the tip follows from a table: see `tip_duty`.
 
     Attributes:
         danger: what is known of it.
@@ -70,34 +71,32 @@ class Watchdog:
         self._state = ScopeState.UNDEFINED
         self._starting: str | None = None
         self._states_seen = 0
-        self._wanted: list[str] = []
+        self._stops: list[str] = []  # wanted before the tip is retracted
+        self._tip = TipDuties()
         self._sent: str | None = None
         self._attempts = 0
         self._can_retract = True  # as far as we know
         self._refused_at = -1  # states seen when the microscope last was not free
         self._told_to_stop = self._unstoppable = False  # what runs
         self._for_feedback = False  # why the tip is to be retracted
-        self._put_off = False
         self._due_s: float | None = None
         self._retries = 0
         self._in_haste = False
-        self._left_to_people = False
 
     def snapshot(self) -> dict[str, Any]:
         """What must survive a kill, as plain JSON."""
         return {
-            "wanted": list(self._wanted),
+            "stops": list(self._stops),
             "for_feedback": self._for_feedback,
-            "put_off": self._put_off,
-            "left_to_people": self._left_to_people,
+            "tip": self._tip.snapshot(),
             "danger": self.danger.snapshot(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take up what `snapshot` wrote."""
-        self._wanted = [str(action) for action in state["wanted"]]
-        self._for_feedback, self._put_off = bool(state["for_feedback"]), bool(state["put_off"])
-        self._left_to_people = bool(state["left_to_people"])
+        self._stops = [str(action) for action in state["stops"]]
+        self._for_feedback = bool(state["for_feedback"])
+        self._tip.restore(state["tip"])
         self.danger.restore(state["danger"])
 
     def begin(self, now_s: float) -> None:
@@ -108,25 +107,32 @@ class Watchdog:
     @property
     def left_to_people(self) -> bool:
         """It has retracted the tip, or could not, and nobody was called yet: to go on is for a person to decide."""
-        return self._left_to_people
+        return self._tip.calls_people
 
     def leave_to_people(self) -> None:
         """Nobody can be told any more what to do with a tip in danger: the translator sees to it as it leaves."""
-        self._left_to_people |= self._settings.retract is not None and self.danger.now is not None
+        if self._settings.retract is not None and self.danger.now is not None:
+            self._tip.see(TipEvent.LEFT)
 
     def people_called(self) -> None:
         """The problem was flagged."""
-        self._left_to_people = False
+        self._tip.calls_people = False
 
     @property
     def owes_retract(self) -> bool:
         """The tip is to be retracted, now or later."""
-        return self._settings.retract in self._wanted
+        return self._tip.now is not TipDuty.NONE
 
     @property
     def put_off(self) -> bool:
         """The tip is to be retracted, but that is not done: it is tried again later."""
-        return self._put_off
+        return self._tip.now is TipDuty.PUT_OFF
+
+    @property
+    def _wanted(self) -> list[str]:
+        """The actions wanted, in order."""
+        retract = self._settings.retract
+        return [*self._stops, retract] if self.owes_retract and retract is not None else list(self._stops)
 
     @property
     def state(self) -> ScopeState:
@@ -147,7 +153,7 @@ class Watchdog:
         if (
             state is ScopeState.FREE and self._sent is None
         ):  # it ended while the translator could not be told to stop it
-            self._wanted = [action for action in self._wanted if action not in _STOP.values()]
+            self._stops = []
 
     def started(self, action: str, states_seen: int, *, certain: bool = True) -> bool:
         """An action succeeded, or may have, that was sent when `states_seen` states were known.
@@ -198,28 +204,25 @@ class Watchdog:
         knows = cause in (Cause.RELEASED, Cause.MANUAL) or (cause is Cause.SOLVED and by_holder)
         if cause is Cause.MANUAL or (was_seen_to and knows and not had_died):
             self.seen_to()
-        before = [] if self._put_off else list(self._wanted)
+        before = [] if self.put_off else self._wanted
         if self._can_retract and (had_died or not knows) and self.danger.now is not None:
             self._want_retract()
         stop = _STOP.get(self._state) or self._starting or _STARTS.get(in_flight or "")
-        if stop is not None and (cause in self._settings.stop_when or self.owes_retract) and stop not in self._wanted:
-            self._wanted.insert(0, stop)
-        return [] if self._put_off else [action for action in self._wanted if action not in before]
+        if stop is not None and (cause in self._settings.stop_when or self.owes_retract) and stop not in self._stops:
+            self._stops.insert(0, stop)
+        return [] if self.put_off else [action for action in self._wanted if action not in before]
 
     def _want_retract(self) -> None:
-        retract = self._settings.retract
-        if retract is None:
+        if self._settings.retract is None:
             return
-        if retract not in self._wanted:
-            self._wanted.append(retract)
         self._for_feedback = self.danger.by_feedback
-        if self._put_off:  # whoever was there to see to it is gone
-            self._put_off, self._due_s = False, None
+        if self.put_off:  # whoever was there to see to it is gone
+            self._due_s = None
+        self._tip.see(TipEvent.ENDANGERED)
 
     def seen_to(self) -> None:
         """Somebody sees to the tip: it is not retracted any more, unless it is just being."""
-        if self.owes_retract and self._sent != self._settings.retract:
-            self._forget_retract()
+        self._see(TipEvent.SEEN_TO)
 
     def put_right(self) -> None:
         """Somebody says that the tip is well again: it may be at the surface, where it can be endangered anew."""
@@ -238,31 +241,32 @@ class Watchdog:
         """The action to send now, if one is; it counts as sent."""
         if self._for_feedback and self.danger.feedback_is_on:
             self.seen_to()
-        if self._sent is not None or self._put_off or self._refused_at == self._states_seen:
+        if self._sent is not None or self.put_off or self._refused_at == self._states_seen:
             return None
         runs = _STOP.get(self._state)
-        if self.owes_retract and runs is not None and not self._told_to_stop and runs not in self._wanted:
-            self._wanted.insert(0, runs)
+        if self.owes_retract and runs is not None and not self._told_to_stop and runs not in self._stops:
+            self._stops.insert(0, runs)
         if not self._wanted or self._waits_for_stop():
             return None
         self._sent, self._due_s = self._wanted[0], None
         self._told_to_stop |= self._sent == runs
+        if not self._stops:
+            self._tip.see(TipEvent.SENT)
         return self._sent
 
     def _waits_for_stop(self) -> bool:
         """It has been told to stop, and the tip is retracted when it has."""
-        return self._wanted[0] == self._settings.retract and self._state in _STOP and not self._unstoppable
+        return not self._stops and self._state in _STOP and not self._unstoppable
 
     def answered(self, code: int, now_s: float) -> Result:
         """The translator answered what was sent (or NO_RESPONSE)."""
         action, self._sent = self._sent or "", None
-        is_retract = action == self._settings.retract
+        is_retract = self._tip.now is TipDuty.ASKED
         if code == ControlResponse.SUCCESS:
             self._starting = None
             if is_retract:
                 self.danger.tip_is_away(is_away=True)
-                self._left_to_people = True
-                self._forget_retract()
+                self._see(TipEvent.RETRACTED)
             else:
                 self._forget_stop(action)
                 self._due_s = now_s + self._wait_s if self.owes_retract else None
@@ -270,16 +274,17 @@ class Watchdog:
         if code == ControlResponse.NOT_FREE:
             self._refused_at = self._states_seen
             self._due_s = now_s + self._wait_s
+            self._see(TipEvent.NOT_YET)
             return Result.AGAIN
         self._attempts += 1
         if code == ControlResponse.NO_RESPONSE and self._attempts < self._settings.attempts:
+            self._see(TipEvent.NOT_YET)
             return Result.AGAIN
         if not is_retract:
             self._unstoppable = True
             self._forget_stop(action)
         elif code == ControlResponse.ACTION_NOT_SUPPORTED:
-            self._left_to_people = True
-            self._forget_retract()
+            self._see(TipEvent.IMPOSSIBLE)
         else:
             self._retract_later(now_s)
         return Result.FAILED
@@ -287,8 +292,7 @@ class Watchdog:
     def done_late(self, action: str) -> None:
         """The translator did what nobody waited for any more: a tip withdrawn late is left to people, too."""
         if action == self._settings.retract:
-            self._left_to_people = True
-            self.seen_to()
+            self._see(TipEvent.RETRACTED_LATE)
 
     def unsent(self, now_s: float) -> None:
         """What `next_action` said could not be sent: the translator is not connected. Again when it is."""
@@ -296,12 +300,13 @@ class Watchdog:
         self._attempts = 0
         self._refused_at = -1
         self._told_to_stop = False
+        self._see(TipEvent.NOT_YET)
         if self.owes_retract and self._due_s is None:
             self._due_s = now_s + self._wait_s
 
     def translator_is_there(self, now_s: float) -> None:
         """Another, or again: what was put off is due, once it has told how it is with the microscope."""
-        if self._put_off:
+        if self.put_off:
             self._due_s = now_s + _SOON_S
 
     # --- what does not come about ---
@@ -321,15 +326,14 @@ class Watchdog:
             what people are to be told, if that is new.
         """
         self._due_s = None
-        if self._put_off:
-            self._put_off, self._refused_at = False, -1
-            if is_seen_to:
-                self.seen_to()
+        if self.put_off:
+            self._refused_at = -1
+            self._see(TipEvent.SEEN_TO if is_seen_to else TipEvent.DUE)
             return None
         if not self._wanted or self._sent is not None:
             return None
-        action = self._wanted[0]
-        if action != self._settings.retract:
+        if self._stops:
+            action = self._stops[0]
             self._forget_stop(action)
             self._unstoppable, self._refused_at = True, -1
             return f"the microscope is never free to {action}"
@@ -346,20 +350,21 @@ class Watchdog:
         return _SOON_S if self._in_haste else self._settings.again_s
 
     def _retract_later(self, now_s: float) -> None:
-        self._put_off, self._left_to_people = True, True
+        self._tip.see(TipEvent.FAILED)
         wait_s = min(self._wait_s * 2**self._retries, self._settings.longest_s)
         self._due_s = now_s + (_SOON_S if self._in_haste else wait_s)
         self._retries = min(self._retries + 1, 32)
         self._attempts = 0
 
     def _forget_stop(self, action: str) -> None:
-        self._wanted = [other for other in self._wanted if other != action]
+        self._stops = [other for other in self._stops if other != action]
         self._attempts = 0
 
-    def _forget_retract(self) -> None:
-        self._wanted = [other for other in self._wanted if other != self._settings.retract]
-        self._put_off, self._due_s, self._for_feedback = False, None, False
-        self._attempts = self._retries = 0
+    def _see(self, event: TipEvent) -> None:
+        """Go on by the table; what was waited for is forgotten where nothing is owed any more."""
+        if self._tip.see(event):
+            self._due_s, self._for_feedback = None, False
+            self._attempts = self._retries = 0
 
 
 def feedback_of(request: Request) -> Feedback | None:

@@ -164,7 +164,7 @@ def test_silence_is_tried_again_and_given_up_loudly() -> None:
         assert dog.next_action() == "stop-scan"
         results.append(dog.answered(SILENCE, 0.0))
     assert results == [Result.AGAIN, Result.AGAIN, Result.FAILED]
-    assert dog.snapshot()["wanted"] == []
+    assert dog.snapshot()["stops"] == []
 
 
 def test_what_could_not_be_sent_is_sent_when_the_translator_is_back_unless_it_is_free_by_then() -> None:
@@ -278,6 +278,24 @@ def test_nor_is_one_there_for_a_scheduler_that_is_restarted() -> None:
     again.begin(100.0)
     assert again.look_again(110.0, is_seen_to=False) is not None
     assert again.left_to_people
+
+
+def test_a_restarted_scheduler_asks_again_for_what_it_was_asking() -> None:
+    dog = off(FREE)
+    dog.control_taken(Cause.DEAD, None)
+    assert dog.next_action() == "x-retract"
+    again = Watchdog()
+    again.restore(dog.snapshot())
+    assert again.next_action() == "x-retract"
+    again.put_right()
+    assert again.owes_retract, "what the microscope is being asked can't be called off"
+
+
+def test_a_late_withdrawal_leaves_nothing_owed_but_a_person_to_call() -> None:
+    dog = refused()
+    dog.people_called()
+    dog.done_late("x-retract")
+    assert (dog.owes_retract, dog.due_s, dog.left_to_people) == (False, None, True)
 
 
 @pytest.mark.parametrize("answer", [OK, ERROR, NOT_FREE])
