@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,9 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from afspm.record.disk import Disk, DiskHangs
+
 
 class Truth:
     """Appends one JSON object a line: `n`, `time_s` (experiment), `event` and what belongs to it.
+
+    A disk that hangs gets the lines later: the microscope does not wait for it.
 
     Args:
         kept: where the number of the last line is kept. After a kill the last event may be written again, under
@@ -21,11 +26,16 @@ class Truth:
     def __init__(self, path: Path, kept: dict[str, Any]) -> None:
         self._path = path
         self._kept = kept
+        self._disk = Disk()
 
     def note(self, time_s: float, event: str, facts: Mapping[str, Any]) -> None:
         """Write down what happened."""
         self._kept["truth_lines"] = number = int(self._kept.get("truth_lines", 0)) + 1
         line = json.dumps({"n": number, "time_s": time_s, "event": event, **facts}, default=_plain)
+        with contextlib.suppress(DiskHangs):
+            self._disk.run(lambda: self._append(line), len(line))
+
+    def _append(self, line: str) -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
