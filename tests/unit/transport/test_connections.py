@@ -53,7 +53,7 @@ def test_a_client_that_is_answered_is_never_disconnected_however_much_it_asks(
     open_: Any, plain: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, answering: str
 ) -> None:
     monkeypatch.setattr(connections, "UNFINISHED_S", 0.0)
-    monkeypatch.setattr(connections, "UNFINISHED_BYTES", 1000)
+    monkeypatch.setattr(connections, "UNFINISHED_BYTES", 5000)
     monkeypatch.setattr(connections, "PERIOD_S", 0.01)
     answer, address = translator(open_) if answering == "a translator" else scheduler(open_)
     asking, rounds, until_s = plain(zmq.REQ), 0, time.monotonic() + 0.3

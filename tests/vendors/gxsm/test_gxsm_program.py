@@ -367,7 +367,7 @@ def test_a_spectrum_and_its_event(bench: Make) -> None:
 
 
 def test_the_frequency_shift_is_that_of_the_picture_and_of_the_setpoint(bench: Make) -> None:
-    made = bench(surface="steps", **NON_CONTACT)
+    made = bench(speed=1.0, surface="steps", **NON_CONTACT)  # slow enough to be seen scanning
 
     def told(code: str) -> float:
         return float(np.mean([gxsm.call("rtquery", code)[0] for _ in range(30)]))
