@@ -367,7 +367,7 @@ def test_a_spectrum_and_its_event(bench: Make) -> None:
 
 
 def test_the_frequency_shift_is_that_of_the_picture_and_of_the_setpoint(bench: Make) -> None:
-    made = bench(speed=1.0, surface="steps", **NON_CONTACT)  # slow enough to be seen scanning
+    made = bench(speed=20.0, surface="steps", **NON_CONTACT)
 
     def told(code: str) -> float:
         return float(np.mean([gxsm.call("rtquery", code)[0] for _ in range(30)]))
@@ -375,6 +375,7 @@ def test_the_frequency_shift_is_that_of_the_picture_and_of_the_setpoint(bench: M
     with calling(made) as gxsm:
         small(gxsm)
         gxsm.call("set", "RangeX", "100")
+        gxsm.call("set", "dsp-fbs-scan-speed-scan", "100")  # slow enough to be seen scanning
         gxsm.call("startscan")
         until(made, lambda: bool(bits(gxsm) & 2))
         until(made, lambda: not bits(gxsm) & 2)
