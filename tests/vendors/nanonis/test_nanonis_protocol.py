@@ -260,7 +260,7 @@ def test_a_session_goes_on_in_a_folder_within_its_own(tmp_path: Path) -> None:
 def test_the_frequency_shift_is_that_of_the_setpoint_and_of_the_picture(tmp_path: Path) -> None:
     """All clients read the same sensor: signals, PLL, the picture, and the file's header."""
     emulator = NanonisEmulator(feedback={"mode": "frequency-shift", "setpoint": -20.0})
-    with emulator.running(tmp_path, ExperimentClock.starting_now(speed=10.0)) as address:  # its end is awaited
+    with emulator.running(tmp_path, ExperimentClock.starting_now(speed=2.0)) as address:  # its end is awaited
 
         def told_hz(name: str, body: bytes) -> float:
             return float(np.mean([struct.unpack_from(">f", _asked(address, name, body))[0] for _ in range(40)]))
