@@ -152,13 +152,7 @@ class Syncer:
 
     def folder_soon(self, folder: Path) -> None:
         """The same for the names of the files in a folder. Raises OSError."""
-        if sys.platform == "win32":  # there is no folder to wait for there
-            return
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            self.soon(descriptor)
-        finally:
-            os.close(descriptor)
+        _with_folder(folder, self.soon)
 
     def now(self, within_s: float) -> None:
         """All that was written until now is on the disk.
@@ -207,10 +201,15 @@ def sync_file(descriptor: int) -> None:
 
 def sync_folder(folder: Path) -> None:
     """Wait until the names of the files in a folder are on the disk. Raises OSError."""
-    if sys.platform == "win32":  # there is no folder to wait for there
+    _with_folder(folder, os.fsync)
+
+
+def _with_folder(folder: Path, sync: Callable[[int], None]) -> None:
+    """Call `sync` with the descriptor of a folder; not on Windows, where there is none to wait for."""
+    if sys.platform == "win32":
         return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        sync(descriptor)
     finally:
         os.close(descriptor)
