@@ -20,8 +20,8 @@ from afspm.errors import AfspmError, ConfigError, WireError
 from afspm.exit_codes import ExitCode
 from afspm.logic.fencing import Epoch, SchedulerFence
 from afspm.logic.forwarder import NOT_SENT
+from afspm.logic.microscope_status import feedback_of
 from afspm.logic.sessions import run_of
-from afspm.logic.watchdog import feedback_of
 from afspm.microscopes import in_force
 from afspm.microscopes.emulated import EmulatedController, wired_to
 from afspm.microscopes.ledger import Ledger

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import Any
 
+from afspm.logic.state import VERSION, SavedState
+from afspm.model import snapshot
 from afspm.record.whole import Generations, ToldOnce, load
 
 
@@ -23,8 +24,8 @@ class StateFile:
         self._log = log
         self._told = ToldOnce("a restart would not know what is in force now", log)
 
-    def load(self) -> dict[str, Any]:
-        """What was saved last; empty if nothing was.
+    def load(self) -> SavedState | None:
+        """Return what was saved last; None if nothing was.
 
         If that is damaged, as a power cut may leave it, the generation before is taken up: the mode, and the problems
         that stand, but nobody in control. Who was then may not be now, and asks again.
@@ -33,19 +34,16 @@ class StateFile:
             FileError: neither can be read. To begin without a problem that is flagged could cost a tip.
         """
         if self.path is None:
-            return {}
+            return None
         state, damage = load(self.path, _read)
-        if state is None:
-            return {}
-        if damage:
-            self._log.critical(
-                "what was in force is damaged, the generation before is taken up, with nobody in control: %s", damage
-            )
-            control = {**state["control"], "holder": None, "solving": 0}
-            state = {**state, "control": control, "granted_to": None}
-        return state
+        if state is None or not damage:
+            return state
+        self._log.critical(
+            "what was in force is damaged, the generation before is taken up, with nobody in control: %s", damage
+        )
+        return state.without_holder()
 
-    def save(self, state: dict[str, Any]) -> None:
+    def save(self, state: SavedState) -> None:
         """Write it down; when this returns it outlives a kill.
 
         A disk that is full must not end the experiment: it is said, and the experiment goes on.
@@ -53,7 +51,7 @@ class StateFile:
         if self._generations is None:
             return
         with self._told.trying():
-            self._generations.save(json.dumps(state, ensure_ascii=False).encode())
+            self._generations.save(json.dumps(snapshot.take(state, VERSION), ensure_ascii=False).encode())
 
     def close(self) -> None:
         """Make sure that what was saved last is on the disk."""
@@ -61,8 +59,5 @@ class StateFile:
             self._generations.close()
 
 
-def _read(content: bytes) -> dict[str, Any]:
-    state = json.loads(content)
-    if not isinstance(state, dict) or not isinstance(state.get("control"), dict):
-        raise ValueError("it is not the state of a scheduler")
-    return state
+def _read(content: bytes) -> SavedState:
+    return snapshot.load(SavedState, json.loads(content), VERSION)

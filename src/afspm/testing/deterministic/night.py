@@ -12,7 +12,7 @@ from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.restart import RestartPolicy
-from afspm.logic.scheduler_core import SchedulerSettings
+from afspm.logic.settings import SchedulerSettings
 from afspm.logic.supervision import ChildPolicy
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Packet, PacketHeader, ScopeState, names
