@@ -41,7 +41,7 @@ class Software:
         self._image_open = image_open
 
     def table(self) -> dict[str, Function]:
-        """By their names in lower case, as Igor does not tell the two apart."""
+        """Return the functions by name in lower case, since Igor ignores case."""
         values = self._controller.values
         table = {
             "GV": Function(self._get, "s"),

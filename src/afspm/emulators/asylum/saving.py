@@ -32,7 +32,7 @@ class Write:
 
 
 class Disk:
-    """What is still to be written."""
+    """The file parts that are still to be written."""
 
     def __init__(self) -> None:
         self._writes: list[Write] = []
@@ -85,7 +85,7 @@ def curve(name: str, spectrum: RunningSpectrum, values: Values, now_s: float) ->
 
 
 def _of_curve(spectrum: RunningSpectrum, distance_m: float, points: int, values: Values) -> Entries:
-    """What the note of a force curve says of how it was taken."""
+    """Return the entries of a force curve's note that describe its acquisition."""
     duration_s = spectrum.end_s - spectrum.start_s
     velocity_m_s = distance_m / (duration_s / 2)
     place = zip(("XLVDT", "YLVDT"), spectrum.position_m, strict=True)
