@@ -103,7 +103,7 @@ class Rig:
         return dict(self._units)
 
     def doing(self, now_s: float) -> str:
-        """Return the activity: "scan", "spectrum", "move", "pulse", "crash", "approach" or that of `occupy`; empty if free."""
+        """Return "scan", "spectrum", "move", "pulse", "crash", "approach", the activity of `occupy`, or "" if free."""
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:
