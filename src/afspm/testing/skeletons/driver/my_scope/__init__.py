@@ -13,11 +13,11 @@ import numpy as np
 
 from afspm.clock import Clock
 from afspm.errors import FileError
-from afspm.microscopes import Microscope, Value, action
 from afspm.model import Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator import Driver, Value, action
 
 
-class MyScope(Microscope):
+class MyScope(Driver):
     """The microscope behind the controller.
 
     Args:
