@@ -19,7 +19,6 @@ from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, WireError
 from afspm.exit_codes import ExitCode
 from afspm.logic.epochs import Allegiance, Epoch
-from afspm.logic.forwarding import NOT_SENT
 from afspm.logic.sessions import run_of
 from afspm.logic.watchdog import feedback_of
 from afspm.microscopes import in_force
@@ -34,7 +33,17 @@ from afspm.microscopes.sequence import Complain, Deliver, Discard, Say, Step
 from afspm.microscopes.sequence import Sequence as StateSequence
 from afspm.microscopes.service import Service
 from afspm.microscopes.sole import ControllerTaken, commanding
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Request,
+    Response,
+    ResponseDetail,
+    ScopeState,
+    ScopeStatus,
+    names,
+)
 from afspm.runtime.memory import Memory
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 
@@ -372,8 +381,11 @@ class Translator:
         except LOST as error:
             if self._connected:
                 self._lose(error)
-            reason = f"{'' if self._acting is request else NOT_SENT}the controller can't be reached: {error}"
-            self._finish(request, Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id))
+            reason = f"the controller can't be reached: {error}"
+            detail = ResponseDetail.OUTCOME_UNKNOWN
+            if self._acting is not request:
+                reason, detail = f"not sent: {reason}", ResponseDetail.NOT_SENT
+            self._finish(request, Response(ControlResponse.NO_RESPONSE, b"", reason, request.id, detail))
 
     def _end(self) -> None:
         """The scheduler says that the experiment is over."""
