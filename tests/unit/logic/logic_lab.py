@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from afspm.logic.chronicle import PERIOD_S
+from afspm.logic.event_log import PERIOD_S
 from afspm.logic.events import (
     Connected,
     Disconnected,
@@ -22,7 +22,7 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
-from afspm.logic.scheduling import SchedulerCore
+from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
     TELL_REQUEST,
