@@ -12,8 +12,8 @@ from afspm.dashboard.sample_map import MapContent, map_html
 from afspm.dashboard.time_line import NOT_HEARD_OF, time_line_html
 from afspm.dashboard.watch import OLD_AFTER_S, Watch
 from afspm.dashboard.words import colour_class, date_and_clock, escape, position
+from afspm.formatting import lasting, time_of_day
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
-from afspm.model.words import lasting, time_of_day
 from afspm.record.overview import OVER, Overview
 
 ANEW_S = 0.4  # at most that often, however much is published
@@ -203,7 +203,7 @@ def _problems(overview: Overview) -> tuple[tuple[int, str, str], ...]:
     flagged = overview.control.problems if overview.control else ()
     found = []
     for number in flagged:
-        now = overview.problem_lanes[number].now if number in overview.problem_lanes else None
+        now = overview.problem_timelines[number].now if number in overview.problem_timelines else None
         found.append((number, overview.problems.name(number), now.by if now else ""))
     return tuple(found)
 

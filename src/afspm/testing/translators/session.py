@@ -17,9 +17,8 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.microscopes import Microscope
 from afspm.model import Frame
-from afspm.record.facts import STATE_DIR
+from afspm.record.run_json import STATE_DIR
 from afspm.runtime.component import Component
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
@@ -33,6 +32,7 @@ from afspm.testing.translators.bench import Bench
 from afspm.testing.translators.processes import Processes
 from afspm.testing.translators.support import Support, find_out
 from afspm.testing.translators.verdicts import Lost
+from afspm.translator import Driver
 from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
 
@@ -144,7 +144,7 @@ def opened(options: Options) -> Iterator[Session]:
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
         class_ = resolved.classes.get(translator.name)
         excused: Mapping[str, str] = {}
-        if isinstance(class_, type) and issubclass(class_, Microscope):
+        if isinstance(class_, type) and issubclass(class_, Driver):
             excused = class_.excused(support.controller)
         yield Session(bench, support, named, simulated, folder, options, excused, complaints)
 
