@@ -1,4 +1,4 @@
-"""The TCP Logger: a stream of signals on a port of its own, to whoever has connected there. No sockets here."""
+"""The TCP TcpLogger: a stream of signals on a port of its own, to whoever has connected there. No sockets here."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _MOST_AT_ONCE: Final = 20
 _DISCONNECTED, _IDLE, _RUNNING, _OVERFLOW = 0, 1, 4, 7
 
 
-class Logger:
-    """The TCP Logger: which slots it streams, and its frames.
+class TcpLogger:
+    """The TCP TcpLogger: which slots it streams, and its frames.
 
     Attributes:
         slots: of the Signals Manager, which the channels are.
