@@ -15,10 +15,10 @@ import pytest
 from afspm import wire
 from afspm.errors import ControlLost
 from afspm.exit_codes import ExitCode
-from afspm.logic.liveness import LivenessPolicy
-from afspm.logic.restart import RestartPolicy
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.supervision import ChildPolicy
+from afspm.logic.supervision.child import ChildPolicy
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.restart import RestartPolicy
 from afspm.model import Problem, Region
 from afspm.runtime.component import Component
 from afspm.scheduler.wire_codec import WireCodec

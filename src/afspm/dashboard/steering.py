@@ -14,7 +14,7 @@ from afspm.dashboard.access import Access, Visitor, check_name
 from afspm.dashboard.acts import Acts, Outcome
 from afspm.dashboard.watch import Watch
 from afspm.errors import AfspmError
-from afspm.model.journal import PERSON
+from afspm.model.events import PERSON
 from afspm.runtime.launch import Launch
 from afspm.runtime.link import Link
 from afspm.runtime.process import new_session

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
-from afspm.logic.supervision import ChildPolicy
+from afspm.logic.supervision.child import ChildPolicy
 from afspm.runtime.launch import Launch, Sockets
 
 FULL = Launch(
