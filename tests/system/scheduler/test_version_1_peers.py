@@ -13,7 +13,9 @@ import zmq
 from version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
 
 from afspm import wire
+from afspm.client.link import ExperimentLink
 from afspm.clock import ExperimentClock
+from afspm.launch import Launch, Sockets
 from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
@@ -30,8 +32,6 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.runtime.launch import Launch, Sockets
-from afspm.runtime.link import Link
 from afspm.supervisor import run_identity
 from afspm.supervisor.reporter import Reporter, ReportFailed
 from afspm.transport.network import Network
@@ -299,7 +299,7 @@ class Pumped:
 
 
 def test_our_component_asks_their_scheduler_what_version_1_has(port: ZmqPort, router: Router) -> None:
-    link = Link(Pumped(port, router), "Ours", session="a")  # type: ignore[arg-type]
+    link = ExperimentLink(Pumped(port, router), "Ours", session="a")  # type: ignore[arg-type]
     requests = [
         (ControlRequest.REQUEST_CTRL, 0),
         (ControlRequest.ACTION, "start-scan"),

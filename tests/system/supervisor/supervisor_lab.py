@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from afspm.experiment import Role
+from afspm.launch import Launch
 from afspm.logic.supervision.child import ChildPolicy
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.logic.supervision.restart import RestartPolicy
-from afspm.runtime.launch import Launch
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.supervisor.task import Task
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import pytest
 
 from afspm.experiment import Role
+from afspm.launch import Launch
 from afspm.logic.supervision.child import ChildPolicy, ChildWatch
 from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.model import ProcessCondition
-from afspm.runtime.launch import Launch
 from afspm.supervisor.process_status import ProcessStatus
 from afspm.supervisor.task import Task
 from afspm.transport.heartbeat import Heartbeat
