@@ -31,7 +31,6 @@ from afspm.transport.port import ParentGone, Port
 LOADED_WITHIN_S = 300.0  # a large library off a slow disk, the weights of a network
 FAREWELL_S = 1.0  # that exit handlers and threads of libraries have, once everything of ours is done
 MOST_FILES = 65_536  # more than anybody needs; some programs that are started by ours walk through all that may be
-MEASURED = frozenset({"Scan2d", "Spec1d"})
 
 
 def main() -> int:

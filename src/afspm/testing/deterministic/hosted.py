@@ -1,6 +1,6 @@
 """Real components and the real translator as simulated processes: their own code, in-memory ports, a folder for a disk.
 
-`HostedComponent` runs a `Component` as the host of `afspm.runtime` does, `HostedTranslator` a `Driver` behind the
+`HostedComponent` runs a `Component` as the host of `afspm.process` does, `HostedTranslator` a `Driver` behind the
 real `Translator`. All of it speaks the real wire format.
 """
 
