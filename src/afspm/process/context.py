@@ -21,6 +21,7 @@ STATE_MESSAGES = frozenset({"ScopeStateMsg", "ControlState", "ScanParameters2d",
 MEASURED_MESSAGES = frozenset({"Scan2d", "Spec1d"})
 """Every component's port subscribes to both: its `Scope` follows the state, and its own measurements."""
 
+
 class ProcessActivity:
     """How long the current step has been running: what tells a busy process from a frozen one.
 
