@@ -17,7 +17,7 @@ from afspm.model import Packet, ProblemNames
 from afspm.process.message_types import register_all
 from afspm.record.overview import Overview
 from afspm.record.run_lock import cut_off_message
-from afspm.transport.launching import open_port
+from afspm.transport.zmq_port import open_port
 
 SMALL = (
     "ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "DriftMapping",

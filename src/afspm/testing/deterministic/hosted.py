@@ -24,7 +24,6 @@ from afspm.testing.deterministic.scheduler import SchedulerHost
 from afspm.testing.deterministic.timeline import Timeline, Timer
 from afspm.translator.driver import Driver
 from afspm.translator.process import Translator
-from afspm.transport.history import Published
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -37,6 +36,7 @@ from afspm.transport.port import (
     SubscriberJoined,
 )
 from afspm.transport.port import Killed as KillReceived
+from afspm.transport.replay import Published
 
 SOURCE = "memory://scheduler"
 
