@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from tests.simulation.codec import TableCodec
+
 from afspm.logic.chronicle import PERIOD_S
 from afspm.logic.events import (
     Connected,
@@ -41,7 +43,6 @@ from afspm.model import (
     ScopeStatus,
     Told,
 )
-from afspm.testing.deterministic.codec import TableCodec
 
 NS = 10**9
 

@@ -33,9 +33,9 @@ from afspm.logic.events import (
 )
 from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
 from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, PacketHeader, Request, Response
-from afspm.testing.deterministic.network import ControlLine, ControlServer, Feed, Publisher, Weather
-from afspm.testing.deterministic.process import Alarm, Process
-from afspm.testing.deterministic.timeline import Timeline
+from tests.simulation.network import ControlLine, ControlServer, Feed, Publisher, Weather
+from tests.simulation.process import Alarm, Process
+from tests.simulation.timeline import Timeline
 
 Entry = tuple[Packet, int | None]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from afspm.model import Packet, Request, Response
-from afspm.testing.deterministic.timeline import Timeline
+from tests.simulation.timeline import Timeline
 
 Deliver = Callable[..., None]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from afspm.logic.supervision import ChildWatch, Effect, GiveUp, Kill, Phase, Policy, Start
 from afspm.model import ProcessCondition, ProcessState
-from afspm.testing.deterministic.process import Process
-from afspm.testing.deterministic.timeline import Timeline
+from tests.simulation.process import Process
+from tests.simulation.timeline import Timeline
 
 _OVER = {Phase.DONE: ProcessCondition.ENDED, Phase.GIVEN_UP: ProcessCondition.GIVEN_UP}
 

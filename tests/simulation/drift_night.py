@@ -15,12 +15,12 @@ from afspm.model import ControlResponse, Packet, Region, Request, Scan, ScanPara
 from afspm.scheduler.drift.core import DriftCore
 from afspm.scheduler.drift.settings import DriftSettings, RescanRule
 from afspm.scheduler.drift.told import Forecasted, Registered, RescanWanted, ScanJob, WorkerGone, WorkerSaid
-from afspm.testing.deterministic.codec import TableCodec
-from afspm.testing.deterministic.invariants import InvariantViolated
-from afspm.testing.deterministic.microscope import FakeMicroscope, FakeScan, Habits
-from afspm.testing.deterministic.night import Night, Plan
-from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import START_S
+from tests.simulation.codec import TableCodec
+from tests.simulation.invariants import InvariantViolated
+from tests.simulation.microscope import FakeMicroscope, FakeScan, Habits
+from tests.simulation.night import Night, Plan
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import START_S
 
 SHAPE = (4, 4)
 WANTED = Region((0.0, 0.0), (2e-6, 2e-6))
@@ -31,7 +31,8 @@ CERTAIN_M = 1e-12
 def drift_m(time_s: float) -> np.ndarray:
     """Where the sample is: fast at first, then slower."""
     since_s = time_s - START_S
-    return np.array([1e-6, -0.5e-6]) * (1.0 - np.exp(-since_s / 7200.0)) + np.array([1e-11, 0.0]) * since_s
+    settled = float(1.0 - np.exp(-since_s / 7200.0))
+    return np.array([1e-6, -0.5e-6]) * settled + np.array([1e-11, 0.0]) * since_s
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,7 @@ class PlayedWorker:
     def _arrive(self, host: SchedulerHost, life: int, said: WorkerSaid) -> None:
         if life == self._life:
             timeline = self._night.timeline
+            assert isinstance(host.core, DriftCore)
             host.carry_out(host.core.said(said, timeline.monotonic_s(), timeline.now_ns()))
 
 

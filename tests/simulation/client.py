@@ -14,11 +14,11 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.testing.deterministic.codec import TableCodec
-from afspm.testing.deterministic.network import ControlLine, Feed, Weather
-from afspm.testing.deterministic.process import Alarm, Process
-from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import Timeline
+from tests.simulation.codec import TableCodec
+from tests.simulation.network import ControlLine, Feed, Weather
+from tests.simulation.process import Alarm, Process
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline
 
 Doing = Generator[float, None, Any]
 """What a component does. It yields how long (real) it waits at most; it goes on when that is over or anything came."""

@@ -32,13 +32,13 @@ from afspm.model import (
     ScopeState,
     names,
 )
-from afspm.testing.deterministic.client import Client
-from afspm.testing.deterministic.codec import TableCodec
-from afspm.testing.deterministic.microscope import FakeMicroscope
-from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import Timeline
-from afspm.testing.deterministic.tip_safety import TipSafety
-from afspm.testing.deterministic.written import Written
+from tests.simulation.client import Client
+from tests.simulation.codec import TableCodec
+from tests.simulation.microscope import FakeMicroscope
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline
+from tests.simulation.tip_safety import TipSafety
+from tests.simulation.written import Written
 
 _SUCCESS, _NO_RESPONSE = int(ControlResponse.SUCCESS), int(ControlResponse.NO_RESPONSE)
 _FORWARDED = range(int(ControlRequest.ACTION), int(ControlRequest.SET_PROBE_POS) + 1)

@@ -19,9 +19,9 @@ from afspm.model import (
     ProblemNames,
     component_of,
 )
-from afspm.testing.deterministic.codec import TableCodec
-from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import Timeline
+from tests.simulation.codec import TableCodec
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline
 
 _NO_RESPONSE = int(ControlResponse.NO_RESPONSE)
 _REMEMBERED = 5000

@@ -1,4 +1,4 @@
-"""Many simulated nights: `python -m afspm.testing.longrun --hours 10000 --seed 1`.
+"""Many simulated nights: `python -m tests.simulation.long_run --hours 10000 --seed 1`.
 
 A seed that fails is printed with what was violated and what led to it; `--seed S --nights 1` replays it exactly.
 """
@@ -10,13 +10,13 @@ import sys
 from collections.abc import Sequence
 
 from afspm.clock import ExperimentClock
-from afspm.testing.deterministic.invariants import InvariantViolated
-from afspm.testing.deterministic.night import Night, plan
+from tests.simulation.invariants import InvariantViolated
+from tests.simulation.night import Night, plan
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Returns 1 if an invariant was violated."""
-    parser = argparse.ArgumentParser(prog="python -m afspm.testing.longrun", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.simulation.long_run", description=__doc__)
     parser.add_argument("--hours", type=float, default=3000.0, help="experiment hours in all")
     parser.add_argument("--nights", type=int, help="instead: how many nights")
     parser.add_argument("--seed", type=int, default=1, help="of the first night; each further one has the next")
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             outcome = Night(plan(seed)).run()
         except InvariantViolated as error:
-            sys.stderr.write(f"{error}\n\nreplay it: python -m afspm.testing.longrun --seed {seed} --nights 1\n")
+            sys.stderr.write(f"{error}\n\nreplay it: python -m tests.simulation.long_run --seed {seed} --nights 1\n")
             return 1
         hours, steps, scans, seed = hours + outcome.hours, steps + outcome.steps, scans + outcome.scans, seed + 1
     took_s = clock.monotonic_s() - began_s

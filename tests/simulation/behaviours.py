@@ -19,7 +19,7 @@ from afspm.model import (
     Told,
     names,
 )
-from afspm.testing.deterministic.client import Client, Doing
+from tests.simulation.client import Client, Doing
 
 _OK = int(ControlResponse.SUCCESS)
 
@@ -158,7 +158,7 @@ class Careless(Experiment):
 
     def be_away(self, for_s: float) -> None:
         self.banned = True
-        self.timeline.after(for_s, setattr, self, "banned", False)  # noqa: FBT003
+        self.timeline.after(for_s, setattr, self, "banned", False)
         self.kill(-11)
 
     def behave(self) -> Doing:

@@ -26,8 +26,8 @@ from afspm.logic.scheduling import SchedulerCore
 from afspm.logic.sessions import Hearing, Sessions
 from afspm.logic.watchdog import Watchdog
 from afspm.model import JournalEntries
-from afspm.testing.deterministic.invariants import InvariantViolated
-from afspm.testing.deterministic.night import Fault, Night, Plan, plan
+from tests.simulation.invariants import InvariantViolated
+from tests.simulation.night import Fault, Night, Plan, plan
 
 NIGHTS = 16
 Patch = pytest.MonkeyPatch

@@ -16,16 +16,16 @@ from afspm.logic.scheduling import SchedulerSettings
 from afspm.logic.supervision import Policy
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Packet, PacketHeader, ScopeState, names
-from afspm.testing.deterministic import behaviours
-from afspm.testing.deterministic.client import Client
-from afspm.testing.deterministic.codec import TableCodec
-from afspm.testing.deterministic.invariants import Invariants, InvariantViolated
-from afspm.testing.deterministic.keeper import Keeper
-from afspm.testing.deterministic.microscope import FakeMicroscope, FakeScan, Habits
-from afspm.testing.deterministic.network import Weather
-from afspm.testing.deterministic.process import Process
-from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import GoesInCircles, Timeline
+from tests.simulation import behaviours
+from tests.simulation.client import Client
+from tests.simulation.codec import TableCodec
+from tests.simulation.invariants import Invariants, InvariantViolated
+from tests.simulation.keeper import Keeper
+from tests.simulation.microscope import FakeMicroscope, FakeScan, Habits
+from tests.simulation.network import Weather
+from tests.simulation.process import Process
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import GoesInCircles, Timeline
 
 _CALM = 0.15
 """The last part of a night, in which nothing bad happens any more and all must come right again."""
@@ -282,7 +282,7 @@ class Night:
         elif fault.what == "outage":
             process.banned = True
             process.kill()
-            self.timeline.after(fault.for_s, setattr, process, "banned", False)  # noqa: FBT003
+            self.timeline.after(fault.for_s, setattr, process, "banned", False)
         elif fault.what == "freeze":
             process.freeze(fault.for_s)
         elif fault.what == "busy":
@@ -316,7 +316,7 @@ class Night:
     def _full_disk(self, for_s: float) -> None:
         self.scheduler.disk.full = True
         self.invariants.forgets()
-        self.timeline.after(for_s, setattr, self.scheduler.disk, "full", False)  # noqa: FBT003
+        self.timeline.after(for_s, setattr, self.scheduler.disk, "full", False)
 
     def _storm(self, for_s: float) -> None:
         """Messages take long, and all connections break at its beginning."""

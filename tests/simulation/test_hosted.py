@@ -22,12 +22,12 @@ from afspm.logic.supervision import Policy
 from afspm.model import Problem, Region
 from afspm.runtime.component import Component
 from afspm.scheduler.codec import WireCodec
-from afspm.testing.deterministic.bench import CHANNELS, BenchMicroscope
-from afspm.testing.deterministic.hosted import HostedComponent, HostedTranslator
-from afspm.testing.deterministic.keeper import Keeper
-from afspm.testing.deterministic.network import Weather
-from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import Timeline
+from tests.simulation.bench import CHANNELS, BenchMicroscope
+from tests.simulation.hosted import HostedComponent, HostedTranslator
+from tests.simulation.keeper import Keeper
+from tests.simulation.network import Weather
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline
 
 TILES = 6
 SCAN_S = 60.0

@@ -21,11 +21,6 @@ from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.memory import Memory
 from afspm.runtime.process import Activity, Context
 from afspm.runtime.view import KEPT
-from afspm.testing.deterministic.baton import Baton
-from afspm.testing.deterministic.network import ControlLine, Feed, Weather
-from afspm.testing.deterministic.process import Process
-from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import Timeline, Timer
 from afspm.transport.history import Published
 from afspm.transport.port import (
     CaughtUp,
@@ -39,6 +34,11 @@ from afspm.transport.port import (
     SubscriberJoined,
 )
 from afspm.transport.port import Killed as KillReceived
+from tests.simulation.baton import Baton
+from tests.simulation.network import ControlLine, Feed, Weather
+from tests.simulation.process import Process
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline, Timer
 
 SOURCE = "memory://scheduler"
 

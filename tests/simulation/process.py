@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from afspm.testing.deterministic.timeline import Timeline, Timer
+from tests.simulation.timeline import Timeline, Timer
 
 
 class Cuttable(Protocol):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drift_night import DriftNight
 
-from afspm.testing.deterministic.night import Plan, plan
+from tests.simulation.drift_night import DriftNight
+from tests.simulation.night import Plan, plan
 
 
 @pytest.mark.parametrize("seeds", [range(first, first + 6) for first in range(0, 12, 6)], ids=str)

@@ -10,11 +10,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from afspm.model import ProcessCondition
-from afspm.testing import longrun
-from afspm.testing.deterministic.night import CAST, FAULTS, Fault, Night, Plan, plan
+from tests.simulation import long_run
+from tests.simulation.night import CAST, FAULTS, Fault, Night, Plan, plan
 
 _ALIVE = ProcessCondition.ALIVE
-# together a few thousand experiment hours; more: python -m afspm.testing.longrun
+# together a few thousand experiment hours; more: python -m tests.simulation.long_run
 CHUNKS = [range(first, first + 15) for first in range(0, 150, 15)]
 
 
@@ -73,7 +73,7 @@ def test_who_has_ended_for_good_loses_control_as_soon_as_its_supervisor_tells() 
 
 
 def test_the_long_run_tells_what_it_did(capsys: pytest.CaptureFixture[str]) -> None:
-    assert longrun.main(["--nights", "2", "--seed", "5"]) == 0
+    assert long_run.main(["--nights", "2", "--seed", "5"]) == 0
     assert "every invariant held" in capsys.readouterr().out
 
 

@@ -9,9 +9,9 @@ from afspm.logic.chronicle import SCHEDULER
 from afspm.logic.events import Effect, Input, Kill, Log, Reply, RequestIn
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import ControlMode, ControlRequest, Parameter, Problem, Request, names
-from afspm.testing.deterministic.microscope import FakeMicroscope
-from afspm.testing.deterministic.scheduler import SchedulerHost
-from afspm.testing.deterministic.timeline import Timeline
+from tests.simulation.microscope import FakeMicroscope
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline
 
 _MALFUNCTION = Problem.DEVICE_MALFUNCTION
 _SLACK_S = 1.0

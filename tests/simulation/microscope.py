@@ -18,10 +18,10 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.testing.deterministic.codec import TableCodec
-from afspm.testing.deterministic.network import ControlLine, Feed
-from afspm.testing.deterministic.process import Process
-from afspm.testing.deterministic.timeline import Timeline, Timer
+from tests.simulation.codec import TableCodec
+from tests.simulation.network import ControlLine, Feed
+from tests.simulation.process import Process
+from tests.simulation.timeline import Timeline, Timer
 
 CHANNELS = ("Height", "Height_Retrace")
 _STARTS = {names.START_SCAN: ScopeState.SCANNING, names.START_SPEC: ScopeState.SPEC}
