@@ -1,19 +1,121 @@
-"""`Bench`: asks what a component could ask, through the scheduler, and hears what is published."""
+"""`CheckClient`: asks what a component could ask, through the scheduler, and hears what is published."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
 
 from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
-from afspm.model import ControlRequest, ControlResponse, Parameter, Response, ScopeState, ScopeStatus, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    Parameter,
+    Response,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+    Spectrum,
+    names,
+)
 from afspm.runtime.link import Link
 from afspm.runtime.stopping import StopRequested
-from afspm.testing.translators.story import Heard, Story, told
-from afspm.testing.translators.verdicts import Failed, Lost, expect
+from afspm.testing.translators.registry import Failed, Lost, expect
+
+T = TypeVar("T")
+
+_OF_A_MICROSCOPE: Final = frozenset(
+    {"Scan2d", "Spec1d", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ScopeStateMsg"}
+)
+"""The rest is others' doing: who is in control, what the scheduler notes down, lines that only those want who asked."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One packet.
+
+    Attributes:
+        message: its name.
+        thing: what is in it; an error that says why it can't be read.
+        time_ns: when it was published.
+    """
+
+    message: str
+    thing: Any
+    time_ns: int | None
+
+    @property
+    def state(self) -> ScopeState | None:
+        """The state, where it tells one."""
+        return self.thing.state if isinstance(self.thing, ScopeStatus) else None
+
+    def __str__(self) -> str:
+        if self.state is not None:
+            return f"SS_{self.state.name}"
+        if isinstance(self.thing, Scan):
+            return f"Scan2d {self.thing.channel!r}"
+        if isinstance(self.thing, WireError):
+            return f"{self.message} that can't be read: {self.thing}"
+        return self.message
+
+
+class Observations:
+    """All that is heard of the microscope, oldest first."""
+
+    def __init__(self) -> None:
+        self.all: list[Observation] = []
+
+    def take(self, packet: Packet, ours: bool) -> None:
+        """A listener of a `Link`."""
+        message = packet.envelope
+        try:
+            message = wire.message_of(packet.envelope)
+            thing = wire.decode(message, bytes(packet.payload))
+        except WireError as error:
+            thing = error
+        if message in _OF_A_MICROSCOPE or isinstance(thing, WireError):
+            self.all.append(Observation(message, thing, packet.time_ns))
+
+    def mark(self) -> int:
+        """Here: what comes later is news."""
+        return len(self.all)
+
+    def since(self, mark: int) -> list[Observation]:
+        """What came after `mark`."""
+        return self.all[mark:]
+
+    def newest(self, kind: type[T]) -> T | None:
+        """The last that was published of a kind."""
+        return next((one.thing for one in reversed(self.all) if isinstance(one.thing, kind)), None)
+
+    def has_state(self, state: ScopeState, mark: int) -> bool:
+        """Whether it was said after `mark`."""
+        return any(one.state is state for one in self.all[mark:])
+
+    def at_s(self, state: ScopeState, mark: int) -> float | None:
+        """When it was first said after `mark`, experiment time; None: not yet."""
+        times = (one.time_ns for one in self.all[mark:] if one.state is state and one.time_ns is not None)
+        return next((time_ns / 1e9 for time_ns in times), None)
+
+
+def told(heard: Iterable[Observation]) -> str:
+    """What was heard, for a person."""
+    return ", ".join(map(str, heard)) or "nothing"
+
+
+def scans(heard: Iterable[Observation]) -> list[Scan]:
+    """The scans among it."""
+    return [one.thing for one in heard if isinstance(one.thing, Scan)]
+
+
+def spectra(heard: Iterable[Observation]) -> list[Spectrum]:
+    """The spectra among it."""
+    return [one.thing for one in heard if isinstance(one.thing, Spectrum)]
+
 
 STARTED_S = 30.0
 """Real seconds until translator and scheduler are up and the microscope has said that it is free."""
@@ -32,7 +134,7 @@ _STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC
 _ANSWERS = "a scheduler that answers (of a run that goes on: one with `[security] plain = true`)"
 
 
-class Bench:
+class CheckClient:
     """A component of a kind of its own: it is told everything, and hides nothing.
 
     Args:
@@ -41,7 +143,7 @@ class Bench:
         lost: says why the links were told that the parent is gone: which process has ended.
 
     Attributes:
-        story: what is published.
+        observations: what is published.
         at_start: what of it was there before anything was asked.
     """
 
@@ -50,11 +152,11 @@ class Bench:
         self._direct = direct or link
         self._lost = lost
         self.clock: Clock = link.clock
-        self.story = Story()
-        self.at_start: tuple[Heard, ...] = ()
+        self.observations = Observations()
+        self.at_start: tuple[Observation, ...] = ()
         self._stirred = True
         self._interrupted = False
-        link.listen(self.story.take)
+        link.listen(self.observations.take)
 
     # --- beginning and ending ---
 
@@ -67,7 +169,9 @@ class Bench:
         try:
             self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, _ANSWERS)
             self.wait(
-                lambda: self.story.newest(ScopeStatus) is not None, STARTED_S, "a ScopeStateMsg of the translator"
+                lambda: self.observations.newest(ScopeStatus) is not None,
+                STARTED_S,
+                "a ScopeStateMsg of the translator",
             )
             self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a controller that is found")
         except Failed as failure:
@@ -76,7 +180,7 @@ class Bench:
         if not response.ok:
             raise Lost(f"control is not given: {answer_in_words(response)}")
         self.quiet()
-        self.at_start = tuple(self.story.all)
+        self.at_start = tuple(self.observations.all)
 
     def end(self) -> None:
         """Give control back."""
@@ -140,7 +244,7 @@ class Bench:
     @property
     def state(self) -> ScopeState:
         """What the microscope has said last."""
-        newest = self.story.newest(ScopeStatus)
+        newest = self.observations.newest(ScopeStatus)
         return ScopeState.UNDEFINED if newest is None else newest.state
 
     def wait(self, done: Callable[[], bool], within_s: float, expected: str) -> None:
@@ -149,16 +253,16 @@ class Bench:
         Raises:
             Failed: it did not come.
         """
-        mark = self.story.mark()
+        mark = self.observations.mark()
         self._wait(done, within_s, expected, mark)
 
     def wait_state(self, state: ScopeState, mark: int, within_s: float = NOTICED_S) -> None:
         """Wait until a state is heard after `mark`."""
-        self._wait(lambda: self.story.has_state(state, mark), within_s, f"SS_{state.name}", mark)
+        self._wait(lambda: self.observations.has_state(state, mark), within_s, f"SS_{state.name}", mark)
 
     def _wait(self, done: Callable[[], bool], within_s: float, expected: str, mark: int) -> None:
         came = self._awaited(done, within_s)
-        expect(came, f"{expected} within {within_s:.3g} s", told(self.story.since(mark)))
+        expect(came, f"{expected} within {within_s:.3g} s", told(self.observations.since(mark)))
 
     def _awaited(self, done: Callable[[], bool], within_s: float) -> bool:
         def done_or_interrupted() -> bool:
@@ -168,22 +272,22 @@ class Bench:
         with self._alive():
             return self._link.wait(done_or_interrupted, self._link.until(within_s))
 
-    def settled(self, mark: int, experiment_s: float = MOVED_S) -> list[Heard]:
+    def settled(self, mark: int, experiment_s: float = MOVED_S) -> list[Observation]:
         """All that is published after `mark` until the microscope is free and quiet."""
 
         self.quiet()
         if self.state is not ScopeState.FREE:
             self.wait(lambda: self.state is ScopeState.FREE, self.real_s(experiment_s), "SS_FREE")
             self.quiet()
-        return self.story.since(mark)
+        return self.observations.since(mark)
 
     def quiet(self) -> None:
         """Until nothing has come for a while."""
         self._stirred = False
         until_s = self.clock.monotonic_s() + NOTICED_S
         while self.clock.monotonic_s() < until_s:
-            count = len(self.story.all)
-            if not self._awaited(lambda n=count: len(self.story.all) != n, QUIET_S):  # type: ignore[misc]
+            count = len(self.observations.all)
+            if not self._awaited(lambda n=count: len(self.observations.all) != n, QUIET_S):  # type: ignore[misc]
                 return
 
     def real_s(self, experiment_s: float) -> float:
@@ -193,13 +297,13 @@ class Bench:
     def come_to_rest(self) -> None:
         """Stop whatever runs; free, or Lost."""
         if self.state is not ScopeState.FREE:
-            mark = self.story.mark()
+            mark = self.observations.mark()
             if self.state in _STOPS:
                 self.ask(ControlRequest.ACTION, _STOPS[self.state])
             try:
                 self.wait(lambda: self.state is ScopeState.FREE, self.real_s(MOVED_S), "SS_FREE")
             except Failed as failure:
-                raise Lost(f"it does not come to rest: {failure} ({told(self.story.since(mark))})") from failure
+                raise Lost(f"it does not come to rest: {failure} ({told(self.observations.since(mark))})") from failure
         if self._stirred:
             self.quiet()
 
