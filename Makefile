@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.made
 
-.PHONY: demo demo-drift test mutants test-samples test-ui test-translators check bench bench-drift soak chaos simulate power-cut clean
+.PHONY: demo demo-drift test mutants test-samples test-ui test-translators check bench bench-drift soak chaos simulate power-cut docs clean
 .DEFAULT_GOAL := demo
 
 $(SETUP): pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -90,6 +90,10 @@ simulate: $(SETUP)
 CUTS ?= 100
 power-cut: $(SETUP)
 	@$(BIN)/python tests/system/record/power_cut.py --cuts $(CUTS) --seed $(SEED)
+
+## the documentation as a site with API reference and search: build/site/index.html. A broken link fails
+docs:
+	@$(PYTHON) tools/build_docs.py
 
 clean:
 	rm -rf .venv build runs

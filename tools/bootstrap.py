@@ -20,7 +20,7 @@ UV_VERSION = "uv>=0.5,<1"
 def main() -> None:
     if sys.version_info < (3, 11):  # noqa: UP036  (it is run by whatever python3 there is)
         sys.exit(f"afspm needs Python 3.11 or later, this is {sys.version.split()[0]}")
-    uv = shutil.which("uv") or _own_uv()
+    uv = find_uv()
     environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(VENV), "UV_PYTHON_DOWNLOADS": "never"}
     environment.pop("VIRTUAL_ENV", None)
     command = [uv, "sync", "--frozen", "--all-extras", "--python", sys.executable, "--quiet"]
@@ -39,8 +39,10 @@ def _compile() -> None:
     subprocess.run([str(python), "-m", "compileall", "-qq", "-j", "0", folder, str(ROOT / "src")], check=False)
 
 
-def _own_uv() -> str:
-    """uv in an environment of its own, made with the standard library's venv."""
+def find_uv() -> str:
+    """Return the uv of this computer, or one in an environment of its own, made with the standard library's venv."""
+    if found := shutil.which("uv"):
+        return found
     folder = TOOLS / ("Scripts" if os.name == "nt" else "bin")
     uv = folder / ("uv.exe" if os.name == "nt" else "uv")
     if not uv.exists():

@@ -110,3 +110,10 @@ def test_every_page_is_listed(listing: str, pages: str) -> None:
     found = {file for file in ROOT.glob(pages) if file != page}
     assert found
     assert found <= linked
+
+
+def test_decisions_are_numbered_from_1_without_a_gap_and_titled_by_their_number() -> None:
+    pages = sorted((ROOT / "docs/explanation/decisions").glob("[0-9]*.md"))
+    assert [page.name[:5] for page in pages] == [f"{number:04d}-" for number in range(1, len(pages) + 1)]
+    for page in pages:
+        assert page.read_text(encoding="utf-8").startswith(f"# {page.name[:4]} ")

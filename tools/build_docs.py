@@ -1,0 +1,170 @@
+"""Builds the documentation as a site in build/site, with an API reference, and checks every link in it.
+
+Run by `make docs`. The pages stay as they are in docs/ and experiments/: they are copied, the files and folders that
+they link to become pages of code, and the navigation is what docs/README.md lists.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import posixpath
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import bootstrap
+
+ROOT = Path(__file__).resolve().parents[1]
+BUILD = ROOT / "build"
+SOURCE, SITE, ENVIRONMENT = BUILD / "site-source", BUILD / "site", BUILD / "docs-env"
+API = "docs/reference/api"
+LINK = re.compile(r"(?<!!)\]\((?!\w+:|#)([^)#\s]+)(#[^)]*)?\)")
+SECTION = re.compile(r"^- \*\*(.+?)\*\*:(.*?)(?=^- \*\*|\Z)", re.MULTILINE | re.DOTALL)
+FENCES = {".py": "python", ".toml": "toml", ".proto": "protobuf", ".json": "json", ".md": "markdown"}
+
+
+def main() -> None:
+    for folder in (SOURCE, SITE):
+        shutil.rmtree(folder, ignore_errors=True)
+    pages = [
+        ROOT / "README.md",
+        ROOT / "CHANGELOG.md",
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "experiments").rglob("*.md"),
+    ]
+    for page in [*pages, *(ROOT / "src").rglob("README.md")]:
+        _write(page.relative_to(ROOT).as_posix(), _for_site(page))
+    shutil.copytree(ROOT / "docs" / "pictures", SOURCE / "docs" / "pictures")
+    for name, home in _public_names().items():
+        _write(f"{API}/{name}.md", f"# {name}\n\n::: {home}\n    options:\n      show_root_heading: false\n")
+    config = (ROOT / "zensical.toml").read_text(encoding="utf-8")
+    config = config.replace("[project]\n", f"[project]\nnav = {_nav()}\n", 1)
+    (BUILD / "zensical.toml").write_text(config, encoding="utf-8")
+    _zensical()
+    broken = sorted(set(_broken_links()))
+    if broken:
+        sys.exit("\n".join([*broken, f"{len(broken)} broken links"]))
+    sys.stdout.write(f"{SITE / 'index.html'}: every link leads somewhere\n")
+
+
+def _zensical() -> None:
+    environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(ENVIRONMENT), "UV_PYTHON_DOWNLOADS": "never"}
+    environment.pop("VIRTUAL_ENV", None)
+    sync = [bootstrap.find_uv(), "sync", "--frozen", "--only-group", "docs", "--quiet", "--python", sys.executable]
+    subprocess.run(sync, cwd=ROOT, env=environment, check=True)
+    program = ENVIRONMENT / ("Scripts/zensical.exe" if os.name == "nt" else "bin/zensical")
+    if subprocess.run([program, "build", "--clean", "--strict"], cwd=BUILD, check=False).returncode != 0:
+        sys.exit("the site could not be built: see above")
+
+
+def _write(path: str, text: str) -> None:
+    target = SOURCE / path
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(text, encoding="utf-8")
+
+
+def _for_site(page: Path) -> str:
+    """Return a page with the links that leave the documentation led to pages of code."""
+
+    def link(found: re.Match[str]) -> str:
+        target = (page.parent / unquote(found[1])).resolve()
+        if target.suffix in (".md", ".svg", ".png") or not target.exists():
+            return found[0]
+        if (target / "README.md").is_file():
+            return f"]({found[1].rstrip('/')}/README.md)"
+        return f"]({posixpath.relpath(_code_page(target), page.parent.relative_to(ROOT).as_posix())})"
+
+    text = LINK.sub(link, page.read_text(encoding="utf-8"))
+    # Python-Markdown wants an empty line before a list, and four spaces within one
+    text = re.sub(r"^(?![-*|>#\s]|\d+\. |```)(.+)\n(?=(?:- |\* |1\. ))", r"\1\n\n", text, flags=re.MULTILINE)
+    return re.sub(r"^( {2,3})(?=- )", "    ", text, flags=re.MULTILINE)
+
+
+def _code_page(target: Path) -> str:
+    """Write a file, or the files of a folder, as a page; return its path."""
+    name = target.relative_to(ROOT).as_posix()
+    files = sorted(target.iterdir()) if target.is_dir() else [target]
+    parts = [
+        f"## {file.name}\n\n````{FENCES.get(file.suffix, 'text')}\n{file.read_text(encoding='utf-8')}\n````\n"
+        for file in files
+        if file.is_file() and file.suffix in (*FENCES, ".cff", "")
+    ]
+    _write(f"{name}/index.md" if target.is_dir() else f"{name}.md", f"# {name}\n\n" + "\n".join(parts))
+    return f"{name}/index.md" if target.is_dir() else f"{name}.md"
+
+
+def _public_names() -> dict[str, str]:
+    """Return what `afspm` exports and the run that `open_run` returns, each with its full name."""
+    tree = ast.parse((ROOT / "src/afspm/__init__.py").read_text(encoding="utf-8"))
+    homes = {
+        alias.name: f"{node.module}.{alias.name}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("afspm")
+        for alias in node.names
+    }
+    homes.setdefault("Run", homes["open_run"].replace("open_run", "Run"))
+    return dict(sorted(homes.items(), key=lambda item: item[0].lower()))
+
+
+def _nav() -> str:
+    """Return the navigation as TOML: the sections of docs/README.md."""
+    listing = (ROOT / "docs/README.md").read_text(encoding="utf-8")
+    entries: list[str] = ['"README.md"']
+    for title, text in SECTION.findall(listing):
+        pages = [posixpath.normpath(f"docs/{target}") for target, _ in LINK.findall(text)]
+        shown = [_group(page) if page.endswith("/README.md") else json.dumps(page) for page in pages]
+        if title == "Reference":
+            shown.append(f'{{ "Python API" = {json.dumps([f"{API}/{name}.md" for name in _public_names()])} }}')
+        entries.append(f"{{ {json.dumps(title)} = [{', '.join(shown)}] }}")
+    return "[\n  " + ",\n  ".join(entries) + ",\n]"
+
+
+def _group(listing: str) -> str:
+    """Return a page that lists others, with these below it."""
+    folder = (ROOT / listing).parent
+    pages = [page.relative_to(ROOT).as_posix() for page in sorted(folder.rglob("*.md")) if page != ROOT / listing]
+    title = (ROOT / listing).read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+    return f"{{ {json.dumps(title)} = {json.dumps([listing, *pages])} }}"
+
+
+class _Page(HTMLParser):
+    """The links and anchors of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.anchors = {"", "__search"}
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name in ("id", "name") and value:
+                self.anchors.add(value)
+            elif name in ("href", "src") and value:
+                self.links.append(value)
+
+
+def _broken_links() -> Iterator[str]:
+    pages = {file: _Page(file.read_text(encoding="utf-8")) for file in SITE.rglob("*.html")}
+    for file, page in pages.items():
+        for link in page.links:
+            url = urlsplit(link)
+            if url.scheme or url.netloc:
+                continue
+            base = SITE if url.path.startswith("/") else file.parent
+            target = (base / unquote(url.path).lstrip("/")).resolve() if url.path else file
+            target = target / "index.html" if target.is_dir() else target
+            known = pages[target].anchors if target in pages else {url.fragment}
+            if file.name != "404.html" and (not target.exists() or unquote(url.fragment) not in known):
+                yield f"{file.relative_to(SITE)} links to {link}, which is not there"
+
+
+if __name__ == "__main__":
+    main()
