@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from registering import PIXEL_M, Waves, scanned
 
 from afspm.drift.estimators import estimator, matching
-from afspm.drift.estimators.matching import matched
+from afspm.drift.estimators.keypoints import matched
 from afspm.drift.registration import Prior, Registration
 from afspm.errors import ConfigError
 from afspm.model import Region

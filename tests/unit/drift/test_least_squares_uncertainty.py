@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from afspm.drift.estimators.alignment import averaged, models
 from afspm.drift.estimators.least_squares import LeastSquares
-from afspm.drift.estimators.least_squares.expected import shear_by_drift
-from afspm.drift.estimators.least_squares.shear import averaged, models
-from afspm.drift.estimators.least_squares.shrink import denoised
-from afspm.drift.estimators.least_squares.warp import derivative
+from afspm.drift.estimators.noise import denoised
+from afspm.drift.estimators.search import shear_by_drift
+from afspm.drift.estimators.warp import derivative
 from afspm.drift.registration import DriftScan, Prior
 from afspm.model import Region
 

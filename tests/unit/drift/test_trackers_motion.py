@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.drift.trackers.compensation import Compensation
-from afspm.drift.trackers.motion import Models
+from afspm.drift.trackers.filters import Models
+from afspm.drift.trackers.forecast import Compensation
 
 MODELS = Models(np.full(4, 2e-24), np.array([0.0, 1 / 10800.0, 1 / 2700.0, 1 / 30.0]), 5e-22)
 

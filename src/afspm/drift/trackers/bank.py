@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from afspm.drift.registration import DriftScan, Estimator, Registration
 from afspm.drift.shear import velocity_from_up_down
 from afspm.drift.trackers import saving
-from afspm.drift.trackers.compensation import Compensation
 from afspm.drift.trackers.filters import Filters
-from afspm.drift.trackers.forecast import BankForecast
-from afspm.drift.trackers.pairs import AGREEMENT, Comparison, Measured, Newest, agreeing
-from afspm.drift.trackers.references import Reference, References
+from afspm.drift.trackers.forecast import BankForecast, Compensation
+from afspm.drift.trackers.pairs import AGREEMENT, Comparison, NewestScan, PairMeasurement, agreeing
+from afspm.drift.trackers.references import ReferenceScan, ReferenceScans
 from afspm.drift.trackers.settings import BankSettings
-from afspm.drift.trackers.similarity import Measurement, Similarity
+from afspm.drift.trackers.similarity import Similarity, SimilarityMeasurement
 from afspm.drift.tracking import Forecast, Prediction, Update
 from afspm.errors import InvalidValue
 
@@ -58,7 +57,7 @@ class BankTracker:
     def __init__(self, estimator: Estimator, **settings: Any) -> None:
         self._settings, choice = BankSettings.split(settings)
         self._estimator = estimator
-        self._references = References(choice)
+        self._references = ReferenceScans(choice)
         self._filters: Filters | None = None
         self._similarity: Similarity | None = None
         self._newest_s: float | None = None
@@ -91,7 +90,7 @@ class BankTracker:
         filters = self._filters.moved(scan.mid_s, followed_m)
         before = self._known(filters)
         compensated_m_s = self._compensation.velocity_m_s(scan.mid_s)
-        newest = Newest(scan, self._turned(filters, scan), compensated_m_s, self._similarity)
+        newest = NewestScan(scan, self._turned(filters, scan), compensated_m_s, self._similarity)
         anywhere = self._lost or self._is_blind(newest)
         tried = self._tried(newest, anywhere=anywhere)
         registrations = {self._references.kept[number].scan.key: found for number, found in tried.items()}
@@ -157,7 +156,7 @@ class BankTracker:
             self._similarity = Similarity.at_start(scan)
         now = self._known(self._filters)
         compensated_m_s = self._compensation.velocity_m_s(scan.mid_s)
-        self._references.kept.append(Reference(scan, compensated_m_s, anchor=True, used=self._scans))
+        self._references.kept.append(ReferenceScan(scan, compensated_m_s, anchor=True, used=self._scans))
         self._forecast = self._forecast_of(self._filters)
         return Update(
             scan.key, before, now, matched=True, reason="", lost=False, registrations={}, forecast=self._forecast
@@ -177,14 +176,14 @@ class BankTracker:
         velocity = found.by_shear_m_s + self._compensation.velocity_m_s(found.time_s)
         return self._with_velocity(filters, found.time_s, velocity, found.by_shear_covariance)
 
-    def _is_blind(self, newest: Newest) -> bool:
+    def _is_blind(self, newest: NewestScan) -> bool:
         """Whether it is too uncertain where to look, against each of the scans that it can be compared with."""
         kept = self._references.kept
         comparable = self._references.candidates(newest.scan, *_drifts(newest.filters), anywhere=True)
         spreads = (newest.expected(number, kept[number])[1] for number in comparable)
         return min((np.linalg.eigvalsh(one)[-1] for one in spreads), default=0.0) > self._limit_m(newest.scan) ** 2
 
-    def _tried(self, newest: Newest, *, anywhere: bool) -> dict[int, Registration]:
+    def _tried(self, newest: NewestScan, *, anywhere: bool) -> dict[int, Registration]:
         """What the estimator says of the scan and each reference, by its number, the best first."""
         kept, filters = self._references.kept, newest.filters
         widening = self._settings.widening * 4.0 ** min(self._unmatched, self._settings.lost_after)
@@ -199,18 +198,18 @@ class BankTracker:
                 tried[number] = self._estimator.register(kept[number].scan, newest.scan)
         return tried
 
-    def _compared(self, newest: Newest, tried: Table[int, Registration]) -> Comparison | None:
+    def _compared(self, newest: NewestScan, tried: Table[int, Registration]) -> Comparison | None:
         """What was found, by the references that agree; those adrift count only where there is no other."""
         kept, inflation = self._references.kept, self._settings.inflation
         measured = [
-            Measured.of(newest, number, kept[number], found, inflation)
+            PairMeasurement.of(newest, number, kept[number], found, inflation)
             for number, found in tried.items()
             if found.accepted
         ]
         firm = [one for one in measured if self._proves(one.link.number)]
         return Comparison(agreeing(firm or measured, newest.filters), newest.filters) if measured else None
 
-    def _believed(self, newest: Newest, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
+    def _believed(self, newest: NewestScan, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
         """What is taken in of that: a surprise only where everything is possible, or after another one like it."""
         before, self._doubted_m = self._doubted_m, None
         if found is None or found.surprise <= self._settings.doubt:
@@ -223,7 +222,9 @@ class BankTracker:
         far_m, since_s = float(np.linalg.norm(found.apart_m)), newest.scan.mid_s - self._matched_s
         return replace(found, filters=found.filters.widened(far_m, far_m / max(since_s, 1.0)))
 
-    def _learn(self, newest: Newest, used: Comparison | None, tried: Table[int, Registration], *, placed: bool) -> None:
+    def _learn(
+        self, newest: NewestScan, used: Comparison | None, tried: Table[int, Registration], *, placed: bool
+    ) -> None:
         """Take in what is believed; keep the scan, unless it is in doubt, and let go of what there is too much of."""
         settings, references, scan = self._settings, self._references, newest.scan
         filters = newest.filters if used is None else used.filters
@@ -249,7 +250,7 @@ class BankTracker:
         drift_m, drifts_m = _drifts(self._filters)
         adrift = bool(tried) and not placed
         anchor = not adrift and references.needs_anchor(scan, drift_m, drifts_m[:-1])
-        references.kept.append(Reference(scan, newest.compensated_m_s, anchor, adrift, used=self._scans))
+        references.kept.append(ReferenceScan(scan, newest.compensated_m_s, anchor, adrift, used=self._scans))
         if self._doubted_m is not None:
             self._drop(len(references) - 1)
         while (number := references.superfluous()) is not None:
@@ -262,7 +263,7 @@ class BankTracker:
         if best is None or best.found.linear_seen is None:
             return similarity.with_scan()
         pair = self._references.kept[best.link.number].scan, scan
-        seen = Measurement.of(best.found.linear_seen, pair, self._settings.inflation)
+        seen = SimilarityMeasurement.of(best.found.linear_seen, pair, self._settings.inflation)
         learned = similarity.learned(best.link.number, seen).with_scan()
         return learned.straight_about(best.found.center_m + best.found.displacement_m)
 
@@ -275,12 +276,12 @@ class BankTracker:
         """Whether what is registered with a reference has a place by that."""
         return not (self._proven and self._references.kept[number].adrift)
 
-    def _vouch(self, newest: Newest, found: Table[int, Registration]) -> None:
+    def _vouch(self, newest: NewestScan, found: Table[int, Registration]) -> None:
         """Those adrift that the newest scan, the last in the state, finds where they are thought to be are known."""
         assert self._filters is not None
         kept, states = self._references.kept, self._filters.mean.shape[1]
         for number in [number for number in found if kept[number].adrift]:
-            one = Measured.of(newest, number, kept[number], found[number], self._settings.inflation)
+            one = PairMeasurement.of(newest, number, kept[number], found[number], self._settings.inflation)
             expected, covariance = self._filters.mixed(one.link.rows(states, states - 4))
             apart = one.value_m - expected
             if apart @ np.linalg.solve(covariance + one.pair_noise_m2, apart) <= AGREEMENT:
@@ -361,7 +362,7 @@ class BankTracker:
         self._doubted_m = None if state["doubted_m"] is None else np.asarray(state["doubted_m"], dtype=np.float64)
         self._proven = bool(state["proven"])
         self._matched_s, self._lost = float(state["matched_s"]), bool(state["lost"])
-        self._references.kept = [Reference.from_dict(one) for one in state["references"]]
+        self._references.kept = [ReferenceScan.from_dict(one) for one in state["references"]]
         self._forecast = BankForecast.at_start()
         if filters is not None:
             self._forecast = self._forecast_of(filters)

@@ -6,6 +6,7 @@ information, "Drift Correction Algorithm".
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
@@ -18,11 +19,54 @@ from afspm.drift.mapping import Mapping, unlike_drift
 from afspm.drift.overlap import intersection_ratio, sr_norm
 from afspm.drift.registration import DriftScan, Estimator, Registration
 from afspm.drift.trackers import saving
-from afspm.drift.trackers.transforms import TRANSFORMS, exponential, logarithm, transform_between
 from afspm.drift.tracking import Forecast, Prediction, Update
 from afspm.errors import ConfigError
 
 Array = NDArray[np.float64]
+
+TRANSFORMS = ("translation", "euclidean", "similarity", "affine")
+
+
+def transform_between(found: Registration, form: str) -> Mapping:
+    """From tip coordinates during the reference to those during the scan, in the nearest transform of a form."""
+    linear = _of_form(np.eye(2) + found.linear, form)
+    center = found.center_m if form != "translation" else np.zeros(2)
+    return Mapping.of(linear, center + found.displacement_m - linear @ center)
+
+
+def _of_form(linear: Array, form: str) -> Array:
+    """The 2 x 2 matrix of a form that is nearest (least squares of its elements)."""
+    if form == "translation":
+        return np.eye(2)
+    if form == "affine":
+        return linear
+    (a, b), (c, d) = linear
+    cos, sin = (a + d) / 2, (c - b) / 2
+    if form == "euclidean":
+        length = math.hypot(cos, sin)
+        cos, sin = cos / length, sin / length
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+def logarithm(matrix: Array) -> Array:
+    """The real X with exp X = matrix, 3 x 3; of a translation exactly."""
+    if np.array_equal(matrix[:2, :2], np.eye(2)):
+        return np.asarray(matrix - np.eye(3))
+    from scipy.linalg import logm
+
+    return np.asarray(logm(matrix)).real
+
+
+def exponential(matrix: Array) -> Array:
+    """exp X with the last row 0 0 1, 3 x 3; of a translation's logarithm exactly."""
+    if not matrix[:2, :2].any():
+        return np.asarray(np.eye(3) + matrix)
+    from scipy.linalg import expm
+
+    made = np.asarray(expm(matrix))
+    made[2] = (0.0, 0.0, 1.0)  # rounding
+    return made
+
 
 VERSION = 1
 _MEMORY = 0.7  # of the mean square of the residuals from one scan to the next

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceScan:
     """A scan that is kept.
 
     Attributes:
@@ -47,7 +47,7 @@ class Reference:
         }
 
     @classmethod
-    def from_dict(cls, table: Table[str, Any]) -> Reference:
+    def from_dict(cls, table: Table[str, Any]) -> ReferenceScan:
         return cls(
             saving.scan_from_dict(table["scan"]),
             np.asarray(table["compensated_m_s"], dtype=np.float64),
@@ -83,17 +83,17 @@ class Choice:
     alike: float = 0.6
 
 
-class References:
+class ReferenceScans:
     """The scans that are kept, in the order of time. All displacements (…, 2) are those of the sample, in m."""
 
     def __init__(self, choice: Choice) -> None:
         self.choice = choice
-        self.kept: list[Reference] = []
+        self.kept: list[ReferenceScan] = []
 
     def __len__(self) -> int:
         return len(self.kept)
 
-    def __iter__(self) -> Iterator[Reference]:
+    def __iter__(self) -> Iterator[ReferenceScan]:
         return iter(self.kept)
 
     def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:

@@ -75,7 +75,7 @@ class Similarity:
         far_m = position_m - self.pivot_m
         return np.asarray(np.eye(2) * (row @ self.covariance @ row) * (far_m @ far_m))
 
-    def learned(self, number: int, seen: Measurement) -> Similarity:
+    def learned(self, number: int, seen: SimilarityMeasurement) -> Similarity:
         """After a registration with a reference."""
         row = self._row(number)
         crossed = self.covariance @ row
@@ -138,7 +138,7 @@ class Similarity:
 
 
 @dataclass(frozen=True)
-class Measurement:
+class SimilarityMeasurement:
     """Rotation and scale between two scans.
 
     Attributes:
@@ -150,7 +150,7 @@ class Measurement:
     variance: float
 
     @classmethod
-    def of(cls, seen: LinearSeen, scans: tuple[DriftScan, DriftScan], inflation: float) -> Measurement:
+    def of(cls, seen: LinearSeen, scans: tuple[DriftScan, DriftScan], inflation: float) -> SimilarityMeasurement:
         """The generalised least squares fit to what was seen, beside a shear by drift during either scan.
 
         Such a shear displaces rows as a whole, so what depends on the position along a row tells the most.

@@ -155,7 +155,7 @@ class Taken:
         return times[0] / 1e9
 
 
-class Measuring:
+class CheckMeasurements:
     """Takes measurements for checks. What failed once is not tried again: who needs it is skipped.
 
     Attributes:

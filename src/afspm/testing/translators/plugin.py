@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from afspm.testing.translators import runner, session
-from afspm.testing.translators.measuring import Measuring
+from afspm.testing.translators.measuring import CheckMeasurements
 from afspm.testing.translators.registry import Check, Lost, all_checks
 from afspm.testing.translators.report import CheckOutcome, CheckReport, CheckResult
 
@@ -59,7 +59,7 @@ class ExperimentFile(pytest.File):
             self.report.lost = str(lost)
             pytest.fail(str(lost), pytrace=False)
         vars(self.report).update(vars(runner.begin_report(opened)))
-        self.kit: Measuring = self._stack.enter_context(runner.restored(opened, self.report))
+        self.kit: CheckMeasurements = self._stack.enter_context(runner.restored(opened, self.report))
 
     def teardown(self) -> None:
         self._stack.close()

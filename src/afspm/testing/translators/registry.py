@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from afspm.testing.translators.measuring import Measuring
+    from afspm.testing.translators.measuring import CheckMeasurements
 
 
 class Failed(AssertionError):
@@ -54,7 +54,7 @@ class Check:
 
     name: str
     title: str
-    do: Callable[[Measuring], None]
+    do: Callable[[CheckMeasurements], None]
     needs: tuple[str, ...] = ()
 
 
@@ -63,10 +63,10 @@ _CHECKS: list[Check] = []
 
 def check(
     name: str, title: str, needs: tuple[str, ...] = ()
-) -> Callable[[Callable[[Measuring], None]], Callable[[Measuring], None]]:
+) -> Callable[[Callable[[CheckMeasurements], None]], Callable[[CheckMeasurements], None]]:
     """Marks a function as a check; they are done in the order in which they are marked."""
 
-    def marked(do: Callable[[Measuring], None]) -> Callable[[Measuring], None]:
+    def marked(do: Callable[[CheckMeasurements], None]) -> Callable[[CheckMeasurements], None]:
         _CHECKS.append(Check(name, title, do, needs))
         return do
 

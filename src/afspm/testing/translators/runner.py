@@ -12,7 +12,7 @@ from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ConfigError
 from afspm.model import ControlRequest, Feedback, Parameter, ProbePosition, Region, ScanParameters, names
 from afspm.testing.translators.client import CheckClient, answer_in_words
-from afspm.testing.translators.measuring import FrameSetting, Measuring, number
+from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, number
 from afspm.testing.translators.registry import Check, Failed, Lost, Skipped, all_checks, near
 from afspm.testing.translators.report import CheckOutcome, CheckReport, CheckResult
 from afspm.testing.translators.session import CheckOptions, CheckSession, opened
@@ -131,7 +131,7 @@ def chosen(only: Collection[str] = ()) -> list[Check]:
     return found
 
 
-def do(check: Check, kit: Measuring) -> CheckResult:
+def do(check: Check, kit: CheckMeasurements) -> CheckResult:
     """Do one.
 
     Raises:
@@ -159,9 +159,9 @@ def do(check: Check, kit: Measuring) -> CheckResult:
 
 
 @contextmanager
-def restored(session: CheckSession, report: CheckReport) -> Iterator[Measuring]:
+def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasurements]:
     """What is in force when the block begins is so again at its end, however that comes."""
-    kit = Measuring(
+    kit = CheckMeasurements(
         session.client, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
     )
     before = SettingsBefore.of(session.client, session.support)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from afspm.model import ControlRequest, ControlResponse, Feedback, names
 from afspm.testing.translators.client import answer_in_words, told
-from afspm.testing.translators.measuring import Measuring, number
+from afspm.testing.translators.measuring import CheckMeasurements, number
 from afspm.testing.translators.registry import Failed, Skipped, check, expect, near
 
 _NUMBERS = {
@@ -19,7 +19,7 @@ _STEP = 1.02
 """A tip that is not engaged does not mind, and neither would one that is."""
 
 
-def in_force(kit: Measuring) -> Feedback:
+def in_force(kit: CheckMeasurements) -> Feedback:
     """What was published last."""
     feedback = kit.client.observations.newest(Feedback)
     if feedback is None and not any(map(kit.support.has, _NUMBERS.values())):
@@ -29,7 +29,7 @@ def in_force(kit: Measuring) -> Feedback:
     return feedback
 
 
-def set_and_require(kit: Measuring, wanted: Feedback) -> None:
+def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
     """Set what is given of it; the rest must stay as it is."""
     kit.client.come_to_rest()
     before, mark = in_force(kit), kit.client.observations.mark()
@@ -56,7 +56,7 @@ def require_same(wanted: Feedback, came: Feedback) -> None:
             expect(near(value, other), f"ZCtrlParameters with {name} = {value:.6g}", f"{other:.6g}")
 
 
-def _stepped(kit: Measuring, fields: Iterable[str]) -> Feedback:
+def _stepped(kit: CheckMeasurements, fields: Iterable[str]) -> Feedback:
     now = in_force(kit)
     values = {name: getattr(now, name) for name in fields if kit.support.has(_NUMBERS[name])}
     values = {name: value * _STEP for name, value in values.items() if value}
@@ -66,17 +66,17 @@ def _stepped(kit: Measuring, fields: Iterable[str]) -> Feedback:
 
 
 @check("feedback/numbers", "gains and setpoint are set and published")
-def numbers(kit: Measuring) -> None:
+def numbers(kit: CheckMeasurements) -> None:
     set_and_require(kit, _stepped(kit, _NUMBERS))
 
 
 @check("feedback/one", "only the fields that are present are set: the integral gain", needs=(names.ZCTRL_IGAIN,))
-def one(kit: Measuring) -> None:
+def one(kit: CheckMeasurements) -> None:
     set_and_require(kit, _stepped(kit, ["integral_gain"]))
 
 
 @check("feedback/as-parameters", "what is set of the feedback is what its parameters then say")
-def as_parameters(kit: Measuring) -> None:
+def as_parameters(kit: CheckMeasurements) -> None:
     wanted = _stepped(kit, _NUMBERS)
     set_and_require(kit, wanted)
     for field, name in _NUMBERS.items():
@@ -87,7 +87,7 @@ def as_parameters(kit: Measuring) -> None:
 
 
 @check("feedback/on-off", "the feedback is switched off and on, and published")
-def on_off(kit: Measuring) -> None:
+def on_off(kit: CheckMeasurements) -> None:
     before = in_force(kit).on
     kit.support.settable[names.FEEDBACK_ON] = False
     if before is None:

@@ -17,13 +17,13 @@ from afspm.model import (
 )
 from afspm.testing.translators.checks.scans import states
 from afspm.testing.translators.client import Observation, told
-from afspm.testing.translators.measuring import NEAR, FrameSetting, Measuring, difference, in_words, number
+from afspm.testing.translators.measuring import NEAR, CheckMeasurements, FrameSetting, difference, in_words, number
 from afspm.testing.translators.registry import Failed, Skipped, check, expect, near
 from afspm.wire.generated import spectroscopy_pb2
 
 
 @check("published/in-force", "what is in force is published at the start, the state last")
-def published_in_force(kit: Measuring) -> None:
+def published_in_force(kit: CheckMeasurements) -> None:
     heard = kit.client.at_start
     wanted: list[tuple[type, tuple[str, ...]]] = [
         (ScanParameters, (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)),
@@ -40,13 +40,13 @@ def published_in_force(kit: Measuring) -> None:
 
 
 @check("published/free", "the microscope is free before anything is asked of it")
-def free(kit: Measuring) -> None:
+def free(kit: CheckMeasurements) -> None:
     states = [one.state for one in kit.client.at_start if one.state is not None]
     expect(states[-1] is ScopeState.FREE, "SS_FREE", told(kit.client.at_start))
 
 
 @check("published/frame", "the ScanParameters2d are what the parameters say", needs=(names.SCAN_SIZE_X,))
-def frame(kit: Measuring) -> None:
+def frame(kit: CheckMeasurements) -> None:
     parameters = next(
         (one.thing for one in reversed(kit.client.at_start) if isinstance(one.thing, ScanParameters)), None
     )
@@ -69,7 +69,7 @@ def frame(kit: Measuring) -> None:
 _SIZES = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
-def ask_for(kit: Measuring, wanted: ScanParameters) -> list[Observation]:
+def ask_for(kit: CheckMeasurements, wanted: ScanParameters) -> list[Observation]:
     """Set what is wanted; what is published of it."""
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
@@ -77,7 +77,7 @@ def ask_for(kit: Measuring, wanted: ScanParameters) -> list[Observation]:
     return kit.client.settled(mark)
 
 
-def current_frame(kit: Measuring) -> FrameSetting:
+def current_frame(kit: CheckMeasurements) -> FrameSetting:
     """The frame that was published last."""
     newest = kit.client.observations.newest(ScanParameters)
     if newest is None or not isinstance(newest.region, Region) or not isinstance(newest.shape, tuple):
@@ -85,7 +85,7 @@ def current_frame(kit: Measuring) -> FrameSetting:
     return FrameSetting(newest.region, newest.shape)
 
 
-def require_in_force(kit: Measuring, frame: FrameSetting) -> None:
+def require_in_force(kit: CheckMeasurements, frame: FrameSetting) -> None:
     """The frame that was published last is this."""
     published = current_frame(kit)
     wrong = difference(frame.region, published.region)
@@ -104,7 +104,7 @@ def require_told_once(heard: list[Observation], kind: type, named: str) -> None:
 
 
 @check("frame/set", "a frame that is set: SS_MOVING, ScanParameters2d as set, once, SS_FREE", needs=_SIZES)
-def set_whole(kit: Measuring) -> None:
+def set_whole(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.plain.request(kit.support))
     heard = ask_for(kit, kit.frames.wide.request(kit.support))
     require_told_once(heard, ScanParameters, "ScanParameters2d")
@@ -112,7 +112,7 @@ def set_whole(kit: Measuring) -> None:
 
 
 @check("frame/position-only", "only the fields that are present are set: the corner", needs=(names.SCAN_TOP_LEFT_X,))
-def position_only(kit: Measuring) -> None:
+def position_only(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.wide.request(kit.support))
     left, low = kit.frames.wide.region.top_left_m
     moved_m = 0.05 * kit.frames.wide.region.size_m[0]
@@ -123,14 +123,14 @@ def position_only(kit: Measuring) -> None:
 
 
 @check("frame/shape-only", "only the fields that are present are set: the pixels", needs=(names.SCAN_RESOLUTION_X,))
-def shape_only(kit: Measuring) -> None:
+def shape_only(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.wide.request(kit.support))
     ask_for(kit, ScanParameters(shape=ShapeChange(rows=48)))
     require_in_force(kit, FrameSetting(kit.frames.wide.region, (48, kit.frames.wide.shape[1])))
 
 
 @check("frame/turned", "an angle is set as it was asked for, about the centre", needs=(names.SCAN_ANGLE,))
-def turned(kit: Measuring) -> None:
+def turned(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.turned.request(kit.support))
     require_in_force(kit, kit.frames.turned)
     straight = Region(kit.frames.turned.region.center_m, kit.frames.turned.region.size_m, 0.0)
@@ -139,7 +139,7 @@ def turned(kit: Measuring) -> None:
 
 
 @check("frame/parameters", "a frame that is set is what its parameters then say", needs=_SIZES)
-def parameters(kit: Measuring) -> None:
+def parameters(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.turned.request(kit.support))
     region, (rows, columns) = kit.frames.turned.region, kit.frames.turned.shape
     (left, low), (width, height) = region.top_left_m, region.size_m
@@ -164,7 +164,7 @@ def parameters(kit: Measuring) -> None:
 _NEEDS = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
-def require_place(kit: Measuring, xy_m: tuple[float, float]) -> None:
+def require_place(kit: CheckMeasurements, xy_m: tuple[float, float]) -> None:
     """The probe is said to be there: as published, and by its parameters."""
     newest = kit.client.observations.newest(ProbePosition)
     if newest is None:
@@ -176,7 +176,7 @@ def require_place(kit: Measuring, xy_m: tuple[float, float]) -> None:
 
 
 @check("probe/move", "the probe is moved: SS_MOVING, ProbePosition as set, once, SS_FREE", needs=_NEEDS)
-def move(kit: Measuring) -> None:
+def move(kit: CheckMeasurements) -> None:
     kit.move_probe(kit.frames.plain.region.center_m)
     heard = kit.move_probe(kit.frames.other.region.center_m)
     require_told_once(heard, ProbePosition, "ProbePosition")
@@ -184,7 +184,7 @@ def move(kit: Measuring) -> None:
 
 
 @check("probe/one-axis", "only the coordinate that is present is set", needs=_NEEDS)
-def one_axis(kit: Measuring) -> None:
+def one_axis(kit: CheckMeasurements) -> None:
     kit.move_probe(kit.frames.other.region.center_m)
     x_m, y_m = kit.frames.other.region.center_m
     y_m += 0.1 * min(kit.frames.whole.size_m)

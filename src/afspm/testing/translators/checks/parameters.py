@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from afspm.model import ControlRequest, ControlResponse, Parameter, Response, names
 from afspm.testing.translators.client import answer_in_words, value_in
-from afspm.testing.translators.measuring import Measuring, number
+from afspm.testing.translators.measuring import CheckMeasurements, number
 from afspm.testing.translators.registry import Skipped, check, expect, near
 from afspm.units import convert
 
@@ -51,11 +51,11 @@ def _of(name: str) -> None:
     what = name.replace("-", " ")
 
     @check(f"parameter/{name}", f"{what}: set, told as it was set, also in another unit", needs=(name,))
-    def is_set(kit: Measuring) -> None:
+    def is_set(kit: CheckMeasurements) -> None:
         _require_set(kit, name)
 
     @check(f"refused/{name}", f"{what}: NaN, no number and a wrong unit are refused, and change nothing", needs=(name,))
-    def is_refused(kit: Measuring) -> None:
+    def is_refused(kit: CheckMeasurements) -> None:
         _require_refused(kit, name)
 
 
@@ -63,7 +63,7 @@ for _name in names.BASE_PARAMETERS:
     _of(_name)
 
 
-def _require_set(kit: Measuring, name: str) -> None:
+def _require_set(kit: CheckMeasurements, name: str) -> None:
     client = kit.client
     client.come_to_rest()
     before = client.get(name)
@@ -82,7 +82,7 @@ def _require_set(kit: Measuring, name: str) -> None:
         _require_other_unit(kit, name, now, unit)
 
 
-def _set_near(kit: Measuring, name: str, now: float, step: ParameterStep, unit: str) -> tuple[float, Response]:
+def _set_near(kit: CheckMeasurements, name: str, now: float, step: ParameterStep, unit: str) -> tuple[float, Response]:
     """A value near the one in force, and the success of setting it.
 
     Raises:
@@ -103,7 +103,7 @@ def _set_near(kit: Measuring, name: str, now: float, step: ParameterStep, unit: 
     raise Skipped(f"it can be got, not set: {answer_in_words(response)}")
 
 
-def _require_other_unit(kit: Measuring, name: str, value: float, unit: str) -> None:
+def _require_other_unit(kit: CheckMeasurements, name: str, value: float, unit: str) -> None:
     """Back to the first value, given in another unit."""
     other = _SMALLER[unit]
     text = f"{convert(value, unit, other):.12g}"
@@ -125,7 +125,7 @@ def _written(value: float, name: str) -> str:
     return str(round(value)) if name in (names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y) else f"{value:.6g}"
 
 
-def _require_refused(kit: Measuring, name: str) -> None:
+def _require_refused(kit: CheckMeasurements, name: str) -> None:
     client = kit.client
     client.come_to_rest()
     before = client.get(name)
@@ -134,7 +134,7 @@ def _require_refused(kit: Measuring, name: str) -> None:
     require_param_error(kit, name, str(before.value), _BAD_UNIT, before)
 
 
-def require_param_error(kit: Measuring, name: str, value: str, unit: str | None, before: Parameter) -> None:
+def require_param_error(kit: CheckMeasurements, name: str, value: str, unit: str | None, before: Parameter) -> None:
     """Setting that is refused with REP_PARAM_ERROR, and changes nothing."""
     asked = f"{name} = {value!r} {unit or ''}".rstrip()
     response = kit.client.ask_directly(ControlRequest.PARAM, Parameter(name, value, unit))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import Region, names
-from afspm.testing.translators.measuring import FrameSetting, Measuring, Taken
+from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, Taken
 from afspm.testing.translators.registry import Failed, Skipped, check
 
 Array = NDArray[np.float64]
@@ -136,7 +136,7 @@ _SHAPE = (96, 96)
     "details fit into a larger scan where they say they are, and as they say they are turned",
     needs=(names.START_SCAN,),
 )
-def picture(kit: Measuring) -> None:
+def picture(kit: CheckMeasurements) -> None:
     has_angle = kit.support.has(names.SCAN_ANGLE)
     details = [kit.scan(name) for name in ("plain", "wide", *(["turned"] if has_angle else []))]
     larger = kit.take_scan(FrameSetting(kit.frames.whole, _SHAPE))

@@ -16,7 +16,7 @@ from afspm.model import (
 )
 from afspm.testing.translators.checks.parameters import require_param_error
 from afspm.testing.translators.client import answer_in_words, told
-from afspm.testing.translators.measuring import Measuring
+from afspm.testing.translators.measuring import CheckMeasurements
 from afspm.testing.translators.registry import check, expect
 from afspm.wire.generated import feedback_pb2, scan_pb2, spectroscopy_pb2
 
@@ -24,30 +24,30 @@ _UNKNOWN = "no-such-thing"
 
 
 @check("refused/unknown-parameter", "a parameter that there is not: REP_PARAM_NOT_SUPPORTED")
-def unknown_parameter(kit: Measuring) -> None:
+def unknown_parameter(kit: CheckMeasurements) -> None:
     for parameter in (Parameter(_UNKNOWN), Parameter(_UNKNOWN, "1", "m")):
         _require(kit, ControlRequest.PARAM, parameter, ControlResponse.PARAM_NOT_SUPPORTED, f"REQ_PARAM {_UNKNOWN}")
 
 
 @check("refused/unknown-action", "an action that there is not: REP_ACTION_NOT_SUPPORTED")
-def unknown_action(kit: Measuring) -> None:
+def unknown_action(kit: CheckMeasurements) -> None:
     can_be_asked = None not in kit.support.actions.values()
     for kind in (ControlRequest.ACTION, *([ControlRequest.ACTION_SUPPORT] if can_be_asked else [])):
         _require(kit, kind, _UNKNOWN, ControlResponse.ACTION_NOT_SUPPORTED, f"REQ_{kind.name} {_UNKNOWN}")
 
 
-def _require(kit: Measuring, kind: ControlRequest, subject: object, code: ControlResponse, what: str) -> None:
+def _require(kit: CheckMeasurements, kind: ControlRequest, subject: object, code: ControlResponse, what: str) -> None:
     response = kit.client.ask_directly(kind, subject)
     expect(response.code == code, f"REP_{code.name} to {what}", answer_in_words(response))
 
 
 @check("refused/read-only", "a parameter that can only be read is not set", needs=(names.CONTROLLER,))
-def read_only(kit: Measuring) -> None:
+def read_only(kit: CheckMeasurements) -> None:
     require_param_error(kit, names.CONTROLLER, "mine", None, kit.client.get(names.CONTROLLER))
 
 
 @check("refused/too-large", "a frame of a kilometre, or of none, is refused, not clamped", needs=(names.SCAN_SIZE_X,))
-def too_large(kit: Measuring) -> None:
+def too_large(kit: CheckMeasurements) -> None:
     kit.client.come_to_rest()
     for name, values in (
         (names.SCAN_SIZE_X, ("1000", "-1e-6", "0")),
@@ -67,7 +67,7 @@ def too_large(kit: Measuring) -> None:
 
 
 @check("refused/whole-frame", "a frame that can't be set as a whole changes nothing", needs=(names.SCAN_SIZE_X,))
-def whole_frame(kit: Measuring) -> None:
+def whole_frame(kit: CheckMeasurements) -> None:
     message = scan_pb2.ScanParameters2d()
     message.spatial.length_units = "m"
     message.spatial.roi.size.x = 0.9 * kit.frames.whole.size_m[0]
@@ -76,7 +76,7 @@ def whole_frame(kit: Measuring) -> None:
 
 
 @check("refused/nan", "NaN in a frame, a position or the feedback is refused, and changes nothing")
-def nan(kit: Measuring) -> None:
+def nan(kit: CheckMeasurements) -> None:
     if kit.support.has(names.SCAN_TOP_LEFT_X):
         frame = scan_pb2.ScanParameters2d()
         frame.spatial.roi.top_left.x = math.nan
@@ -91,14 +91,16 @@ def nan(kit: Measuring) -> None:
 
 
 @check("refused/unit-of-frame", "a frame in kilograms is refused, and changes nothing", needs=(names.SCAN_SIZE_X,))
-def unit_of_frame(kit: Measuring) -> None:
+def unit_of_frame(kit: CheckMeasurements) -> None:
     message = scan_pb2.ScanParameters2d()
     message.spatial.length_units = "kg"
     message.spatial.roi.size.x = 0.9 * kit.frames.whole.size_m[0]
     _require_unchanged(kit, ControlRequest.SET_SCAN_PARAMS, message, ScanParameters, "a frame in kg")
 
 
-def _require_unchanged(kit: Measuring, kind: ControlRequest, subject: object, published: type, what: str) -> None:
+def _require_unchanged(
+    kit: CheckMeasurements, kind: ControlRequest, subject: object, published: type, what: str
+) -> None:
     client = kit.client
     client.come_to_rest()
     before, mark = client.observations.newest(published), client.observations.mark()
@@ -112,7 +114,7 @@ _NEEDS = (names.START_SCAN, names.STOP_SCAN)
 
 
 @check("busy/refused", "while a scan runs what would disturb it is REP_NOT_FREE, and it goes on", needs=_NEEDS)
-def refused(kit: Measuring) -> None:
+def refused(kit: CheckMeasurements) -> None:
     mark = kit.begin_long_scan(kit.frames.other)
     asked: list[tuple[ControlRequest, object, str, tuple[str, ...]]] = [
         (ControlRequest.ACTION, names.START_SCAN, "start-scan", ()),
@@ -139,7 +141,7 @@ def refused(kit: Measuring) -> None:
 
 
 @check("busy/answered", "while a scan runs, parameters are told and support of actions is answered", needs=_NEEDS)
-def answered(kit: Measuring) -> None:
+def answered(kit: CheckMeasurements) -> None:
     mark = kit.begin_long_scan(kit.frames.other)
     name = next((one for one, value in kit.support.parameters.items() if value is not None), None)
     asked: list[tuple[ControlRequest, object, str]] = []
@@ -153,6 +155,6 @@ def answered(kit: Measuring) -> None:
     _require_running(kit, mark)
 
 
-def _require_running(kit: Measuring, mark: int) -> None:
+def _require_running(kit: CheckMeasurements, mark: int) -> None:
     state = kit.client.state
     expect(state is ScopeState.SCANNING, "a scan that goes on", told(kit.client.observations.since(mark)))

@@ -6,7 +6,7 @@ import numpy as np
 
 from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.testing.translators.client import Observation, scans, told
-from afspm.testing.translators.measuring import SCAN_S, Measuring, Taken, difference
+from afspm.testing.translators.measuring import SCAN_S, CheckMeasurements, Taken, difference
 from afspm.testing.translators.registry import Failed, Skipped, check, expect
 
 
@@ -19,13 +19,13 @@ def states(heard: list[Observation]) -> list[str]:
     return found
 
 
-def broken_off(kit: Measuring, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
+def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
     """Stop what runs; what is published from its beginning on, once its states have been found right."""
     asked_to_stop(kit, mark, stop, begun)
     return require_broken_off(kit, mark, stop, begun)
 
 
-def asked_to_stop(kit: Measuring, mark: int, stop: str, begun: ScopeState) -> float:
+def asked_to_stop(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> float:
     """Stop what runs; when that was answered, experiment time in s."""
     client = kit.client
     expect(client.state is begun, f"SS_{begun.name} until it is stopped", told(client.observations.since(mark)))
@@ -33,7 +33,7 @@ def asked_to_stop(kit: Measuring, mark: int, stop: str, begun: ScopeState) -> fl
     return client.clock.now_s()
 
 
-def require_broken_off(kit: Measuring, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
+def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
     """What is published from the beginning on of what was stopped, once its states have been found right."""
     client = kit.client
     client.wait_state(ScopeState.INTERRUPTED, mark)
@@ -52,13 +52,13 @@ def require_broken_off(kit: Measuring, mark: int, stop: str, begun: ScopeState) 
     "stop-scan breaks a scan off: SS_INTERRUPTED, SS_FREE, and no scan",
     needs=(names.START_SCAN, names.STOP_SCAN),
 )
-def cancel(kit: Measuring) -> None:
+def cancel(kit: CheckMeasurements) -> None:
     heard = broken_off(kit, kit.begin_long_scan(kit.frames.other), names.STOP_SCAN, ScopeState.SCANNING)
     expect(not scans(heard), "no Scan2d of a scan that was stopped", told(heard))
 
 
 @check("scan/stop-nothing", "stop-scan while nothing runs is a success, and changes nothing", needs=(names.STOP_SCAN,))
-def stop_nothing(kit: Measuring) -> None:
+def stop_nothing(kit: CheckMeasurements) -> None:
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
     kit.act(names.STOP_SCAN)
@@ -74,7 +74,7 @@ _FASTER, _SLOWER, _EDGES_S = 2.5, 5.0, 30.0
 
 
 @check("scan/order", "start-scan: SS_SCANNING, the Scan2d of every channel once, and only then SS_FREE", needs=_NEEDS)
-def order(kit: Measuring) -> None:
+def order(kit: CheckMeasurements) -> None:
     require_order(kit.scan("plain").heard, ScopeState.SCANNING, Scan)
 
 
@@ -92,7 +92,7 @@ def require_order(heard: list, begun: ScopeState, kind: type) -> None:  # type: 
 
 
 @check("scan/channels", "every channel has a name of its own, and values everywhere", needs=_NEEDS)
-def channels(kit: Measuring) -> None:
+def channels(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     found = [scan.channel for scan in taken.scans]
     expect(len(set(found)) == len(found), "each channel once", ", ".join(found))
@@ -103,7 +103,7 @@ def channels(kit: Measuring) -> None:
 
 
 @check("scan/frame", "a scan says the frame that was set, and is of that many pixels", needs=_NEEDS)
-def frame(kit: Measuring) -> None:
+def frame(kit: CheckMeasurements) -> None:
     require_frame(kit.scan("plain"))
 
 
@@ -119,7 +119,7 @@ def require_frame(taken: Taken) -> None:
 
 
 @check("scan/in-force", "a scan's parameters are the ScanParameters2d that were in force", needs=_NEEDS)
-def as_published(kit: Measuring) -> None:
+def as_published(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     before = [one for one in kit.client.observations.all if isinstance(one.thing, ScanParameters)]
     begun = taken.time_s(ScopeState.SCANNING)
@@ -132,7 +132,7 @@ def as_published(kit: Measuring) -> None:
 
 
 @check("scan/time", "a scan says when it was finished", needs=_NEEDS)
-def time(kit: Measuring) -> None:
+def time(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     for scan in taken.scans:
         require_time(scan.time_ns, taken, ScopeState.SCANNING, f"scan {scan.channel!r}")
@@ -159,7 +159,7 @@ def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str
     "a scan lasts about as long as its frame and scan-speed say",
     needs=(names.START_SCAN, names.SCAN_SPEED),
 )
-def duration(kit: Measuring) -> None:
+def duration(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     if taken.expected_s is None or taken.expected_s < SCAN_S / 2:
         raise Skipped("the speed could not be set so low that it would be seen")
@@ -173,7 +173,7 @@ def duration(kit: Measuring) -> None:
 
 
 @check("scan/again", "the same frame again is another scan, later than the first", needs=_NEEDS)
-def again(kit: Measuring) -> None:
+def again(kit: CheckMeasurements) -> None:
     first = kit.scan("plain")
     second = kit.take_scan(kit.frames.plain)
     require_order(second.heard, ScopeState.SCANNING, Scan)
@@ -193,7 +193,7 @@ def again(kit: Measuring) -> None:
 
 
 @check("scan/not-square", "a frame wider than high, of other pixels, comes out as it was set", needs=_NEEDS)
-def not_square(kit: Measuring) -> None:
+def not_square(kit: CheckMeasurements) -> None:
     require_frame(kit.scan("wide"))
 
 
@@ -202,5 +202,5 @@ def not_square(kit: Measuring) -> None:
     "a frame that is turned comes out as it was set, counter-clockwise",
     needs=(names.START_SCAN, names.SCAN_ANGLE),
 )
-def turned(kit: Measuring) -> None:
+def turned(kit: CheckMeasurements) -> None:
     require_frame(kit.scan("turned"))

@@ -9,7 +9,7 @@ import numpy as np
 from afspm.model import ProbePosition, ScopeState, Spectrum, names
 from afspm.testing.translators.checks.scans import CLOCK_S, asked_to_stop, require_broken_off, require_order, states
 from afspm.testing.translators.client import spectra, told
-from afspm.testing.translators.measuring import NEAR, Measuring, in_words
+from afspm.testing.translators.measuring import NEAR, CheckMeasurements, in_words
 from afspm.testing.translators.registry import Failed, Skipped, check, expect
 
 _NEEDS = (names.START_SPEC,)
@@ -20,7 +20,7 @@ _NEEDS = (names.START_SPEC,)
     "stop-spec breaks a spectrum off: SS_INTERRUPTED, SS_FREE, and no spectrum",
     needs=(names.START_SPEC, names.STOP_SPEC),
 )
-def cancel(kit: Measuring) -> None:
+def cancel(kit: CheckMeasurements) -> None:
     mark, answered_s = kit.begin_spectrum(), math.inf
     try:
         answered_s = asked_to_stop(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
@@ -32,7 +32,7 @@ def cancel(kit: Measuring) -> None:
     expect(not spectra(heard), "no Spec1d of a spectrum that was stopped", told(heard))
 
 
-def _was_over(kit: Measuring, mark: int, answered_s: float) -> bool:
+def _was_over(kit: CheckMeasurements, mark: int, answered_s: float) -> bool:
     """Whether a spectrum came to its end by itself, all in order, before anybody had stopped it."""
     client = kit.client
     heard = client.settled(mark)
@@ -44,7 +44,7 @@ def _was_over(kit: Measuring, mark: int, answered_s: float) -> bool:
 
 
 @check("spectrum/stop-nothing", "stop-spec while nothing runs is a success, and changes nothing", (names.STOP_SPEC,))
-def stop_nothing(kit: Measuring) -> None:
+def stop_nothing(kit: CheckMeasurements) -> None:
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
     kit.act(names.STOP_SPEC)
@@ -53,13 +53,13 @@ def stop_nothing(kit: Measuring) -> None:
 
 
 @check("spectrum/order", "start-spec: SS_SPEC, the Spec1d, and only then SS_FREE", needs=_NEEDS)
-def order(kit: Measuring) -> None:
+def order(kit: CheckMeasurements) -> None:
     taken = kit.spectrum()
     require_order(taken.heard, ScopeState.SPEC, Spectrum)
 
 
 @check("spectrum/values", "a spectrum has a kind, variables of different names, and values", needs=_NEEDS)
-def values(kit: Measuring) -> None:
+def values(kit: CheckMeasurements) -> None:
     for spectrum in kit.spectrum().spectra:
         expect(spectrum.kind.strip(), "a spectrum that says its type", "an empty type")
         expect(len(set(spectrum.names)) == len(spectrum.names) >= 2, "two variables or more, of different names",
@@ -70,7 +70,7 @@ def values(kit: Measuring) -> None:
 
 
 @check("spectrum/position", "a spectrum says where the probe was", needs=(*_NEEDS, names.PROBE_POS_X))
-def position(kit: Measuring) -> None:
+def position(kit: CheckMeasurements) -> None:
     wanted = kit.frames.other.region.center_m
     for spectrum in kit.spectrum().spectra:
         if spectrum.position_m is None:
@@ -83,7 +83,7 @@ def position(kit: Measuring) -> None:
 
 
 @check("spectrum/time", "a spectrum says when it was taken", needs=_NEEDS)
-def time(kit: Measuring) -> None:
+def time(kit: CheckMeasurements) -> None:
     taken = kit.spectrum()
     begin_s, end_s = taken.time_s(ScopeState.SPEC), taken.time_s(ScopeState.FREE)
     for spectrum in taken.spectra:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from afspm.drift.estimators.images import Image
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -95,14 +98,14 @@ def _mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True, eq=False)
-class Box:
+class OverlapBox:
     """The pixels of the mid grid, (x, y) from the centres: the rectangle in which two shifted images overlap."""
 
     x: Array
     y: Array
 
     @classmethod
-    def of_overlap(cls, shape1: tuple[int, int], shape2: tuple[int, int], shift_px: Array) -> Box | None:
+    def of_overlap(cls, shape1: tuple[int, int], shape2: tuple[int, int], shift_px: Array) -> OverlapBox | None:
         """None: there is less than 8 x 8 pixels of it."""
         axes = []
         for axis, shift in ((1, shift_px[0]), (0, shift_px[1])):
@@ -112,9 +115,9 @@ class Box:
             axes.append(np.arange(np.ceil(low - parity - 1e-6), np.floor(high - parity + 1e-6) + 1) + parity)
         return cls(*axes) if min(axis.size for axis in axes) >= 8 else None
 
-    def without_border(self, width: int) -> Box:
+    def without_border(self, width: int) -> OverlapBox:
         """Less so many pixels on each side: the centre remains."""
-        return Box(self.x[width:-width], self.y[width:-width])
+        return OverlapBox(self.x[width:-width], self.y[width:-width])
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,14 +135,14 @@ SLOPES = 6  # the first of them: they act through the gradient
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class WarpedPair:
     """Two images on a box. Parameters are theta = (ux, uy, axx, axy, ayx, ayy, g, h): shift u px and linear map A about
     the centre of the box, d(q) = u + A (q - centre); logarithm g of the gain of the second over the first, and h, by
     how much more the second is bent (heights z appear as z + h z² / 2: feedback and tip do that to edges)."""
 
     first: Spline
     second: Spline
-    box: Box
+    box: OverlapBox
 
     def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
         """I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and where both are known.
@@ -202,3 +205,77 @@ def derivative(values: Array, axis: int) -> Array:
     for far, weight in enumerate(NINE_POINTS, start=1):
         found += weight * (part(4 + far, 4 + far + count, of=padded) - part(4 - far, 4 - far + count, of=padded))
     return found
+
+
+Both = tuple[Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Two images with one pixel size."""
+
+    first: Image
+    second: Image
+
+    @cached_property
+    def smooth(self) -> Both:
+        """Without most of the noise."""
+        return self._filtered(1.0)
+
+    @cached_property
+    def slope(self) -> Both:
+        """Along the rows: their offsets don't touch it."""
+        return self._filtered(1.5, order=(0, 1))
+
+    @cached_property
+    def band(self) -> Both:
+        """Edges rather than areas."""
+        fine, coarse = self._filtered(0.8), self._filtered(3.0)
+        return fine[0] - coarse[0], fine[1] - coarse[1]
+
+    @cached_property
+    def smooth_splines(self) -> tuple[Spline, Spline]:
+        return self.splines(self.smooth)
+
+    @cached_property
+    def band_splines(self) -> tuple[Spline, Spline]:
+        return self.splines(self.band)
+
+    def splines(self, values: Both, order: Order = 3) -> tuple[Spline, Spline]:
+        """Of values that are known where the images are."""
+        return Spline.of(values[0], self.first.known, order), Spline.of(values[1], self.second.known, order)
+
+    def box(self, shift_px: Array) -> OverlapBox | None:
+        """Where they overlap; see `OverlapBox.of_overlap`."""
+        return OverlapBox.of_overlap(self.first.values.shape, self.second.values.shape, shift_px)
+
+    @property
+    def least_known(self) -> int:
+        """Pixels of that of which less is known."""
+        return min(int(self.first.known.sum()), int(self.second.known.sum()))
+
+    def _filtered(self, sigma_px: float, order: tuple[int, int] = (0, 0)) -> Both:
+        from scipy.ndimage import gaussian_filter
+
+        one, two = (
+            gaussian_filter(image.values, sigma_px, order=order, mode="nearest") for image in (self.first, self.second)
+        )
+        return one, two
+
+    def smaller(self) -> tuple[Scene, int, Array]:
+        """For the search: with `factor` times larger pixels where the images are large, that factor, and by how much,
+        px, the centres have been moved apart (only whole blocks of pixels are kept)."""
+        largest = max(*self.first.values.shape, *self.second.values.shape)
+        factor = 1 if largest <= 160 else 2 if largest <= 640 else 4
+        if factor == 1:
+            return self, 1, np.zeros(2)
+        cut = [np.array(image.values.shape[::-1]) % factor / 2 for image in (self.first, self.second)]
+        return Scene(_decimated(self.first, factor), _decimated(self.second, factor)), factor, cut[0] - cut[1]
+
+
+def _decimated(image: Image, factor: int) -> Image:
+    """Means of `factor` x `factor` pixels."""
+    ny, nx = (n // factor for n in image.values.shape)
+    kept, blocks = np.s_[: ny * factor, : nx * factor], (ny, factor, nx, factor)
+    known = np.asarray(image.known[kept].reshape(blocks).all(axis=(1, 3)))
+    return Image(image.values[kept].reshape(blocks).mean(axis=(1, 3)), known)

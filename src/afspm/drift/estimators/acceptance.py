@@ -21,8 +21,8 @@ FEW = 10  # with fewer repetitions a surface doesn't repeat itself
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Figures of merit of a match; see `Limits`."""
+class MatchEvidence:
+    """Figures of merit of a match; see `AcceptanceLimits`."""
 
     overlap: float
     sd_px: float
@@ -39,7 +39,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Limits:
+class AcceptanceLimits:
     """What a match must reach. Set by what true and wrong pairs of the benchmark reach.
 
     Attributes:
@@ -83,7 +83,7 @@ class Limits:
     surprise: float = 14.0
 
     @classmethod
-    def of(cls, table: Mapping[str, float]) -> Limits:
+    def of(cls, table: Mapping[str, float]) -> AcceptanceLimits:
         """The usual limits but for what a table says.
 
         Raises:
@@ -97,7 +97,7 @@ class Limits:
                 raise ConfigError(f"{name} = {value!r} is no number", where="limits")
         return cls(**table)
 
-    def reason(self, found: Evidence, *, expected: bool) -> str:
+    def reason(self, found: MatchEvidence, *, expected: bool) -> str:
         """Why a match is refused, in words; empty if it isn't."""
         overlap = self.overlap_expected if expected else self.overlap
         if found.correlation < self.correlation or found.information < self.information:
@@ -148,12 +148,6 @@ def outliers(residual: Array) -> float:
     """Variance of values over the square of their median absolute deviation; 1 for normal noise."""
     typical = 1.4826 * float(np.median(np.abs(residual)))
     return float(np.mean(residual**2)) / max(typical**2, 1e-300)
-
-
-def correlated(one: Array, two: Array) -> float:
-    """Pearson's coefficient."""
-    a, b = one - one.mean(), two - two.mean()
-    return float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-300))
 
 
 def above_surrogates(found: Array, origin: Array) -> float:

@@ -8,32 +8,28 @@ from dataclasses import asdict, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.least_squares import shear
-from afspm.drift.estimators.least_squares.acceptance import (
-    Evidence,
-    Limits,
+from afspm.drift.estimators.acceptance import (
+    AcceptanceLimits,
+    MatchEvidence,
     above_repeats,
     above_surrogates,
     agreement,
     outliers,
 )
-from afspm.drift.estimators.least_squares.align import (
+from afspm.drift.estimators.alignment import (
     ALL,
     SHIFT,
     Believed,
+    averaged,
+    covariance,
     generalised_least_squares,
     least_squares,
+    shear_models,
 )
-from afspm.drift.estimators.least_squares.covariance import covariance
-from afspm.drift.estimators.least_squares.expected import Expected, shear_by_drift
-from afspm.drift.estimators.least_squares.grid import Grid, onto_common_grid
-from afspm.drift.estimators.least_squares.prepare import Unusable, prepare
-from afspm.drift.estimators.least_squares.rows import without_lines
-from afspm.drift.estimators.least_squares.scene import Scene
-from afspm.drift.estimators.least_squares.score import Scorer
-from afspm.drift.estimators.least_squares.search import Correlation, candidates
-from afspm.drift.estimators.least_squares.spectra import FineFilter, shared_information
-from afspm.drift.estimators.least_squares.warp import COUNT, LINEAR, Box, Pair
+from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
+from afspm.drift.estimators.noise import FineFilter, shared_information, without_lines
+from afspm.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
+from afspm.drift.estimators.warp import COUNT, LINEAR, OverlapBox, Scene, WarpedPair
 from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
 
 Array = NDArray[np.float64]
@@ -56,14 +52,14 @@ class LeastSquares:
     5. `acceptance`: is it a match at all?
 
     Args:
-        limits: what a match must reach; as a table, some of the values of `Limits`.
+        limits: what a match must reach; as a table, some of the values of `AcceptanceLimits`.
 
     Raises:
         ConfigError: a limit that there is not, or that is no number.
     """
 
-    def __init__(self, limits: Limits | Mapping[str, float] | None = None):
-        self._limits = limits if isinstance(limits, Limits) else Limits.of(limits or {})
+    def __init__(self, limits: AcceptanceLimits | Mapping[str, float] | None = None):
+        self._limits = limits if isinstance(limits, AcceptanceLimits) else AcceptanceLimits.of(limits or {})
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         """See `afspm.drift.registration.Estimator`."""
@@ -74,7 +70,7 @@ class LeastSquares:
             except Unusable as reason:
                 return Registration.refused(f"the {name} can't be registered: {reason}")
         grid, *on_grid = onto_common_grid(reference, images[0], scan, images[1])
-        scene, expected = Scene(on_grid[0], on_grid[1]), None if prior is None else Expected.of(prior, grid)
+        scene, expected = Scene(on_grid[0], on_grid[1]), None if prior is None else ExpectedShift.of(prior, grid)
         start = _coarse(scene, expected)
         box = None if start is None else scene.box(start[0][:2])
         if start is None or box is None:
@@ -87,7 +83,7 @@ class LeastSquares:
         return replace(registration, linear_seen=_in_m(seen, grid))
 
     def _registration(
-        self, theta: Array, total: Array, box: Box, grid: Grid, found: Evidence, *, expected: bool
+        self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence, *, expected: bool
     ) -> Registration:
         reason = self._limits.reason(found, expected=expected)
         return Registration(
@@ -101,7 +97,7 @@ class LeastSquares:
         )
 
 
-def _coarse(scene: Scene, expected: Expected | None) -> tuple[Array, float, float] | None:
+def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float, float] | None:
     """theta within a fraction of a pixel, its log-likelihood and that of the best other; on smaller images where they
     are large."""
     small, factor, offset = scene.smaller()
@@ -110,7 +106,7 @@ def _coarse(scene: Scene, expected: Expected | None) -> tuple[Array, float, floa
     box = None if best is None else small.box(best[0].shift_px)
     if best is None or box is None:
         return None
-    pair = Pair(*small.smooth_splines, box)
+    pair = WarpedPair(*small.smooth_splines, box)
     theta = np.concatenate([best[0].shift_px, np.zeros(COUNT - 2)])
     theta = least_squares(pair, theta, _believed(scaled), SHIFT, steps=4)
     theta = least_squares(pair, theta, _believed(scaled), ALL, steps=4)
@@ -119,20 +115,20 @@ def _coarse(scene: Scene, expected: Expected | None) -> tuple[Array, float, floa
 
 
 def _fine(
-    scene: Scene, box: Box, theta: Array, expected: Expected | None, shears: tuple[Array, list[Array]]
+    scene: Scene, box: OverlapBox, theta: Array, expected: ExpectedShift | None, shears: tuple[Array, list[Array]]
 ) -> tuple[Array, Array, LinearSeen]:
     """theta and its covariance, and its linear map before what shear is plausible was reckoned with."""
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
-    pair = Pair(*scene.splines(values, order=5), box.without_border(BORDER_PX))
+    pair = WarpedPair(*scene.splines(values, order=5), box.without_border(BORDER_PX))
     believed = _believed(expected)
     fit = generalised_least_squares(pair, theta, believed, fine)
     spread = covariance(fit, believed)
     seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
-    return *shear.averaged(fit.theta, spread, shears[1], shears[0]), seen
+    return *averaged(fit.theta, spread, shears[1], shears[0]), seen
 
 
-def _in_m(seen: LinearSeen, grid: Grid) -> LinearSeen:
+def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
     """The same in tip coordinates, by where a feature is in the reference."""
     to_m = np.kron(grid.to_m, np.linalg.inv(grid.to_m).T)
     return LinearSeen(grid.linear_m(_from_reference(seen.linear)), to_m @ seen.covariance @ to_m.T)
@@ -144,7 +140,7 @@ def _from_reference(linear: Array) -> Array:
     return whole
 
 
-def _believed(expected: Expected | None) -> Believed:
+def _believed(expected: ExpectedShift | None) -> Believed:
     mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
     precision[2:, 2:] = np.diag(1.0 / np.square([*WIDEST, *WIDEST, GAIN_SD, BEND_SD]))
     if expected is not None:
@@ -152,26 +148,33 @@ def _believed(expected: Expected | None) -> Believed:
     return Believed(mean, precision)
 
 
-def _shear_models(prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: Grid) -> tuple[Array, list[Array]]:
+def _shear_models(
+    prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid
+) -> tuple[Array, list[Array]]:
     """Mean and covariances of the linear map of pixels, (axx, axy, ayx, ayy)."""
     mean_m, sd = shear_by_drift(prior, reference, scan)
     angle = reference.region.angle_rad
     slow = np.array([-np.sin(angle), np.cos(angle)])
     width, height = np.hypot(*grid.to_m)
     mean: Array = np.linalg.inv(grid.to_m) @ np.outer(mean_m, slow) @ grid.to_m
-    return mean.ravel(), shear.models(sd, float(height / width))
+    return mean.ravel(), shear_models(sd, float(height / width))
 
 
 def _evidence(
-    scene: Scene, box: Box, theta: Array, total: Array, likelihoods: tuple[float, float], expected: Expected | None
-) -> Evidence:
-    one, two, known = Pair(*scene.smooth_splines, box).warped(theta)
+    scene: Scene,
+    box: OverlapBox,
+    theta: Array,
+    total: Array,
+    likelihoods: tuple[float, float],
+    expected: ExpectedShift | None,
+) -> MatchEvidence:
+    one, two, known = WarpedPair(*scene.smooth_splines, box).warped(theta)
     one, two = without_lines(one, known), without_lines(two, known)
-    edges = Pair(*scene.band_splines, box).warped(theta)
+    edges = WarpedPair(*scene.band_splines, box).warped(theta)
     share, correlation = agreement(one, two, known)
-    elsewhere = Correlation(known, known, SURROGATES_PX)
+    elsewhere = MaskedCorrelation(known, known, SURROGATES_PX)
     by_shift, edges_by_shift = elsewhere.of(one, two), elsewhere.of(edges[0], edges[1])
-    return Evidence(
+    return MatchEvidence(
         overlap=float(known.sum() / scene.least_known),
         sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
         gap=likelihoods[0] - likelihoods[1],

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.least_squares.prepare import flatten_rows
-from afspm.drift.estimators.least_squares.rows import LEAST_NOISE, noise_metric, products, seen, without_lines
-from afspm.drift.estimators.least_squares.shrink import denoised
-from afspm.drift.estimators.least_squares.spectra import FineFilter
-from afspm.drift.estimators.least_squares.warp import COUNT, SLOPES, Pair, derivative
+from afspm.drift.estimators.images import flatten_rows
+from afspm.drift.estimators.noise import LEAST_NOISE, FineFilter, denoised, noise_metric, products, seen, without_lines
+from afspm.drift.estimators.warp import COUNT, LINEAR, SLOPES, WarpedPair, derivative
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -36,7 +36,7 @@ class Fit:
     """Where it has come to, and the equations there, per block of the image and over the variance of the noise.
 
     Attributes:
-        theta: (8,), see `Pair`.
+        theta: (8,), see `WarpedPair`.
         curvature: (n, 8, 8), H'QJ with J the gradient without noise and H what of it is known.
         spread: (n, 8, 8), H'QH, the covariance of `slope`.
         slope: (n, 8), H'Qr.
@@ -48,7 +48,7 @@ class Fit:
     slope: Array
 
 
-def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
+def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
     """theta after some steps with plain weights, for the coarse stages."""
     theta = theta.copy()
     for _ in range(steps):
@@ -64,7 +64,7 @@ def least_squares(pair: Pair, theta: Array, believed: Believed, free: Index, ste
     return theta
 
 
-def generalised_least_squares(pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
+def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
     """theta by rows (see `rows`), where scars count less. The gradient, the noise and the weights are estimated anew in
     each round, from what the one before has left."""
     for _ in range(ROUNDS):
@@ -76,7 +76,7 @@ def generalised_least_squares(pair: Pair, theta: Array, believed: Believed, seen
     return fit
 
 
-def _round(pair: Pair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
+def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
     """Newton's step to H'Q r + P (theta - mean) = 0; H is the gradient J without most of its noise (see `shrink`).
 
     Noise moves with theta as the surface does, but so does what of it has been left in H, and both cancel: what the
@@ -144,3 +144,75 @@ def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
     typical = float(np.median(rms[count > 0])) if count.any() else 1.0
     weight: Array = 1.0 / (1.0 + 4.0 * np.maximum(rms / max(typical, 1e-12) - 1.3, 0.0) ** 2)
     return weight
+
+
+FLOOR_PX = 1e-3
+
+
+def covariance(fit: Fit, believed: Believed) -> Array:
+    """(8, 8) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982),
+    scaled by what the shift really varies with the blocks of the image left out.
+
+    The variation is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb, J. Appl. Econom. 38, 671, 2023),
+    which allows for noise that is correlated within a block. Of 8 x 8 numbers it would know little, as few blocks hold
+    most of the features: only its size is taken, and only where it is larger.
+    """
+    used = np.abs(fit.curvature).max(axis=(1, 2)) > 0.0
+    n = int(used.sum())
+    whole = fit.curvature.sum(axis=0) + believed.precision
+    inverse = np.linalg.inv(whole)
+    model = inverse @ (fit.spread.sum(axis=0) + believed.precision) @ inverse.T
+    change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
+    varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
+    size = float(np.trace(np.linalg.solve(model[:2, :2], varied[:2, :2]))) / 2
+    total: Array = max(size, 1.0) * (model + model.T) / 2
+    total[:2, :2] += FLOOR_PX**2 * np.eye(2)
+    return total
+
+
+DRIFTS = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)  # displacement per length along y
+BESIDES = (2e-4, 0.01)  # of each element: next to nothing; or creep, a sample that turns, another calibration
+
+
+def of_drift(sd: float) -> Array:
+    """Covariance of (axx, axy, ayx, ayy) when drift during the scans shears them: each row is displaced against the one
+    before, so what depends on y varies alone."""
+    return sd**2 * np.diag([0.0, 1.0, 0.0, 1.0])
+
+
+def shear_models(drift: float | None, aspect: float) -> list[Array]:
+    """What the linear map of pixel coordinates may be: covariances of it.
+
+    Args:
+        drift: displacement per length along y; None: not known, so all are tried.
+        aspect: height of a pixel over its width.
+    """
+    to_px = np.diag([1.0, aspect, 1.0 / aspect, 1.0])
+    drifts = DRIFTS if drift is None else (drift,)
+    return [to_px @ (of_drift(d) + b**2 * np.eye(4)) @ to_px for d, b in itertools.product(drifts, BESIDES)]
+
+
+def averaged(theta: Array, covariance: Array, covariances: Iterable[Array], mean: Array) -> tuple[Array, Array]:
+    """Bayesian model averaging over what the linear map may be (Hoeting, Stat. Sci. 14, 382, 1999).
+
+    Where features are few, shift and shear are nearly the same thing, and what shear is plausible decides the shift.
+    Each model says that the map is normal about `mean` with its covariance; it conditions the shift on that, and weighs
+    by how likely the map found is in it.
+
+    Returns:
+        theta and its covariance, the moments of the mixture.
+    """
+    weights, thetas, totals = [], [], []
+    off = theta[LINEAR] - mean
+    for model in covariances:
+        spread = covariance[LINEAR, LINEAR] + model
+        gain = covariance[:, LINEAR] @ np.linalg.inv(spread)
+        weights.append(-0.5 * off @ np.linalg.solve(spread, off) - 0.5 * np.linalg.slogdet(spread)[1])
+        thetas.append(theta - gain @ off)
+        totals.append(covariance - gain @ covariance[LINEAR])
+    weight = np.exp(np.array(weights) - max(weights))
+    weight /= weight.sum()
+    best: Array = weight @ np.array(thetas)
+    apart = np.array(thetas) - best
+    total: Array = np.tensordot(weight, np.array(totals), 1) + np.einsum("k,ki,kj->ij", weight, apart, apart)
+    return best, total
