@@ -36,22 +36,22 @@ def state_diagram() -> str:
 def transition_table() -> str:
     lines = ["| a component … | when | it gets | and | because |", "| --- | --- | --- | --- | --- |"]
     for row in arbitration.TABLE:
-        answer = "the translator's answer" if arbitration.Do.FORWARD in row.do else "—"
+        answer = "the translator's answer" if arbitration.ControlChange.FORWARD in row.do else "—"
         if row.response is not None:
             answer = f"`REP_{row.response.name}`"
-        done = ", ".join(_done(do) for do in row.do if do is not arbitration.Do.FORWARD) or "nothing changes"
+        done = ", ".join(_done(do) for do in row.do if do is not arbitration.ControlChange.FORWARD) or "nothing changes"
         lines.append(f"| {row.event.value} | {row.when.text} | {answer} | {done} | {row.why} |")
     return "\n".join(lines) + "\n"
 
 
-def _done(do: arbitration.Do) -> str:
+def _done(do: arbitration.ControlChange) -> str:
     return {
-        arbitration.Do.GRANT: "it is in control",
-        arbitration.Do.TAKE: "nobody is in control",
-        arbitration.Do.FLAG: "the problem is flagged",
-        arbitration.Do.UNFLAG: "the flag is removed",
-        arbitration.Do.SET_MODE: "the mode is set",
-        arbitration.Do.END: "the experiment ends",
+        arbitration.ControlChange.GRANT: "it is in control",
+        arbitration.ControlChange.TAKE: "nobody is in control",
+        arbitration.ControlChange.FLAG: "the problem is flagged",
+        arbitration.ControlChange.UNFLAG: "the flag is removed",
+        arbitration.ControlChange.SET_MODE: "the mode is set",
+        arbitration.ControlChange.END: "the experiment ends",
     }[do]
 
 

@@ -13,8 +13,8 @@ from afspm.drift.trackers.paper import PaperForecast
 from afspm.logic.events import Effect, Publish
 from afspm.model import ControlResponse, Packet, Region, Request, Scan, ScanParameters, ScopeState
 from afspm.scheduler.drift.core import DriftCore
-from afspm.scheduler.drift.settings import DriftSettings, RescanRule
-from afspm.scheduler.drift.told import Forecasted, Registered, RescanWanted, ScanJob, WorkerGone, WorkerSaid
+from afspm.scheduler.drift.messages import Forecasted, Registered, RescanWanted, ScanJob, WorkerGone, WorkerSaid
+from afspm.scheduler.drift.settings import DriftCompensationSettings, RescanRule
 from tests.simulation.codec import TableCodec
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.microscope import FakeMicroscope, FakeScan, Habits
@@ -194,7 +194,7 @@ class DriftNight(Night):
         return DriftingMicroscope(self.timeline, self.codec, habits)
 
     def make_core(self) -> Callable[[], Any]:
-        drift = DriftSettings(rescan=RescanRule("never"), longest_registration=LONGEST_S)
+        drift = DriftCompensationSettings(rescan=RescanRule("never"), longest_registration=LONGEST_S)
         return lambda: DriftCore(self.settings, drift, self.codec, self.worker, "scheduler")  # type: ignore[arg-type]
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:

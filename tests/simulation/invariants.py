@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from afspm.errors import AfspmError
-from afspm.logic.arbitration import Control
+from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.events import (
     Disconnected,
     Effect,
@@ -15,10 +15,10 @@ from afspm.logic.events import (
     Input,
     Publish,
     Replay,
+    ReplayRequested,
     Reply,
     RequestIn,
     SaveState,
-    SubscriberJoined,
 )
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
@@ -83,8 +83,8 @@ class Invariants:
         self._open: dict[tuple[str, str], tuple[float, int]] = {}
         self._definite: dict[tuple[str, str], int] = {}
         self._life = 0
-        self._checked: Control | None = None
-        self._saved_control: Control | None = None
+        self._checked: ArbitrationState | None = None
+        self._saved_control: ArbitrationState | None = None
         self._saved_state: dict[str, bytes] | None = None
         self.written = Written(timeline, codec, self._must, NAME_TAKEN)
         microscope.on_executed = self.executed
@@ -128,7 +128,7 @@ class Invariants:
         elif isinstance(event, Disconnected):
             for key in [k for k, (_, connection) in self._open.items() if connection == event.connection]:
                 del self._open[key]
-        if isinstance(event, SubscriberJoined):
+        if isinstance(event, ReplayRequested):
             self._replayed(host, event, effects)
         self._control(host)
         self._presence(host)
@@ -158,7 +158,7 @@ class Invariants:
         self._holder = control.holder
 
     def _presence(self, host: SchedulerHost) -> None:
-        """Control never stays with the dead."""
+        """ArbitrationState never stays with the dead."""
         now_s = self._timeline.monotonic_s()
         for client in self.components:
             if client.identity != client.name:
@@ -281,7 +281,7 @@ class Invariants:
         )
         self._last_ns = packet.time_ns
 
-    def _replayed(self, host: SchedulerHost, event: SubscriberJoined, effects: Sequence[Effect]) -> None:
+    def _replayed(self, host: SchedulerHost, event: ReplayRequested, effects: Sequence[Effect]) -> None:
         """Exactly what is cached and it has not had, oldest first over all envelopes."""
         replay = next(effect for effect in effects if isinstance(effect, Replay))
         cached = [packet for packet, _ in host.core.cached()]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from afspm.logic.supervision import ChildWatch, Effect, GiveUp, Kill, Phase, Policy, Start
+from afspm.logic.supervision import ChildEffect, ChildPhase, ChildPolicy, ChildWatch, GiveUpChild, KillChild, StartChild
 from afspm.model import ProcessCondition, ProcessState
 from tests.simulation.process import Process
 from tests.simulation.timeline import Timeline
 
-_OVER = {Phase.DONE: ProcessCondition.ENDED, Phase.GIVEN_UP: ProcessCondition.GIVEN_UP}
+_OVER = {ChildPhase.DONE: ProcessCondition.ENDED, ChildPhase.GIVEN_UP: ProcessCondition.GIVEN_UP}
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Keeper:
         given_up: names of those that it gave up.
     """
 
-    def __init__(self, timeline: Timeline, processes: Iterable[Process], policy: Policy) -> None:
+    def __init__(self, timeline: Timeline, processes: Iterable[Process], policy: ChildPolicy) -> None:
         self._timeline = timeline
         self._policy = policy
         self._children = {process.name: (process, ChildWatch(policy)) for process in processes}
@@ -40,7 +40,7 @@ class Keeper:
         self._beat()
 
     def restart(self, name: str) -> None:
-        """Start a process anew, as somebody ordered."""
+        """StartChild a process anew, as somebody ordered."""
         process, watch = self._children[name]
         self._do(process, watch.restart(self._timeline.monotonic_s()))
 
@@ -67,16 +67,16 @@ class Keeper:
         process, watch = self._children[name]
         self._do(process, watch.exited(code, self._timeline.monotonic_s()))
 
-    def _do(self, process: Process, effects: Iterable[Effect]) -> None:
+    def _do(self, process: Process, effects: Iterable[ChildEffect]) -> None:
         for effect in effects:
-            if isinstance(effect, Start):
+            if isinstance(effect, StartChild):
                 self._timeline.after(0.3 + 0.5 * self._timeline.random.random(), process.start)
-            elif isinstance(effect, Kill):
+            elif isinstance(effect, KillChild):
                 process.kill()
-            elif isinstance(effect, GiveUp):
+            elif isinstance(effect, GiveUpChild):
                 self.given_up.append(process.name)
         watch = self._children[process.name][1]
-        if watch.phase is Phase.WAITING and (again_s := watch.deadline_s()) is not None:
+        if watch.phase is ChildPhase.WAITING and (again_s := watch.deadline_s()) is not None:
             self._timeline.after(again_s - self._timeline.monotonic_s(), self._tick, process.name)
 
     def _tick(self, name: str) -> None:

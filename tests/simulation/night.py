@@ -6,14 +6,14 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from afspm.logic.arbitration import Cause, Roles, Rules
-from afspm.logic.danger import FEEDBACK_OFF
+from afspm.logic.arbitration import Cause, RoleTable, Rules
 from afspm.logic.envelopes import Envelopes
-from afspm.logic.limits import Limit, Limits
+from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.liveness import LivenessPolicy
+from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.restart import RestartPolicy
-from afspm.logic.scheduling import SchedulerSettings
-from afspm.logic.supervision import Policy
+from afspm.logic.scheduler_core import SchedulerSettings
+from afspm.logic.supervision import ChildPolicy
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Packet, PacketHeader, ScopeState, names
 from tests.simulation import behaviours
@@ -368,7 +368,7 @@ class Night:
 
 
 def _settings(plan: Plan) -> SchedulerSettings:
-    limits = Limits(
+    limits = ExperimentLimits(
         {names.TIP_BIAS_VOLTAGE: Limit(low=-10.0, high=10.0, source="night")},
         {names.PULSE: Limit(only=("corrector", "feedback"), source="night")},
     )
@@ -380,7 +380,7 @@ def _settings(plan: Plan) -> SchedulerSettings:
         longest_s=20.0,
     )
     return SchedulerSettings(
-        rules=Rules(Roles(end=("dawn",), mode=_PEOPLE, clear=_PEOPLE)),
+        rules=Rules(RoleTable(end=("dawn",), mode=_PEOPLE, clear=_PEOPLE)),
         lease_s=plan.lease_s,
         watchdog=watchdog,
         limits=limits,
@@ -389,6 +389,6 @@ def _settings(plan: Plan) -> SchedulerSettings:
     )
 
 
-def _policy() -> Policy:
+def _policy() -> ChildPolicy:
     liveness = LivenessPolicy(beat_period_s=5.0, missed_beats=3, longest_step_s=30.0)
-    return Policy(liveness, RestartPolicy(budget=10**6, longest_delay_s=5.0))
+    return ChildPolicy(liveness, RestartPolicy(budget=10**6, longest_delay_s=5.0))

@@ -21,17 +21,17 @@ from afspm.logic.events import (
     PacketIn,
     Publish,
     Replay,
+    ReplayRequested,
     Reply,
     RequestIn,
     SaveState,
-    SubscriberJoined,
     Tick,
     TranslatorCaughtUp,
     TranslatorDown,
     TranslatorReply,
     TranslatorUp,
 )
-from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
+from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
 from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, PacketHeader, Request, Response
 from tests.simulation.network import ControlLine, ControlServer, Feed, Publisher, Weather
 from tests.simulation.process import Alarm, Process
@@ -221,7 +221,7 @@ class SchedulerHost(Process):
 
     def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
         self._replay = ()
-        self._step(SubscriberJoined(feed, tuple(prefixes), since_ns))
+        self._step(ReplayRequested(feed, tuple(prefixes), since_ns))
         if feed not in self._feeds:
             self._feeds.append(feed)
         if self._has_ended:
@@ -244,7 +244,7 @@ class SchedulerHost(Process):
         return self.core.leave_at_s < math.inf
 
     def _step(self, event: Input, *, late: bool = False) -> None:
-        if self._has_ended and not (late or isinstance(event, SubscriberJoined)):
+        if self._has_ended and not (late or isinstance(event, ReplayRequested)):
             return
         self._carry_out(event, self.core.step(event, self.timeline.monotonic_s(), self.timeline.now_ns()))
 

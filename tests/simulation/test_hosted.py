@@ -18,10 +18,10 @@ from afspm.exit_codes import ExitCode
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.restart import RestartPolicy
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.supervision import Policy
+from afspm.logic.supervision import ChildPolicy
 from afspm.model import Problem, Region
 from afspm.runtime.component import Component
-from afspm.scheduler.codec import WireCodec
+from afspm.scheduler.wire_codec import WireCodec
 from tests.simulation.bench import CHANNELS, BenchMicroscope
 from tests.simulation.hosted import HostedComponent, HostedTranslator
 from tests.simulation.keeper import Keeper
@@ -119,7 +119,7 @@ def night(
         name: HostedComponent(timeline, weather, scheduler, name, made, folder, dies_in_call=dies_in_call)
         for name, made in cast.items()
     }
-    policy = Policy(LivenessPolicy(beat_period_s=5.0), RestartPolicy(budget=10**6, longest_delay_s=2.0))
+    policy = ChildPolicy(LivenessPolicy(beat_period_s=5.0), RestartPolicy(budget=10**6, longest_delay_s=2.0))
     keeper = Keeper(timeline, [translator, scheduler, *components.values()], policy)
     return Night(timeline, scheduler, components["survey"], translator, components, finished, folder, keeper)
 

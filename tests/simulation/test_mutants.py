@@ -9,21 +9,21 @@ from typing import Any
 
 import pytest
 
-from afspm.logic import arbitration, chronicle
-from afspm.logic.absence import Absence
+from afspm.logic import arbitration, event_log
 from afspm.logic.arbiter import Arbiter
-from afspm.logic.arbitration import Do, Event, Row
-from afspm.logic.cache import Cache
-from afspm.logic.chronicle import Chronicle
-from afspm.logic.danger import Danger
-from afspm.logic.desk import Desk
-from afspm.logic.ending import Ending
-from afspm.logic.forwarding import Forwarder
-from afspm.logic.guard import Guard
+from afspm.logic.arbitration import ControlChange, ControlEvent, Transition
+from afspm.logic.cache import PacketCache
+from afspm.logic.event_log import EventLog
+from afspm.logic.experiment_end import ExperimentEnd
+from afspm.logic.forwarder import Forwarder
+from afspm.logic.holder_timeout import HolderTimeout
+from afspm.logic.idempotency_cache import IdempotencyCache
 from afspm.logic.lease import Lease
-from afspm.logic.once import OnceTable
-from afspm.logic.scheduling import SchedulerCore
-from afspm.logic.sessions import Hearing, Sessions
+from afspm.logic.limit_checker import LimitChecker
+from afspm.logic.microscope_status import TipRisk
+from afspm.logic.request_pipeline import RequestPipeline
+from afspm.logic.scheduler_core import SchedulerCore
+from afspm.logic.sessions import Hearing, SessionTable
 from afspm.logic.watchdog import Watchdog
 from afspm.model import JournalEntries
 from tests.simulation.invariants import InvariantViolated
@@ -51,49 +51,51 @@ def _bad_night(seed: int) -> Plan:
     return replace(slow, faults=faults, ids_known=seed % 2 == 0, dies_in_step=0.003, doubles=0.1, hangs=0.005)
 
 
-def _rows(patch: Patch, event: Event, change: Callable[[tuple[Row, ...]], tuple[Row, ...]]) -> None:
+def _rows(
+    patch: Patch, event: ControlEvent, change: Callable[[tuple[Transition, ...]], tuple[Transition, ...]]
+) -> None:
     patch.setitem(arbitration._ROWS, event, change(arbitration._ROWS[event]))
 
 
-def _without(condition: arbitration.Condition) -> Callable[[tuple[Row, ...]], tuple[Row, ...]]:
+def _without(condition: arbitration.Condition) -> Callable[[tuple[Transition, ...]], tuple[Transition, ...]]:
     return lambda rows: tuple(row for row in rows if row.when is not condition)
 
 
-def _not_doing(do: Do) -> Callable[[tuple[Row, ...]], tuple[Row, ...]]:
+def _not_doing(do: ControlChange) -> Callable[[tuple[Transition, ...]], tuple[Transition, ...]]:
     return lambda rows: tuple(replace(row, do=tuple(d for d in row.do if d is not do)) for row in rows)
 
 
 def flag_leaves_control(patch: Patch) -> None:
-    _rows(patch, Event.FLAG, _not_doing(Do.TAKE))
+    _rows(patch, ControlEvent.FLAG, _not_doing(ControlChange.TAKE))
 
 
 def two_in_control(patch: Patch) -> None:
-    _rows(patch, Event.REQUEST_CONTROL, _without(arbitration.OTHER_HOLDS))
+    _rows(patch, ControlEvent.REQUEST_CONTROL, _without(arbitration.OTHER_HOLDS))
 
 
 def anybody_while_flagged(patch: Patch) -> None:
-    _rows(patch, Event.REQUEST_CONTROL, _without(arbitration.SOLVES_NONE))
+    _rows(patch, ControlEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_NONE))
 
 
 def manual_lets_in(patch: Patch) -> None:
-    _rows(patch, Event.REQUEST_CONTROL, _without(arbitration.IS_MANUAL))
+    _rows(patch, ControlEvent.REQUEST_CONTROL, _without(arbitration.IS_MANUAL))
 
 
 def manual_leaves_control(patch: Patch) -> None:
-    _rows(patch, Event.SET_MODE, _not_doing(Do.TAKE))
+    _rows(patch, ControlEvent.SET_MODE, _not_doing(ControlChange.TAKE))
 
 
 def solver_stays_when_solved(patch: Patch) -> None:
-    _rows(patch, Event.CLEAR, _not_doing(Do.TAKE))
+    _rows(patch, ControlEvent.CLEAR, _not_doing(ControlChange.TAKE))
 
 
 def anybody_commands(patch: Patch) -> None:
-    rows = arbitration._ROWS[Event.COMMAND]
-    _rows(patch, Event.COMMAND, lambda _: (replace(rows[0], when=arbitration.OTHERWISE),))
+    rows = arbitration._ROWS[ControlEvent.COMMAND]
+    _rows(patch, ControlEvent.COMMAND, lambda _: (replace(rows[0], when=arbitration.OTHERWISE),))
 
 
 def the_dead_keep_control(patch: Patch) -> None:
-    _rows(patch, Event.DEAD, _not_doing(Do.TAKE))
+    _rows(patch, ControlEvent.DEAD, _not_doing(ControlChange.TAKE))
 
 
 def no_lease(patch: Patch) -> None:
@@ -101,29 +103,29 @@ def no_lease(patch: Patch) -> None:
 
 
 def nobody_is_dead(patch: Patch) -> None:
-    patch.setattr(Absence, "dead_at_s", lambda self, holder: None)
+    patch.setattr(HolderTimeout, "dead_at_s", lambda self, holder: None)
 
 
 def an_impostor_is_let_in(patch: Patch) -> None:
-    real = Sessions.hear
+    real = SessionTable.hear
 
-    def hear(self: Sessions, *args: Any) -> Hearing:
+    def hear(self: SessionTable, *args: Any) -> Hearing:
         hearing = real(self, *args)
         if hearing is Hearing.TAKEN:
             self._bind(args[1], None, args[0])
             return Hearing.ACCEPTED
         return hearing
 
-    patch.setattr(Sessions, "hear", hear)
+    patch.setattr(SessionTable, "hear", hear)
 
 
 def ids_are_forgotten(patch: Patch) -> None:
-    patch.setattr(OnceTable, "look_up", lambda self, client, request: None)
+    patch.setattr(IdempotencyCache, "look_up", lambda self, client, request: None)
 
 
 def sent_actions_are_not_saved(patch: Patch) -> None:
-    real = Desk.snapshot
-    patch.setattr(Desk, "snapshot", lambda self: {**real(self), "sent": []})
+    real = RequestPipeline.snapshot
+    patch.setattr(RequestPipeline, "snapshot", lambda self: {**real(self), "sent": []})
 
 
 def nothing_expires(patch: Patch) -> None:
@@ -140,7 +142,7 @@ def any_answer_will_do(patch: Patch) -> None:
 
 
 def nothing_is_called_back(patch: Patch) -> None:
-    patch.setattr(Desk, "call_back", lambda self, former, cause: None)
+    patch.setattr(RequestPipeline, "call_back", lambda self, former, cause: None)
 
 
 def told_before_saved(patch: Patch) -> None:
@@ -148,60 +150,60 @@ def told_before_saved(patch: Patch) -> None:
 
     def follow(self: Arbiter, *args: Any) -> None:
         real(self, *args)
-        self._desk.effects.sort(key=lambda effect: type(effect).__name__ == "SaveState")
+        self._pipeline.effects.sort(key=lambda effect: type(effect).__name__ == "SaveState")
 
     patch.setattr(Arbiter, "_follow", follow)
 
 
 def times_go_back(patch: Patch) -> None:
-    def next_ns(self: Cache, time_ns: int) -> int:
+    def next_ns(self: PacketCache, time_ns: int) -> int:
         self._last_ns = time_ns
         return time_ns
 
-    patch.setattr(Cache, "_next_ns", next_ns)
+    patch.setattr(PacketCache, "_next_ns", next_ns)
 
 
 def doubles_of_the_translator_pass(patch: Patch) -> None:
-    patch.setattr(Cache, "remember", lambda self, recent: None)
+    patch.setattr(PacketCache, "remember", lambda self, recent: None)
 
 
 def replay_by_one_newest_time(patch: Patch) -> None:
-    real = Cache.replay
-    patch.setattr(Cache, "replay", lambda self, prefixes, since_ns: real(self, prefixes, since_ns)[-3:])
+    real = PacketCache.replay
+    patch.setattr(PacketCache, "replay", lambda self, prefixes, since_ns: real(self, prefixes, since_ns)[-3:])
 
 
 def replay_envelope_by_envelope(patch: Patch) -> None:
-    real = Cache.replay
+    real = PacketCache.replay
 
-    def replay(self: Cache, prefixes: Any, since_ns: int) -> Any:
+    def replay(self: PacketCache, prefixes: Any, since_ns: int) -> Any:
         return tuple(sorted(real(self, prefixes, since_ns), key=lambda packet: packet.envelope))
 
-    patch.setattr(Cache, "replay", replay)
+    patch.setattr(PacketCache, "replay", replay)
 
 
 def answers_are_written_down_once_more(patch: Patch) -> None:
-    real = Chronicle.take
+    real = EventLog.take
 
-    def take(self: Chronicle) -> JournalEntries:
+    def take(self: EventLog) -> JournalEntries:
         taken, before = real(self), self.__dict__.setdefault("before", JournalEntries(()))
         self.__dict__["before"] = JournalEntries(taken.entries[-1:])
         return JournalEntries((*before.entries, *taken.entries))
 
-    patch.setattr(Chronicle, "take", take)
+    patch.setattr(EventLog, "take", take)
 
 
 def every_fiftieth_answer_is_not_written_down(patch: Patch) -> None:
-    real, count = Chronicle.answered, itertools.count(1)
+    real, count = EventLog.answered, itertools.count(1)
 
-    def answered(self: Chronicle, *args: Any) -> None:
+    def answered(self: EventLog, *args: Any) -> None:
         if next(count) % 50:
             real(self, *args)
 
-    patch.setattr(Chronicle, "answered", answered)
+    patch.setattr(EventLog, "answered", answered)
 
 
 def changes_of_control_are_not_written_down(patch: Patch) -> None:
-    patch.setattr(Chronicle, "_say", lambda self, who, what, reason="": None)
+    patch.setattr(EventLog, "_say", lambda self, who, what, reason="": None)
 
 
 def entries_are_held_back(patch: Patch) -> None:
@@ -209,21 +211,21 @@ def entries_are_held_back(patch: Patch) -> None:
 
 
 def entries_are_published_at_once(patch: Patch) -> None:
-    patch.setattr(chronicle, "PERIOD_S", 0.0)
+    patch.setattr(event_log, "PERIOD_S", 0.0)
 
 
 def entries_backwards(patch: Patch) -> None:
-    real = Chronicle.take
-    patch.setattr(Chronicle, "take", lambda self: JournalEntries(real(self).entries[::-1]))
+    real = EventLog.take
+    patch.setattr(EventLog, "take", lambda self: JournalEntries(real(self).entries[::-1]))
 
 
 def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
-    real = Cache.restore
+    real = PacketCache.restore
 
-    def restore(self: Cache, packets: Any, *args: Any) -> None:
-        real(self, [entry for entry in packets if entry[0].envelope != chronicle.ENTRIES], *args)
+    def restore(self: PacketCache, packets: Any, *args: Any) -> None:
+        real(self, [entry for entry in packets if entry[0].envelope != event_log.ENTRIES], *args)
 
-    patch.setattr(Cache, "restore", restore)
+    patch.setattr(PacketCache, "restore", restore)
 
 
 def the_tip_is_never_retracted(patch: Patch) -> None:
@@ -231,7 +233,7 @@ def the_tip_is_never_retracted(patch: Patch) -> None:
 
 
 def a_danger_that_can_not_be_helped_is_never_told(patch: Patch) -> None:
-    patch.setattr(Danger, "untold", lambda self: None)
+    patch.setattr(TipRisk, "untold", lambda self: None)
 
 
 def nobody_is_called_to_a_tip_that_was_retracted(patch: Patch) -> None:
@@ -239,19 +241,19 @@ def nobody_is_called_to_a_tip_that_was_retracted(patch: Patch) -> None:
 
 
 def other_problems_are_solved_with_a_tip_that_is_away(patch: Patch) -> None:
-    _rows(patch, Event.REQUEST_CONTROL, _without(arbitration.SOLVES_OTHER_THAN_MALFUNCTION))
+    _rows(patch, ControlEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_OTHER_THAN_MALFUNCTION))
 
 
 def the_end_does_not_wait_for_the_tip(patch: Patch) -> None:
-    patch.setattr(Ending, "is_due", lambda self, now_s: self.by_s is not None)
+    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s: self.by_s is not None)
 
 
 def the_end_never_comes(patch: Patch) -> None:
-    patch.setattr(Ending, "is_due", lambda self, now_s: False)
+    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s: False)
 
 
 def limits_are_not_checked(patch: Patch) -> None:
-    patch.setattr(Guard, "check", lambda self, *args: None)
+    patch.setattr(LimitChecker, "check", lambda self, *args: None)
 
 
 def everybody_has_every_role(patch: Patch) -> None:

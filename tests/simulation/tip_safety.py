@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from afspm.logic.arbitration import Control
-from afspm.logic.chronicle import SCHEDULER
+from afspm.logic.arbitration import ArbitrationState
+from afspm.logic.event_log import SCHEDULER
 from afspm.logic.events import Effect, Input, Kill, Log, Reply, RequestIn
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import ControlMode, ControlRequest, Parameter, Problem, Request, names
@@ -42,7 +42,7 @@ class TipSafety:
         self._settings = settings
         self._microscope = microscope
         self._must = must
-        self._before = Control()
+        self._before = ArbitrationState()
         self._unattended = False
         self._danger_since_s: float | None = None
         self._disturbed_until_s = -1.0
@@ -91,7 +91,7 @@ class TipSafety:
         elif now_s - self._safe_since_s > settings.request_timeout_s + settings.patience_s:
             self._is_told = False
 
-    def _changed(self, before: Control, after: Control, who: str) -> None:
+    def _changed(self, before: ArbitrationState, after: ArbitrationState, who: str) -> None:
         self._roles(before, after, who)
         if after.mode is ControlMode.MANUAL or (after.holder is not None and after.solving == _MALFUNCTION):
             self._unattended = False
@@ -100,7 +100,7 @@ class TipSafety:
         elif (before.holder is not None and after.holder is None and who != before.holder) or after.ended:
             self._unattended = True
 
-    def _roles(self, before: Control, after: Control, who: str) -> None:
+    def _roles(self, before: ArbitrationState, after: ArbitrationState, who: str) -> None:
         roles = self._settings.rules.roles
         if after.mode is not before.mode:
             self._must(who in (roles.mode or ()), f"{who or 'nobody'} switched the mode")

@@ -6,10 +6,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from afspm.logic.arbitration import Control
-from afspm.logic.chronicle import CONTROL, ENTRIES, PERIOD_S, SCHEDULER
+from afspm.logic.arbitration import ArbitrationState
+from afspm.logic.event_log import CONTROL, ENTRIES, PERIOD_S, SCHEDULER
 from afspm.logic.events import Effect, Input, Publish, Reply
-from afspm.logic.telling import SUPERVISOR
+from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.model import (
     ControlMode,
     ControlResponse,
@@ -42,7 +42,7 @@ class _Derived:
     problems: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, control: Control, names: ProblemNames) -> _Derived:
+    def of(cls, control: ArbitrationState, names: ProblemNames) -> _Derived:
         problems = {names.name(number): who for number, who in control.problems.items()}
         return cls(control.holder, control.mode.name, problems)
 

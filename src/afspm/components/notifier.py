@@ -18,7 +18,7 @@ from afspm.components.notices import (
     Targets,
 )
 from afspm.errors import ConfigError
-from afspm.logic.telling import LOGGED_AS
+from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
 from afspm.model.words import lasting
 from afspm.record.facts import name_in

@@ -19,7 +19,7 @@ from afspm.runtime.launch import Launch
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved import Resolved
-    from afspm.logic.supervision import Policy
+    from afspm.logic.supervision import ChildPolicy
 
 
 @dataclass(frozen=True)
@@ -173,14 +173,14 @@ class Experiment:
 
         return starting.asking(self, names)
 
-    def policy(self) -> Policy:
+    def policy(self) -> ChildPolicy:
         """How processes are watched and started again, from [restart]."""
         from afspm.logic.liveness import LivenessPolicy
         from afspm.logic.restart import RestartPolicy
-        from afspm.logic.supervision import Policy
+        from afspm.logic.supervision import ChildPolicy
 
         r = self.resolved.restart
-        return Policy(
+        return ChildPolicy(
             LivenessPolicy(r.beat_period, r.missed_beats, r.start, r.longest_step, r.closing),
             RestartPolicy(r.budget, r.window, r.first_delay, longest_delay_s=r.longest_delay, healthy_s=r.healthy),
         )

@@ -31,7 +31,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
 from afspm.experiment.lines import Path
 from afspm.experiment.sections import S, Section, parse, report
-from afspm.logic.limits import Limit, Limits
+from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import Parameter, Region, names
 from afspm.units import Angle, Duration, Length, parse_quantity, si
 
@@ -106,7 +106,7 @@ class LimitsReader:
         self._certain = certain
         self._sets = sets
 
-    def read(self, table: Mapping[str, Any]) -> Limits:
+    def read(self, table: Mapping[str, Any]) -> ExperimentLimits:
         """The limits; what is wrong is reported and left out."""
         whole = parse(
             Whole, "limits", {k: v for k, v in table.items() if k in Whole.model_fields}, self._document, self._findings
@@ -116,7 +116,7 @@ class LimitsReader:
         if not isinstance(actions, Mapping):
             self._findings.error("[limits] actions is no table", self._document.place("limits", "actions"))
             actions = {}
-        limits = Limits(
+        limits = ExperimentLimits(
             parameters={name: limit for name, one in parameters.items() if (limit := self._parameter(name, one))},
             actions={name: limit for name, one in actions.items() if (limit := self._action(name, one))},
             region=None if whole.region is None else self._region(whole.region),
@@ -241,7 +241,7 @@ class LimitsReader:
             )  # fmt: skip
         return Region(center, size, box.angle)
 
-    def _check_sizes(self, limits: Limits) -> None:
+    def _check_sizes(self, limits: ExperimentLimits) -> None:
         """The smallest scan allowed must fit into the region allowed."""
         region = limits.region
         if region is None:
@@ -268,7 +268,7 @@ def _rate(value: Quantity, unit: str) -> float:
     return si(f"{number} {over}", unit) / si(f"1 {under}", "s")
 
 
-def to_settings(limits: Limits) -> dict[str, Any]:
+def to_settings(limits: ExperimentLimits) -> dict[str, Any]:
     """As the scheduler process gets them, in JSON's types; `Limit` and `Region` by their fields."""
 
     def plain(limit: Limit) -> dict[str, Any]:

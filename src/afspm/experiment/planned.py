@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from afspm.logic.guard import Guard
-from afspm.logic.limits import Limits
+from afspm.logic.limit_checker import LimitChecker
+from afspm.logic.limits import ExperimentLimits
 from afspm.model import ControlRequest, ProbePosition, Region, Request, ScanParameters
 
 PURE = (
@@ -48,10 +48,10 @@ def plan_of(component: type, settings: Mapping[str, Any]) -> Planned | None:
     return Planned(regions, positions, getattr(plan, "shape", None), *needs)
 
 
-def refusals(name: str, planned: Planned, limits: Limits) -> list[str]:
+def refusals(name: str, planned: Planned, limits: ExperimentLimits) -> list[str]:
     """Why the limits would refuse what is planned; each reason once."""
     # steps and rates depend on what is in force by then
-    guard = Guard(_without_changes(limits))
+    guard = LimitChecker(_without_changes(limits))
     wanted: list[tuple[ControlRequest, object]] = [
         (ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, planned.shape)) for region in planned.regions
     ]
@@ -64,10 +64,12 @@ def refusals(name: str, planned: Planned, limits: Limits) -> list[str]:
     return list(dict.fromkeys(reasons))
 
 
-def refused_actions(limits: Limits) -> list[tuple[str, str]]:
+def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
     """The actions of which it is known beforehand that the limits refuse what they set, and why."""
     parameters = {name: replace(limit, only=None) for name, limit in _without_changes(limits).parameters.items()}
-    guard = Guard(replace(limits, parameters=parameters, actions={}, region=None))  # where the tip is is not known yet
+    guard = LimitChecker(
+        replace(limits, parameters=parameters, actions={}, region=None)
+    )  # where the tip is is not known yet
     found = []
     for action in limits.sets:
         refused = guard.check("", Request(ControlRequest.ACTION, action, b""), 0)
@@ -76,7 +78,7 @@ def refused_actions(limits: Limits) -> list[tuple[str, str]]:
     return found
 
 
-def _without_changes(limits: Limits) -> Limits:
+def _without_changes(limits: ExperimentLimits) -> ExperimentLimits:
     parameters = {
         name: replace(limit, step=None, rate_per_s=None, interval_s=None) for name, limit in limits.parameters.items()
     }

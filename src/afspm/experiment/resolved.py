@@ -28,7 +28,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
 from afspm.experiment.parts import EMULATED, SIMULATED, Part, Parts, Role
 from afspm.experiment.wiring import Net, Slot, Wires
-from afspm.logic.limits import Limits
+from afspm.logic.limits import ExperimentLimits
 from afspm.model import ProblemNames
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
@@ -62,7 +62,7 @@ class Resolved:
     net: Net = field(default_factory=Net)
     listening: list[Slot] = field(default_factory=list)
     """Where components listen by settings of their own, beside the wiring."""
-    limits: Limits = field(default_factory=Limits)
+    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
     caching: Caching = field(default_factory=Caching)
 
     def with_role(self, role: Role) -> list[Part]:

@@ -15,7 +15,7 @@ from afspm.experiment.experiment import Start
 from afspm.experiment.findings import nearest
 from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
 from afspm.experiment.parts import Part, Role
-from afspm.logic.danger import FEEDBACK_OFF
+from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Frame
 from afspm.runtime.launch import Launch, Sockets

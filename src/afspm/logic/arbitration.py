@@ -17,7 +17,7 @@ from afspm.model import ControlMode, ControlResponse, ControlState, Problem, Pro
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
 
-class Event(Enum):
+class ControlEvent(Enum):
     """What control depends on: the requests, by kind, and two that time brings."""
 
     REQUEST_CONTROL = "asks for control"
@@ -32,7 +32,7 @@ class Event(Enum):
     IDLE = "has let its lease run out"
 
 
-class Do(Enum):
+class ControlChange(Enum):
     """What a row does."""
 
     GRANT = auto()
@@ -60,7 +60,7 @@ class Cause(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Control:
+class ArbitrationState:
     """The state that control is in.
 
     Attributes:
@@ -98,7 +98,7 @@ class Control:
         }
 
     @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> Control:
+    def from_dict(cls, plain: Mapping[str, Any]) -> ArbitrationState:
         problems = {int(number): str(who) for number, who in plain["problems"].items()}
         return cls(
             ControlMode(plain["mode"]),
@@ -110,7 +110,7 @@ class Control:
 
 
 @dataclass(frozen=True, slots=True)
-class Roles:
+class RoleTable:
     """Who may do what is not everybody's. None: everybody may; but nobody may `operate` unless named.
 
     Who acts for a person ("dashboard:Ada") has the roles of the component and those given to just that person there.
@@ -134,15 +134,15 @@ class Roles:
 class Rules:
     """What the table takes from the experiment file: roles, and the problems there are."""
 
-    roles: Roles = Roles()
+    roles: RoleTable = RoleTable()
     problems: ProblemNames = field(default_factory=ProblemNames)
 
 
 @dataclass(slots=True)
-class Ask:
+class ControlInput:
     """An event of `who`; `number` is the problem or mode that it is about."""
 
-    event: Event
+    event: ControlEvent
     who: str
     number: int = 0
 
@@ -152,11 +152,11 @@ class Condition:
     """Something that may hold of a state and an ask, with words for it."""
 
     text: str
-    holds: Callable[[Control, Ask, Rules], bool]
+    holds: Callable[[ArbitrationState, ControlInput, Rules], bool]
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class Transition:
     """One line of the table.
 
     Attributes:
@@ -166,10 +166,10 @@ class Row:
         cause: why control is taken, where it is.
     """
 
-    event: Event
+    event: ControlEvent
     when: Condition
     response: ControlResponse | None
-    do: tuple[Do, ...]
+    do: tuple[ControlChange, ...]
     why: str
     cause: Cause | None = None
 
@@ -179,7 +179,7 @@ def may(role: Collection[str] | None, who: str) -> bool:
     return role is None or who in role or component_of(who) in role
 
 
-def _may_clear(control: Control, ask: Ask, rules: Rules) -> bool:
+def _may_clear(control: ArbitrationState, ask: ControlInput, rules: Rules) -> bool:
     flagged_by = control.problems.get(ask.number, ask.who)
     solves = control.holder == ask.who and control.solving == ask.number
     return flagged_by == ask.who or solves or may(rules.roles.clear, ask.who)
@@ -225,121 +225,143 @@ NO_SUCH_MODE = Condition(
 SAME_MODE = Condition("that is the mode", lambda c, a, r: a.number == c.mode)
 TO_MANUAL = Condition("to manual", lambda c, a, r: a.number == ControlMode.MANUAL)
 
-_E, _R = Event, ControlResponse
+_E, _R = ControlEvent, ControlResponse
 
-TABLE: tuple[Row, ...] = (
-    Row(
+TABLE: tuple[Transition, ...] = (
+    Transition(
         _E.REQUEST_CONTROL,
         IS_MANUAL,
         _R.WRONG_CONTROL_MODE,
         (),
         "the mode is manual: the person at the microscope is in control",
     ),
-    Row(
+    Transition(
         _E.REQUEST_CONTROL,
         SOLVES_UNFLAGGED,
         _R.WRONG_EXP_PROBLEM,
         (),
         "{problem} is not flagged; flagged: {problems}",
     ),
-    Row(
+    Transition(
         _E.REQUEST_CONTROL,
         SOLVES_OTHER_THAN_MALFUNCTION,
         _R.WRONG_EXP_PROBLEM,
         (),
         "flagged: {problems}; device-malfunction comes first: until that is cleared, control is only for who solves it",
     ),
-    Row(
+    Transition(
         _E.REQUEST_CONTROL,
         SOLVES_NONE,
         _R.WRONG_EXP_PROBLEM,
         (),
         "flagged: {problems}; until that is cleared, control is only for who solves it",
     ),
-    Row(
+    Transition(
         _E.REQUEST_CONTROL, OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, (), "{holder} is in control until it gives that back"
     ),
-    Row(
+    Transition(
         _E.REQUEST_CONTROL,
         ASKER_HOLDS,
         _R.SUCCESS,
-        (Do.GRANT,),
+        (ControlChange.GRANT,),
         "asked for again: it stays in control, for the problem it now names",
     ),
-    Row(_E.REQUEST_CONTROL, OTHERWISE, _R.SUCCESS, (Do.GRANT,), "nobody is in control: the first to ask gets it"),
-    Row(_E.RELEASE_CONTROL, ASKER_HOLDS, _R.SUCCESS, (Do.TAKE,), "its own decision", Cause.RELEASED),
-    Row(_E.RELEASE_CONTROL, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is; nothing changed"),
-    Row(
+    Transition(
+        _E.REQUEST_CONTROL,
+        OTHERWISE,
+        _R.SUCCESS,
+        (ControlChange.GRANT,),
+        "nobody is in control: the first to ask gets it",
+    ),
+    Transition(_E.RELEASE_CONTROL, ASKER_HOLDS, _R.SUCCESS, (ControlChange.TAKE,), "its own decision", Cause.RELEASED),
+    Transition(
+        _E.RELEASE_CONTROL, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is; nothing changed"
+    ),
+    Transition(
         _E.FLAG, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem with the number {number}"
     ),
-    Row(_E.FLAG, IS_FLAGGED, _R.SUCCESS, (), "what was asked for is so: two may notice the same"),
-    Row(
+    Transition(_E.FLAG, IS_FLAGGED, _R.SUCCESS, (), "what was asked for is so: two may notice the same"),
+    Transition(
         _E.FLAG,
         HOLDER_SOLVES_NOTHING,
         _R.SUCCESS,
-        (Do.FLAG, Do.TAKE),
+        (ControlChange.FLAG, ControlChange.TAKE),
         "from now on only who solves a flagged problem may have control",
         Cause.PROBLEM,
     ),
-    Row(
+    Transition(
         _E.FLAG,
         MALFUNCTION_IS_NEW_TO_HOLDER,
         _R.SUCCESS,
-        (Do.FLAG, Do.TAKE),
+        (ControlChange.FLAG, ControlChange.TAKE),
         "nothing else can be solved with a microscope that can't be used, or a tip that was in danger",
         Cause.PROBLEM,
     ),
-    Row(_E.FLAG, OTHERWISE, _R.SUCCESS, (Do.FLAG,), "a solver stays in control while its own problem is flagged"),
-    Row(
+    Transition(
+        _E.FLAG,
+        OTHERWISE,
+        _R.SUCCESS,
+        (ControlChange.FLAG,),
+        "a solver stays in control while its own problem is flagged",
+    ),
+    Transition(
         _E.CLEAR, UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, (), "this experiment knows no problem with the number {number}"
     ),
-    Row(_E.CLEAR, NOT_FLAGGED, _R.SUCCESS, (), "what was asked for is so: classifier and corrector may both clear"),
-    Row(
+    Transition(
+        _E.CLEAR, NOT_FLAGGED, _R.SUCCESS, (), "what was asked for is so: classifier and corrector may both clear"
+    ),
+    Transition(
         _E.CLEAR,
         MAY_NOT_CLEAR,
         _R.FAILURE,
         (),
         "{who} has not flagged {problem} and has not the role 'clear' ([control] roles)",
     ),
-    Row(
+    Transition(
         _E.CLEAR,
         HOLDER_SOLVES_IT,
         _R.SUCCESS,
-        (Do.UNFLAG, Do.TAKE),
+        (ControlChange.UNFLAG, ControlChange.TAKE),
         "solved: its solver has no more reason to be in control",
         Cause.SOLVED,
     ),
-    Row(_E.CLEAR, OTHERWISE, _R.SUCCESS, (Do.UNFLAG,), "who solves another problem stays in control"),
-    Row(_E.SET_MODE, MAY_NOT_SET_MODE, _R.FAILURE, (), "{who} has not the role 'mode' ([control] roles)"),
-    Row(
+    Transition(_E.CLEAR, OTHERWISE, _R.SUCCESS, (ControlChange.UNFLAG,), "who solves another problem stays in control"),
+    Transition(_E.SET_MODE, MAY_NOT_SET_MODE, _R.FAILURE, (), "{who} has not the role 'mode' ([control] roles)"),
+    Transition(
         _E.SET_MODE, NO_SUCH_MODE, _R.WRONG_CONTROL_MODE, (), "there is no control mode {number}: 1 manual, 2 automated"
     ),
-    Row(_E.SET_MODE, SAME_MODE, _R.SUCCESS, (), "what was asked for is so"),
-    Row(
+    Transition(_E.SET_MODE, SAME_MODE, _R.SUCCESS, (), "what was asked for is so"),
+    Transition(
         _E.SET_MODE,
         TO_MANUAL,
         _R.SUCCESS,
-        (Do.SET_MODE, Do.TAKE),
+        (ControlChange.SET_MODE, ControlChange.TAKE),
         "a person takes over: whoever is in control is disengaged",
         Cause.MANUAL,
     ),
-    Row(_E.SET_MODE, OTHERWISE, _R.SUCCESS, (Do.SET_MODE,), "components ask for control again, and go on"),
-    Row(_E.END, MAY_NOT_END, _R.FAILURE, (), "{who} has not the role 'end' ([control] roles)"),
-    Row(_E.END, OTHERWISE, _R.SUCCESS, (Do.END,), "all receivers close"),
-    Row(_E.COMMAND, ASKER_HOLDS, None, (Do.FORWARD,), "only who is in control commands the microscope"),
-    Row(_E.COMMAND, IS_OPERATOR, None, (Do.FORWARD,), "in manual mode a person may, by a component"),
-    Row(_E.COMMAND, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is"),
-    Row(_E.READ, OTHERWISE, None, (Do.FORWARD,), "it disturbs nothing, so anybody may, at any time"),
-    Row(_E.DEAD, ASKER_HOLDS, None, (Do.TAKE,), "control never stays with the dead", Cause.DEAD),
-    Row(_E.DEAD, OTHERWISE, None, (), "it was not in control"),
-    Row(_E.IDLE, ASKER_HOLDS, None, (Do.TAKE,), "a greedy component can't block the night", Cause.IDLE),
-    Row(_E.IDLE, OTHERWISE, None, (), "it was not in control"),
+    Transition(
+        _E.SET_MODE, OTHERWISE, _R.SUCCESS, (ControlChange.SET_MODE,), "components ask for control again, and go on"
+    ),
+    Transition(_E.END, MAY_NOT_END, _R.FAILURE, (), "{who} has not the role 'end' ([control] roles)"),
+    Transition(_E.END, OTHERWISE, _R.SUCCESS, (ControlChange.END,), "all receivers close"),
+    Transition(
+        _E.COMMAND, ASKER_HOLDS, None, (ControlChange.FORWARD,), "only who is in control commands the microscope"
+    ),
+    Transition(_E.COMMAND, IS_OPERATOR, None, (ControlChange.FORWARD,), "in manual mode a person may, by a component"),
+    Transition(_E.COMMAND, OTHERWISE, _R.NOT_IN_CONTROL, (), "{who} is not in control, {holder} is"),
+    Transition(_E.READ, OTHERWISE, None, (ControlChange.FORWARD,), "it disturbs nothing, so anybody may, at any time"),
+    Transition(_E.DEAD, ASKER_HOLDS, None, (ControlChange.TAKE,), "control never stays with the dead", Cause.DEAD),
+    Transition(_E.DEAD, OTHERWISE, None, (), "it was not in control"),
+    Transition(
+        _E.IDLE, ASKER_HOLDS, None, (ControlChange.TAKE,), "a greedy component can't block the night", Cause.IDLE
+    ),
+    Transition(_E.IDLE, OTHERWISE, None, (), "it was not in control"),
 )
 
-_ROWS = {event: tuple(row for row in TABLE if row.event is event) for event in Event}
+_ROWS = {event: tuple(row for row in TABLE if row.event is event) for event in ControlEvent}
 
 
-def row_for(control: Control, ask: Ask, rules: Rules) -> Row:
+def row_for(control: ArbitrationState, ask: ControlInput, rules: Rules) -> Transition:
     """The row of the table that applies."""
     for row in _ROWS[ask.event]:
         if row.when.holds(control, ask, rules):
@@ -347,14 +369,14 @@ def row_for(control: Control, ask: Ask, rules: Rules) -> Row:
     raise AssertionError(f"the table has no last row for {ask.event}")
 
 
-def apply(row: Row, control: Control, ask: Ask) -> Control:
+def apply(row: Transition, control: ArbitrationState, ask: ControlInput) -> ArbitrationState:
     """The state after a row."""
     for do in row.do:
         control = _APPLY[do](control, ask)
     return control
 
 
-def reason(row: Row, control: Control, ask: Ask, rules: Rules) -> str:
+def reason(row: Transition, control: ArbitrationState, ask: ControlInput, rules: Rules) -> str:
     """The reason given with a refusal; empty for a success."""
     if row.response in (None, ControlResponse.SUCCESS):
         return ""
@@ -367,21 +389,21 @@ def reason(row: Row, control: Control, ask: Ask, rules: Rules) -> str:
     )
 
 
-def _flag(control: Control, ask: Ask) -> Control:
+def _flag(control: ArbitrationState, ask: ControlInput) -> ArbitrationState:
     return replace(control, problems=MappingProxyType({**control.problems, ask.number: ask.who}))
 
 
-def _unflag(control: Control, ask: Ask) -> Control:
+def _unflag(control: ArbitrationState, ask: ControlInput) -> ArbitrationState:
     rest = {number: who for number, who in control.problems.items() if number != ask.number}
     return replace(control, problems=MappingProxyType(rest))
 
 
-_APPLY: dict[Do, Callable[[Control, Ask], Control]] = {
-    Do.GRANT: lambda control, ask: replace(control, holder=ask.who, solving=ask.number),
-    Do.TAKE: lambda control, ask: replace(control, holder=None, solving=0),
-    Do.FLAG: _flag,
-    Do.UNFLAG: _unflag,
-    Do.SET_MODE: lambda control, ask: replace(control, mode=ControlMode(ask.number)),
-    Do.END: lambda control, ask: replace(control, ended=True),
-    Do.FORWARD: lambda control, ask: control,
+_APPLY: dict[ControlChange, Callable[[ArbitrationState, ControlInput], ArbitrationState]] = {
+    ControlChange.GRANT: lambda control, ask: replace(control, holder=ask.who, solving=ask.number),
+    ControlChange.TAKE: lambda control, ask: replace(control, holder=None, solving=0),
+    ControlChange.FLAG: _flag,
+    ControlChange.UNFLAG: _unflag,
+    ControlChange.SET_MODE: lambda control, ask: replace(control, mode=ControlMode(ask.number)),
+    ControlChange.END: lambda control, ask: replace(control, ended=True),
+    ControlChange.FORWARD: lambda control, ask: control,
 }

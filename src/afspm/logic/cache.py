@@ -31,7 +31,7 @@ class Kept:
     size: int
 
 
-class Cache:
+class PacketCache:
     """The latest packets of each envelope, oldest first over all of them.
 
     Args:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-from afspm.logic.arbitration import Ask, Control, Event, Rules, apply, row_for
+from afspm.logic.arbitration import ArbitrationState, ControlEvent, ControlInput, Rules, apply, row_for
 from afspm.model import ControlMode
 
 _MODES = (ControlMode.AUTOMATED, ControlMode.MANUAL)
 
 
-def kind(control: Control) -> str:
+def kind(control: ArbitrationState) -> str:
     """The node of the diagram that a state belongs to."""
     if control.ended:
         return "ended"
@@ -24,11 +24,11 @@ def kind(control: Control) -> str:
 def edges() -> list[tuple[str, str, str]]:
     """All (from, label, to) between different nodes, in the order of the table."""
     found: dict[tuple[str, str, str], None] = {}
-    for event in Event:
+    for event in ControlEvent:
         for control in _states():
             for who in ("a", "b"):
                 for number in (0, 1, 2):
-                    ask = Ask(event, who, number)
+                    ask = ControlInput(event, who, number)
                     after = apply(row_for(control, ask, Rules()), control, ask)
                     if kind(after) != kind(control):
                         found[kind(control), _label(ask, control, after), kind(after)] = None
@@ -46,29 +46,29 @@ def mermaid() -> str:
         if after != "ended":
             merged.setdefault((before, after), []).append(label)
     lines += [f"    {names[a]} --> {names[b]}: {' / '.join(labels)}" for (a, b), labels in merged.items()]
-    lines += [f"    {name} --> Ended: {Event.END.value}" for name in names.values() if name != "Ended"]
+    lines += [f"    {name} --> Ended: {ControlEvent.END.value}" for name in names.values() if name != "Ended"]
     return "\n".join([*lines, "    Ended --> [*]"]) + "\n"
 
 
-def _label(ask: Ask, before: Control, after: Control) -> str:
-    if ask.event is Event.SET_MODE:
+def _label(ask: ControlInput, before: ArbitrationState, after: ArbitrationState) -> str:
+    if ask.event is ControlEvent.SET_MODE:
         return f"sets the mode {after.mode.name.lower()}"
-    if ask.event in (Event.DEAD, Event.IDLE, Event.RELEASE_CONTROL):
+    if ask.event in (ControlEvent.DEAD, ControlEvent.IDLE, ControlEvent.RELEASE_CONTROL):
         return f"the holder {ask.event.value}"
-    if ask.event is Event.CLEAR and after.problems:
+    if ask.event is ControlEvent.CLEAR and after.problems:
         return "the solver's flag is removed, others are left"
-    if ask.event is Event.CLEAR:
+    if ask.event is ControlEvent.CLEAR:
         return "the last flag is removed"
     return str(ask.event.value)
 
 
-def _states() -> list[Control]:
+def _states() -> list[ArbitrationState]:
     """One of each kind of state that can be reached, with up to two problems and two components."""
     states = []
     for mode in _MODES:
         for flagged in ({}, {1: "b"}, {1: "b", 2: "b"}):
             problems = MappingProxyType(flagged)
-            states.append(Control(mode, None, 0, problems))
+            states.append(ArbitrationState(mode, None, 0, problems))
             if mode is ControlMode.AUTOMATED:
-                states += [Control(mode, "a", solving, problems) for solving in (flagged or {0: ""})]
+                states += [ArbitrationState(mode, "a", solving, problems) for solving in (flagged or {0: ""})]
     return states

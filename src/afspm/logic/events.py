@@ -71,7 +71,7 @@ class PacketIn:
 
 
 @dataclass(frozen=True, slots=True)
-class SubscriberJoined:
+class ReplayRequested:
     """A subscriber asks for what is cached under `prefixes` and newer than `since_ns`.
 
     Attributes:
@@ -155,7 +155,7 @@ Input = (
     | RequestIn
     | Unreadable
     | PacketIn
-    | SubscriberJoined
+    | ReplayRequested
     | TranslatorUp
     | TranslatorDown
     | TranslatorCaughtUp

@@ -1,4 +1,4 @@
-"""Limits of an experiment: what of the microscope may be set, how far, how fast, where and by whom."""
+"""ExperimentLimits of an experiment: what of the microscope may be set, how far, how fast, where and by whom."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Limits:
+class ExperimentLimits:
     """All limits of an experiment.
 
     Attributes:

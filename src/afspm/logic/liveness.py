@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 
-class Vital(Enum):
+class ProcessHealth(Enum):
     """The state of health of a process."""
 
     STARTING = auto()
@@ -59,7 +59,7 @@ class Liveness:
     def __init__(self, policy: LivenessPolicy, now_s: float, *, beats: bool = True) -> None:
         self._policy = policy
         self._beats = beats
-        self._vital = Vital.STARTING
+        self._vital = ProcessHealth.STARTING
         self._deadline_s = now_s + policy.start_s
         self._checked_s = now_s
         self._step_began_s = now_s
@@ -72,22 +72,22 @@ class Liveness:
         Also after it was said that it closes, which then was not so, or not said by it.
         """
         longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
-        self._vital = Vital.ALIVE
+        self._vital = ProcessHealth.ALIVE
         self._frozen = step_age_s > longest_s
         self._step_began_s, self._longest_s = now_s - step_age_s, longest_s  # where it had no step, one may begin now
         self._deadline_s = now_s + self._policy.silence_s
 
     def waits(self, now_s: float) -> None:
         """It may not begin yet: the time that its start may take counts from now."""
-        if self._vital is Vital.STARTING:
+        if self._vital is ProcessHealth.STARTING:
             self._deadline_s = now_s + self._policy.start_s
 
     def closing(self, now_s: float) -> None:
         """It says that it is closing on purpose."""
-        self._vital = Vital.NOT_CLOSING
+        self._vital = ProcessHealth.NOT_CLOSING
         self._deadline_s = now_s + self._policy.closing_s
 
-    def check(self, now_s: float, *, works: bool | None = None) -> Vital:
+    def check(self, now_s: float, *, works: bool | None = None) -> ProcessHealth:
         """How it is. To be asked at least once a beat period, since we can't judge while we sleep ourselves.
 
         Args:
@@ -98,15 +98,17 @@ class Liveness:
         if asleep_s > self._policy.beat_period_s:  # a suspended computer: its beats wait to be read, or it slept too
             self._deadline_s += asleep_s
             self._step_began_s += asleep_s
-        if self._frozen and self._vital is Vital.ALIVE:
-            return Vital.FROZEN
+        if self._frozen and self._vital is ProcessHealth.ALIVE:
+            return ProcessHealth.FROZEN
         if self._has_no_deadline:
-            return Vital.ALIVE
+            return ProcessHealth.ALIVE
         if now_s < self._deadline_s:
-            return Vital.STARTING if self._vital is Vital.STARTING else Vital.ALIVE
-        if works and self._vital is Vital.ALIVE:
-            return Vital.BUSY if now_s - self._step_began_s <= self._longest_s else Vital.FROZEN
-        return {Vital.STARTING: Vital.SLOW_START, Vital.ALIVE: Vital.SILENT}.get(self._vital, self._vital)
+            return ProcessHealth.STARTING if self._vital is ProcessHealth.STARTING else ProcessHealth.ALIVE
+        if works and self._vital is ProcessHealth.ALIVE:
+            return ProcessHealth.BUSY if now_s - self._step_began_s <= self._longest_s else ProcessHealth.FROZEN
+        return {ProcessHealth.STARTING: ProcessHealth.SLOW_START, ProcessHealth.ALIVE: ProcessHealth.SILENT}.get(
+            self._vital, self._vital
+        )
 
     def next_check_s(self) -> float:
         """When to check at the latest."""
@@ -117,4 +119,4 @@ class Liveness:
 
     @property
     def _has_no_deadline(self) -> bool:
-        return not self._beats and self._vital is not Vital.NOT_CLOSING
+        return not self._beats and self._vital is not ProcessHealth.NOT_CLOSING

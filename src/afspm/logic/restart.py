@@ -26,7 +26,7 @@ class RestartPolicy:
     healthy_s: float = 30.0
 
 
-class Restarts:
+class RestartBudget:
     """The restarts of one child."""
 
     def __init__(self, policy: RestartPolicy) -> None:

@@ -67,7 +67,7 @@ def run_of(name: str, request_id: str) -> str:
     return run if dash and _RUN.fullmatch(run) else ""
 
 
-class Sessions:
+class SessionTable:
     """The names in use.
 
     Args:

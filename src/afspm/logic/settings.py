@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from afspm.logic.arbitration import Rules
 from afspm.logic.envelopes import Envelopes
-from afspm.logic.limits import Limits
+from afspm.logic.limits import ExperimentLimits
 from afspm.logic.watchdog import WatchdogSettings
 
 
@@ -42,7 +42,7 @@ class SchedulerSettings:
     longest_queue: int = 64
     takeover_s: float = 3.0
     watchdog: WatchdogSettings = field(default_factory=WatchdogSettings)
-    limits: Limits = field(default_factory=Limits)
+    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
     envelopes: Envelopes = field(default_factory=Envelopes)
     cache_bytes: int = 512 * 2**20
     catch_up_s: float = 1.0

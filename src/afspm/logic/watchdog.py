@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any
 
 from afspm.logic.arbitration import Cause
-from afspm.logic.danger import FEEDBACK_OFF, Danger
+from afspm.logic.microscope_status import FEEDBACK_OFF, TipRisk
 from afspm.logic.tip_duty import TipDuties, TipDuty, TipEvent
 from afspm.model import ControlResponse, Feedback, Parameter, Request, ScopeState, names
 
@@ -46,7 +46,7 @@ class WatchdogSettings:
     longest_s: float = 300.0
 
 
-class Result(Enum):
+class SafetyResult(Enum):
     """What became of an action of the watchdog's."""
 
     DONE = "done"
@@ -67,7 +67,7 @@ class Watchdog:
 
     def __init__(self, settings: WatchdogSettings | None = None) -> None:
         self._settings = settings or WatchdogSettings()
-        self.danger = Danger(self._settings.dangerous)
+        self.danger = TipRisk(self._settings.dangerous)
         self._state = ScopeState.UNDEFINED
         self._starting: str | None = None
         self._states_seen = 0
@@ -258,7 +258,7 @@ class Watchdog:
         """It has been told to stop, and the tip is retracted when it has."""
         return not self._stops and self._state in _STOP and not self._unstoppable
 
-    def answered(self, code: int, now_s: float) -> Result:
+    def answered(self, code: int, now_s: float) -> SafetyResult:
         """The translator answered what was sent (or NO_RESPONSE)."""
         action, self._sent = self._sent or "", None
         is_retract = self._tip.now is TipDuty.ASKED
@@ -270,16 +270,16 @@ class Watchdog:
             else:
                 self._forget_stop(action)
                 self._due_s = now_s + self._wait_s if self.owes_retract else None
-            return Result.DONE
+            return SafetyResult.DONE
         if code == ControlResponse.NOT_FREE:
             self._refused_at = self._states_seen
             self._due_s = now_s + self._wait_s
             self._see(TipEvent.NOT_YET)
-            return Result.AGAIN
+            return SafetyResult.AGAIN
         self._attempts += 1
         if code == ControlResponse.NO_RESPONSE and self._attempts < self._settings.attempts:
             self._see(TipEvent.NOT_YET)
-            return Result.AGAIN
+            return SafetyResult.AGAIN
         if not is_retract:
             self._unstoppable = True
             self._forget_stop(action)
@@ -287,7 +287,7 @@ class Watchdog:
             self._see(TipEvent.IMPOSSIBLE)
         else:
             self._retract_later(now_s)
-        return Result.FAILED
+        return SafetyResult.FAILED
 
     def done_late(self, action: str) -> None:
         """The translator did what nobody waited for any more: a tip withdrawn late is left to people, too."""

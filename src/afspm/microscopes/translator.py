@@ -18,8 +18,8 @@ from afspm import wire
 from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, WireError
 from afspm.exit_codes import ExitCode
-from afspm.logic.epochs import Allegiance, Epoch
-from afspm.logic.forwarding import NOT_SENT
+from afspm.logic.fencing import Epoch, SchedulerFence
+from afspm.logic.forwarder import NOT_SENT
 from afspm.logic.sessions import run_of
 from afspm.logic.watchdog import feedback_of
 from afspm.microscopes import in_force
@@ -110,7 +110,7 @@ class Translator:
         self._why_lost = self._complaint = ""
         self._last_ns = int(self._kept.get("last_ns", 0))
         self._acting: Request | None = None
-        self._allegiance = Allegiance(run, simulated=simulated)
+        self._allegiance = SchedulerFence(run, simulated=simulated)
         self._commander, self._told_refused = b"", ""
         self._ended = False
 

@@ -13,14 +13,14 @@ from typing import Any, Protocol
 from afspm.clock import Clock
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
-from afspm.logic.epochs import Epoch
-from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
+from afspm.logic.fencing import Epoch
+from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
 from afspm.model import ProblemNames
-from afspm.scheduler.codec import WireCodec
 from afspm.scheduler.journal import Journal
 from afspm.scheduler.settings import scheduler_settings
-from afspm.scheduler.shell import Core, Shell
+from afspm.scheduler.shell import Core, SchedulerShell
 from afspm.scheduler.state_file import StateFile
+from afspm.scheduler.wire_codec import WireCodec
 from afspm.transport.complaints import Complaints
 from afspm.transport.launching import Launched
 from afspm.transport.scheduler_sockets import SchedulerSockets
@@ -41,7 +41,7 @@ class SchedulerLaunch(Launched, Protocol):
     def request_timeout_s(self) -> float: ...
 
 
-class Activity(Protocol):
+class SchedulerActivity(Protocol):
     """The part of `runtime.process.Activity` that is needed here."""
 
     def step(self) -> AbstractContextManager[None]: ...
@@ -57,7 +57,7 @@ class SchedulerContext(Protocol):
     @property
     def log(self) -> logging.Logger: ...
     @property
-    def activity(self) -> Activity: ...
+    def activity(self) -> SchedulerActivity: ...
     @property
     def problems(self) -> ProblemNames: ...
     @property
@@ -131,9 +131,9 @@ class Scheduler:
         """The decisions."""
         return SchedulerCore(self._settings(context), WireCodec())
 
-    def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> Shell:
+    def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
         """What is around them."""
-        return Shell(core, sockets, *others)
+        return SchedulerShell(core, sockets, *others)
 
 
 def _epoch(context: SchedulerContext) -> bytes:

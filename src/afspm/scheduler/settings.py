@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from afspm.errors import ConfigError
-from afspm.logic.arbitration import Cause, Roles, Rules
+from afspm.logic.arbitration import Cause, RoleTable, Rules
 from afspm.logic.envelopes import CacheRule, EnvelopeMapping, Envelopes
-from afspm.logic.limits import Limit, Limits
-from afspm.logic.scheduling import SchedulerSettings
+from afspm.logic.limits import ExperimentLimits, Limit
+from afspm.logic.scheduler_core import SchedulerSettings
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Parameter, ProblemNames, Region
 
@@ -41,8 +41,8 @@ def scheduler_settings(
         raise ConfigError(f"the scheduler's settings make no sense: {error}") from error
 
 
-def _roles(table: Table) -> Roles:
-    return Roles(
+def _roles(table: Table) -> RoleTable:
+    return RoleTable(
         table.get("end_experiment"),
         table.get("set_mode"),
         table.get("clear_problems"),
@@ -66,7 +66,7 @@ def _watchdog(control: Table) -> WatchdogSettings:
     )
 
 
-def _limits(table: Table) -> Limits:
+def _limits(table: Table) -> ExperimentLimits:
     plain = dict(table)
     for key in ("parameters", "actions"):
         plain[key] = {name: Limit(**limit) for name, limit in plain.get(key, {}).items()}
@@ -74,7 +74,7 @@ def _limits(table: Table) -> Limits:
         center, size = tuple(region["center_m"]), tuple(region["size_m"])
         plain["region"] = Region(center, size, region.get("angle_rad", 0.0))
     plain["sets"] = {name: tuple(Parameter(*one) for one in given) for name, given in plain.get("sets", {}).items()}
-    return Limits(**plain)
+    return ExperimentLimits(**plain)
 
 
 def _envelopes(table: Table) -> Envelopes:

@@ -24,7 +24,7 @@ from afspm.wire.frames import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
-    from afspm.logic.arbitration import Control
+    from afspm.logic.arbitration import ArbitrationState
     from afspm.scheduler.journal import Journal
     from afspm.scheduler.state_file import StateFile
     from afspm.transport.complaints import Complaints
@@ -52,14 +52,14 @@ class Core(Protocol):
     def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None: ...
     def cached(self) -> Iterable[tuple[Packet, int | None]]: ...
     @property
-    def control(self) -> Control: ...
+    def control(self) -> ArbitrationState: ...
     @property
     def newest_source_ns(self) -> int: ...
     @property
     def leave_at_s(self) -> float: ...
 
 
-class Shell:
+class SchedulerShell:
     """One scheduler at work: `start`, then `handle` what `wait` returns until it is `over`."""
 
     def __init__(
@@ -250,7 +250,7 @@ class Shell:
 
     def _history(self, subscriber: Hashable, prefixes: tuple[str, ...], since_ns: int) -> Iterable[Packet]:
         self._replay = ()
-        self._take(events.SubscriberJoined(subscriber, prefixes, since_ns))
+        self._take(events.ReplayRequested(subscriber, prefixes, since_ns))
         return self._replay
 
     def _deadlines(self, now_s: float) -> None:

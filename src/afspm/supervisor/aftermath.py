@@ -16,7 +16,7 @@ from afspm.components import notices
 from afspm.components.notices import END, GIVEN_UP, NotDelivered, Notice, Targets, Way
 from afspm.errors import ConfigError
 from afspm.experiment import Role, notifying
-from afspm.logic.telling import LOGGED_AS
+from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record.journal import JOURNAL_FILE
 from afspm.supervisor import summary
 from afspm.supervisor.ending import Why

@@ -12,7 +12,7 @@ from typing import Any
 
 from afspm.addresses import connectable, reaches
 from afspm.experiment import Experiment, Role, Start
-from afspm.logic.telling import SUPERVISOR
+from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.record.disk import bounded
 from afspm.record.facts import STATE_DIR
 from afspm.record.whole import replace as write

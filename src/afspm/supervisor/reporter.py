@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from afspm import wire
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import AfspmError, WireError
-from afspm.logic.telling import LONGEST
+from afspm.logic.supervisor_registry import LONGEST
 from afspm.model import (
     OTHER_RUN_RESPONSE,
     TELL_REQUEST,

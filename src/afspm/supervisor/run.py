@@ -13,7 +13,7 @@ from afspm.addresses import connectable
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
-from afspm.logic.telling import LOGGED_AS
+from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record import ahead
 from afspm.record.disk import bounded
 from afspm.record.facts import ENDED, STATE_DIR, known_facts

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from afspm.clock import Clock
 from afspm.logic.liveness import LivenessPolicy
-from afspm.logic.supervision import Beat, ChildWatch, Phase
+from afspm.logic.supervision import ChildPhase, ChildWatch, HeartbeatReport
 from afspm.model import ProcessCondition, ProcessState
 from afspm.supervisor.task import Task
 
@@ -34,7 +34,7 @@ class Child(Protocol):
     @property
     def up(self) -> bool: ...
     @property
-    def beat(self) -> Beat | None: ...
+    def beat(self) -> HeartbeatReport | None: ...
     @property
     def beat_s(self) -> float: ...
     @property
@@ -77,7 +77,7 @@ class Standing:
             return ProcessCondition.GIVEN_UP
         if child.process is None:
             return _WITHOUT_PROCESS.get(child.watch.phase, ProcessCondition.RESTARTING)
-        if child.watch.phase is Phase.KILLING:
+        if child.watch.phase is ChildPhase.KILLING:
             return ProcessCondition.RESTARTING
         if not child.task.beats:
             return ProcessCondition.ALIVE
@@ -95,8 +95,8 @@ class Standing:
 
 
 _WITHOUT_PROCESS = {
-    Phase.IDLE: ProcessCondition.STARTING,
-    Phase.STOPPING: ProcessCondition.ENDED,
-    Phase.DONE: ProcessCondition.ENDED,
-    Phase.GIVEN_UP: ProcessCondition.GIVEN_UP,
+    ChildPhase.IDLE: ProcessCondition.STARTING,
+    ChildPhase.STOPPING: ProcessCondition.ENDED,
+    ChildPhase.DONE: ProcessCondition.ENDED,
+    ChildPhase.GIVEN_UP: ProcessCondition.GIVEN_UP,
 }

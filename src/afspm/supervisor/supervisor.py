@@ -19,7 +19,7 @@ from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
 from afspm.logic import supervision
 from afspm.logic.liveness import LivenessPolicy
-from afspm.logic.telling import LOGGED_AS
+from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.supervisor import signals
 from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import LineReader, RunLog
@@ -155,7 +155,7 @@ class Supervisor:
         tasks: Sequence[Task],
         log: RunLog,
         clock: ExperimentClock,
-        policy: supervision.Policy,
+        policy: supervision.ChildPolicy,
         reporter: Reporter | None = None,
     ) -> None:
         self._log = log
@@ -351,17 +351,17 @@ class Supervisor:
                 LOGGED_AS, logging.WARNING, "the scheduler does not answer; the components begin all the same"
             )
 
-    def _carry_out(self, child: _Child, effects: Sequence[supervision.Effect]) -> None:
+    def _carry_out(self, child: _Child, effects: Sequence[supervision.ChildEffect]) -> None:
         for effect in effects:
             match effect:
-                case supervision.Start():
+                case supervision.StartChild():
                     self._start(child)
-                case supervision.Kill():
+                case supervision.KillChild():
                     if child.process:
                         child.process.kill()
-                case supervision.Log(level, text):
+                case supervision.ChildLog(level, text):
                     self._log.write(child.name, logging.getLevelNamesMapping()[level], text)
-                case supervision.GiveUp(why):
+                case supervision.GiveUpChild(why):
                     self._give_up(child, why)
 
     def _start(self, child: _Child) -> None:
@@ -403,7 +403,7 @@ class Supervisor:
             now_s = self._clock.monotonic_s()
             self._ending = Ending.begin(why, text, now_s)
             for child in self._children.values():
-                is_missing = child.process is None and child.watch.phase is supervision.Phase.WAITING
+                is_missing = child.process is None and child.watch.phase is supervision.ChildPhase.WAITING
                 child.watch.stop(now_s)
                 if is_missing and self._may_be_rescued(child):
                     self._rescue(child)

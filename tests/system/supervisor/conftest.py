@@ -9,7 +9,7 @@ import pytest
 from supervisor_lab import DEADLINE_S, QUICK, Running, RunTasks, Terminal
 
 from afspm.clock import ExperimentClock
-from afspm.logic.supervision import Policy
+from afspm.logic.supervision import ChildPolicy
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.reporter import Reporter
 from afspm.supervisor.supervisor import Outcome, Supervisor
@@ -22,7 +22,7 @@ def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
     running: list[Running] = []
     logs: list[RunLog] = []
 
-    def start(*tasks: Task, policy: Policy = QUICK, reporter: Reporter | None = None) -> Running:
+    def start(*tasks: Task, policy: ChildPolicy = QUICK, reporter: Reporter | None = None) -> Running:
         terminal = Terminal()
         clock = ExperimentClock.real()
         log = RunLog(tmp_path / "log.txt", clock, terminal=terminal, level=0)  # type: ignore[arg-type]

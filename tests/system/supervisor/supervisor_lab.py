@@ -13,7 +13,7 @@ from typing import Any
 from afspm.experiment import Role
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.restart import RestartPolicy
-from afspm.logic.supervision import Policy
+from afspm.logic.supervision import ChildPolicy
 from afspm.runtime.launch import Launch
 from afspm.supervisor.supervisor import Outcome, Supervisor
 from afspm.supervisor.task import Task
@@ -21,7 +21,7 @@ from afspm.supervisor.task import Task
 DEADLINE_S = 20.0
 BEAT_S = 0.1
 PEER = Path(__file__).with_name("peer.py")
-QUICK = Policy(
+QUICK = ChildPolicy(
     liveness=LivenessPolicy(beat_period_s=0.2, missed_beats=5, start_s=15.0, longest_step_s=10.0),
     restart=RestartPolicy(budget=2, first_delay_s=0.05),
 )

@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from afspm import wire
-from afspm.logic.epochs import Epoch
+from afspm.logic.fencing import Epoch
 from afspm.model import ControlRequest, Request, Response, names
 
 OURS, THEIRS = "0123456789abcdef", "fedcba9876543210"

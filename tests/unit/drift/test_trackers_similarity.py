@@ -20,7 +20,7 @@ from afspm.drift.trackers import BankTracker, forecast_from_dict
 from afspm.drift.tracking import Update
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Frame, Region
-from afspm.scheduler.drift.store import Store
+from afspm.scheduler.drift.worker_state import WorkerStateFile
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ def test_an_estimator_that_tells_no_linear_part_leaves_the_mapping_a_translation
 
 
 def test_saved_on_disk_and_restored_it_goes_on_with_the_same_bits(tmp_path: Path) -> None:
-    sample, store = Sample(TURN / INTERVAL_S), Store(tmp_path / "drift")
+    sample, store = Sample(TURN / INTERVAL_S), WorkerStateFile(tmp_path / "drift")
     whole = night(TURN, "similarity", 6).updates
     for cut in (1, 4):
         before, after = (BankTracker(LeastSquares(), compared=1, transform="similarity") for _ in range(2))

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from afspm.experiment.limits import to_settings
-from afspm.logic.guard import Guard
+from afspm.logic.limit_checker import LimitChecker
 from afspm.model import ControlRequest, ProblemNames, Request
 from afspm.scheduler.settings import scheduler_settings
 
@@ -139,7 +139,7 @@ def test_what_added_actions_set_reaches_the_scheduler(write: Write) -> None:
     assert not errors(experiment)
     limits = scheduler_settings({}, to_settings(experiment.resolved.limits), {}, ProblemNames(), 5.0).limits
     assert limits.sets == experiment.resolved.limits.sets
-    guard = Guard(limits)
+    guard = LimitChecker(limits)
     high = Request(int(ControlRequest.ACTION), "x-high")
     assert guard.check("repair", high, 0) is None
     refusal = guard.check("series", high, 0)

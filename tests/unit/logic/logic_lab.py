@@ -7,7 +7,7 @@ from typing import Any
 
 from tests.simulation.codec import TableCodec
 
-from afspm.logic.chronicle import PERIOD_S
+from afspm.logic.event_log import PERIOD_S
 from afspm.logic.events import (
     Connected,
     Disconnected,
@@ -24,7 +24,7 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
-from afspm.logic.scheduling import SchedulerCore
+from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
     TELL_REQUEST,

@@ -11,19 +11,19 @@ from hypothesis import strategies as st
 from afspm.logic.arbitration import (
     OTHERWISE,
     TABLE,
-    Ask,
+    ArbitrationState,
     Cause,
-    Control,
-    Event,
-    Roles,
-    Row,
+    ControlEvent,
+    ControlInput,
+    RoleTable,
     Rules,
+    Transition,
     apply,
     reason,
     row_for,
 )
+from afspm.logic.descriptions import is_routine
 from afspm.logic.diagram import edges, kind, mermaid
-from afspm.logic.words import is_routine
 from afspm.model import ControlMode, ControlResponse, ProblemNames
 
 TIP, MALFUNCTION, FEEDBACK, NAMED = 1, 2, 3, 40
@@ -31,47 +31,47 @@ RULES = Rules(problems=ProblemNames({"lost-molecule": NAMED}))
 MANUAL, AUTOMATED = int(ControlMode.MANUAL), int(ControlMode.AUTOMATED)
 
 
-def after(*asks: Ask, rules: Rules = RULES) -> tuple[Control, Row]:
+def after(*asks: ControlInput, rules: Rules = RULES) -> tuple[ArbitrationState, Transition]:
     """The state after a story, and the row that its last event met."""
-    control = Control()
+    control = ArbitrationState()
     for ask in asks:
         row = row_for(control, ask, rules)
         control = apply(row, control, ask)
     return control, row
 
 
-def request(who: str, problem: int = 0) -> Ask:
-    return Ask(Event.REQUEST_CONTROL, who, problem)
+def request(who: str, problem: int = 0) -> ControlInput:
+    return ControlInput(ControlEvent.REQUEST_CONTROL, who, problem)
 
 
-def flag(who: str, problem: int) -> Ask:
-    return Ask(Event.FLAG, who, problem)
+def flag(who: str, problem: int) -> ControlInput:
+    return ControlInput(ControlEvent.FLAG, who, problem)
 
 
-def clear(who: str, problem: int) -> Ask:
-    return Ask(Event.CLEAR, who, problem)
+def clear(who: str, problem: int) -> ControlInput:
+    return ControlInput(ControlEvent.CLEAR, who, problem)
 
 
-def mode(number: int, who: str = "person") -> Ask:
-    return Ask(Event.SET_MODE, who, number)
+def mode(number: int, who: str = "person") -> ControlInput:
+    return ControlInput(ControlEvent.SET_MODE, who, number)
 
 
 def test_each_event_has_a_last_row_that_always_applies() -> None:
-    for event in Event:
+    for event in ControlEvent:
         rows = [row for row in TABLE if row.event is event]
         assert rows[-1].when is OTHERWISE
         assert all(row.when is not OTHERWISE for row in rows[:-1])
 
 
 def test_every_row_can_apply() -> None:
-    roles = Roles(end={"boss"}, mode={"boss"}, clear={"boss"}, operate={"boss"})
+    roles = RoleTable(end={"boss"}, mode={"boss"}, clear={"boss"}, operate={"boss"})
     met = set()
     for rules in (RULES, Rules(roles)):
         for control in _states():
-            for event in Event:
+            for event in ControlEvent:
                 for who in ("a", "b", "boss"):
                     for number in (0, 1, 2, 3, 99):
-                        met.add(id(row_for(control, Ask(event, who, number), rules)))
+                        met.add(id(row_for(control, ControlInput(event, who, number), rules)))
     assert [row for row in TABLE if id(row) not in met] == []
 
 
@@ -83,7 +83,9 @@ def test_a_cause_is_given_where_control_is_taken_and_only_there() -> None:
 def test_the_first_to_ask_gets_control_and_no_other_until_it_is_given_back() -> None:
     control, row = after(request("experiment"), request("greedy"))
     assert (control.holder, row.response) == ("experiment", ControlResponse.ALREADY_UNDER_CONTROL)
-    control, row = after(request("experiment"), Ask(Event.RELEASE_CONTROL, "experiment"), request("greedy"))
+    control, row = after(
+        request("experiment"), ControlInput(ControlEvent.RELEASE_CONTROL, "experiment"), request("greedy")
+    )
     assert (control.holder, row.response) == ("greedy", ControlResponse.SUCCESS)
 
 
@@ -108,7 +110,7 @@ def test_anybody_may_clear_a_flag_unless_roles_are_given(who: str) -> None:
 
 
 def test_with_roles_the_flag_of_another_is_cleared_only_by_its_solver_or_the_role() -> None:
-    rules = Rules(Roles(clear={"boss"}))
+    rules = Rules(RoleTable(clear={"boss"}))
     flagged = flag("classifier", TIP)
     control, row = after(flagged, clear("stranger", TIP), rules=rules)
     assert (set(control.problems), row.response) == ({TIP}, ControlResponse.FAILURE)
@@ -135,7 +137,7 @@ def test_a_flag_that_is_not_set_is_removed_with_success_and_takes_control_from_n
 
 
 def test_a_stranger_s_release_is_refused_and_harmless() -> None:
-    control, row = after(request("experiment"), Ask(Event.RELEASE_CONTROL, "stranger"))
+    control, row = after(request("experiment"), ControlInput(ControlEvent.RELEASE_CONTROL, "stranger"))
     assert (control.holder, row.response) == ("experiment", ControlResponse.NOT_IN_CONTROL)
 
 
@@ -207,24 +209,27 @@ def test_a_problem_that_nobody_named_is_refused(problem: int) -> None:
 
 
 def test_only_the_holder_commands_and_everybody_reads() -> None:
-    assert after(request("experiment"), Ask(Event.COMMAND, "experiment"))[1].response is None
-    assert after(request("experiment"), Ask(Event.COMMAND, "other"))[1].response is ControlResponse.NOT_IN_CONTROL
-    assert after(Ask(Event.COMMAND, "other"))[1].response is ControlResponse.NOT_IN_CONTROL
-    assert after(request("experiment"), Ask(Event.READ, "other"))[1].response is None
+    assert after(request("experiment"), ControlInput(ControlEvent.COMMAND, "experiment"))[1].response is None
+    assert (
+        after(request("experiment"), ControlInput(ControlEvent.COMMAND, "other"))[1].response
+        is ControlResponse.NOT_IN_CONTROL
+    )
+    assert after(ControlInput(ControlEvent.COMMAND, "other"))[1].response is ControlResponse.NOT_IN_CONTROL
+    assert after(request("experiment"), ControlInput(ControlEvent.READ, "other"))[1].response is None
 
 
 def test_an_operator_commands_in_manual_only() -> None:
-    rules = Rules(Roles(operate={"console"}))
-    command = Ask(Event.COMMAND, "console")
+    rules = Rules(RoleTable(operate={"console"}))
+    command = ControlInput(ControlEvent.COMMAND, "console")
     assert after(mode(MANUAL), command, rules=rules)[1].response is None
     assert after(command, rules=rules)[1].response is ControlResponse.NOT_IN_CONTROL
     assert after(mode(MANUAL), command)[1].response is ControlResponse.NOT_IN_CONTROL
 
 
 def test_roles_say_who_may_end_and_switch() -> None:
-    rules = Rules(Roles(end={"boss"}, mode={"boss"}))
-    assert after(Ask(Event.END, "other"), rules=rules)[1].response is ControlResponse.FAILURE
-    assert after(Ask(Event.END, "boss"), rules=rules)[0].ended
+    rules = Rules(RoleTable(end={"boss"}, mode={"boss"}))
+    assert after(ControlInput(ControlEvent.END, "other"), rules=rules)[1].response is ControlResponse.FAILURE
+    assert after(ControlInput(ControlEvent.END, "boss"), rules=rules)[0].ended
     assert after(mode(MANUAL, "other"), rules=rules)[1].response is ControlResponse.FAILURE
     assert after(mode(MANUAL, "boss"), rules=rules)[0].mode is ControlMode.MANUAL
 
@@ -240,17 +245,20 @@ def test_a_refusal_says_who_and_what() -> None:
 def test_every_refusal_has_a_reason_that_can_be_told() -> None:
     for row in TABLE:
         if row.response not in (None, ControlResponse.SUCCESS):
-            assert reason(row, Control(), Ask(row.event, "somebody", 1), RULES)
+            assert reason(row, ArbitrationState(), ControlInput(row.event, "somebody", 1), RULES)
 
 
 asks = st.builds(
-    Ask, st.sampled_from(Event), st.sampled_from(["a", "b", "c"]), st.sampled_from([0, 1, 2, 3, NAMED, 99])
+    ControlInput,
+    st.sampled_from(ControlEvent),
+    st.sampled_from(["a", "b", "c"]),
+    st.sampled_from([0, 1, 2, 3, NAMED, 99]),
 )
 
 
 @given(st.lists(asks, max_size=40))
-def test_no_story_breaks_what_must_always_hold(story: list[Ask]) -> None:
-    control = Control()
+def test_no_story_breaks_what_must_always_hold(story: list[ControlInput]) -> None:
+    control = ArbitrationState()
     for ask in story:
         before, row = control, row_for(control, ask, RULES)
         control = apply(row, before, ask)
@@ -262,7 +270,7 @@ def test_no_story_breaks_what_must_always_hold(story: list[Ask]) -> None:
         if before.holder is not None:
             assert control.holder in (None, before.holder)
         assert set(control.problems) <= set(RULES.problems.values())
-        assert Control.from_dict(control.to_dict()) == control
+        assert ArbitrationState.from_dict(control.to_dict()) == control
 
 
 def test_the_diagram_is_drawn_from_the_table() -> None:
@@ -273,34 +281,34 @@ def test_the_diagram_is_drawn_from_the_table() -> None:
     assert ("solver in control", "the last flag is removed", "free") in drawn
     assert not any(before == "manual" and after == "in control" for before, _, after in drawn)
     assert mermaid().startswith("stateDiagram-v2")
-    assert kind(Control()) == "free"
+    assert kind(ArbitrationState()) == "free"
 
 
-def _states() -> list[Control]:
-    states = [Control(ended=True)]
+def _states() -> list[ArbitrationState]:
+    states = [ArbitrationState(ended=True)]
     for flagged in ({}, {1: "a"}, {1: "a", 2: "b"}):
         problems = MappingProxyType(flagged)
-        states += [Control(m, None, 0, problems) for m in (ControlMode.MANUAL, ControlMode.AUTOMATED)]
-        states += [Control(ControlMode.AUTOMATED, "a", solving, problems) for solving in (flagged or {0: ""})]
+        states += [ArbitrationState(m, None, 0, problems) for m in (ControlMode.MANUAL, ControlMode.AUTOMATED)]
+        states += [ArbitrationState(ControlMode.AUTOMATED, "a", solving, problems) for solving in (flagged or {0: ""})]
     return states
 
 
 def test_giving_control_back_and_taking_it_again_is_routine_to_the_log() -> None:
-    free, held = Control(), Control(holder="series")
-    back = Ask(Event.RELEASE_CONTROL, "series")
-    ask = Ask(Event.REQUEST_CONTROL, "series")
+    free, held = ArbitrationState(), ArbitrationState(holder="series")
+    back = ControlInput(ControlEvent.RELEASE_CONTROL, "series")
+    ask = ControlInput(ControlEvent.REQUEST_CONTROL, "series")
     assert is_routine(held, free, back, "series")
     assert is_routine(free, held, ask, "series")
 
 
 def test_what_says_how_the_experiment_goes_is_told() -> None:
-    free, held = Control(), Control(holder="series")
-    ask = Ask(Event.REQUEST_CONTROL, "series")
-    flagged = Control(problems={1: "classifier"})
+    free, held = ArbitrationState(), ArbitrationState(holder="series")
+    ask = ControlInput(ControlEvent.REQUEST_CONTROL, "series")
+    flagged = ArbitrationState(problems={1: "classifier"})
     assert not is_routine(free, held, ask, None)  # the first to be in control
     assert not is_routine(free, held, ask, "corrector")  # another than before
-    assert not is_routine(held, free, Ask(Event.DEAD, "series"), "series")
-    assert not is_routine(held, flagged, Ask(Event.FLAG, "classifier", 1), "series")
-    assert not is_routine(flagged, free, Ask(Event.CLEAR, "classifier", 1), "series")
-    solving = Control(holder="corrector", solving=1, problems={1: "classifier"})
-    assert not is_routine(solving, flagged, Ask(Event.RELEASE_CONTROL, "corrector"), "corrector")
+    assert not is_routine(held, free, ControlInput(ControlEvent.DEAD, "series"), "series")
+    assert not is_routine(held, flagged, ControlInput(ControlEvent.FLAG, "classifier", 1), "series")
+    assert not is_routine(flagged, free, ControlInput(ControlEvent.CLEAR, "classifier", 1), "series")
+    solving = ArbitrationState(holder="corrector", solving=1, problems={1: "classifier"})
+    assert not is_routine(solving, flagged, ControlInput(ControlEvent.RELEASE_CONTROL, "corrector"), "corrector")

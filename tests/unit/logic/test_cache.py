@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.errors import ConfigError
-from afspm.logic.cache import TIME_STEP_NS, Cache
+from afspm.logic.cache import TIME_STEP_NS, PacketCache
 from afspm.logic.envelopes import CacheRule, Envelopes, default_envelope, size_text
 from afspm.model import Packet, PacketHeader
 
@@ -20,13 +20,13 @@ def scan(width_m: float = 2e-6, channel: str = "Height") -> PacketHeader:
 
 
 def put(
-    cache: Cache, header: PacketHeader, time_ns: int | None, payload: bytes = b"x", now_ns: int = NOW
+    cache: PacketCache, header: PacketHeader, time_ns: int | None, payload: bytes = b"x", now_ns: int = NOW
 ) -> Packet | None:
     taken = cache.take(Packet(header.message, payload, time_ns), header, now_ns)
     return None if taken is None else taken[0]
 
 
-def times(cache: Cache, prefix: str = "", since_ns: int = -1) -> list[int]:
+def times(cache: PacketCache, prefix: str = "", since_ns: int = -1) -> list[int]:
     return [packet.time_ns or 0 for packet in cache.replay([prefix], since_ns)]
 
 
@@ -51,7 +51,7 @@ def test_sizes_below_a_nanometre_stay_apart() -> None:
 
 
 def test_lines_of_a_running_scan_are_passed_on_and_not_kept() -> None:
-    cache = Cache()
+    cache = PacketCache()
     put(cache, scan(), NOW)
     for number in range(1, 200):
         taken = cache.take(Packet("ScanLines", b"x", NOW + number), PacketHeader("ScanLines", "Height"), NOW + number)
@@ -118,7 +118,7 @@ def test_a_rule_that_can_not_work_is_refused(rule: dict[str, object]) -> None:
 
 
 def test_of_each_envelope_the_newest_are_kept() -> None:
-    cache = Cache(Envelopes(history={"Scan2d": 3}))
+    cache = PacketCache(Envelopes(history={"Scan2d": 3}))
     for n in range(1, 11):
         put(cache, scan(channel="a"), n * NS)
     put(cache, scan(channel="b"), 11 * NS)
@@ -126,7 +126,7 @@ def test_of_each_envelope_the_newest_are_kept() -> None:
 
 
 def test_a_replay_is_oldest_first_over_all_envelopes_by_prefix_and_since() -> None:
-    cache = Cache()
+    cache = PacketCache()
     put(cache, scan(channel="a"), 1 * NS)
     put(cache, PacketHeader("ScopeStateMsg"), 2 * NS)
     put(cache, scan(channel="b"), 3 * NS)
@@ -138,32 +138,32 @@ def test_a_replay_is_oldest_first_over_all_envelopes_by_prefix_and_since() -> No
 
 
 def test_times_increase_though_the_translator_s_clock_goes_back() -> None:
-    cache = Cache()
+    cache = PacketCache()
     given = [put(cache, scan(), t) for t in (100 * NS, 50 * NS, 50 * NS + 1, 200 * NS)]
     assert [p.time_ns for p in given if p] == [100 * NS, 100 * NS + TIME_STEP_NS, 100 * NS + 2 * TIME_STEP_NS, 200 * NS]
 
 
 def test_a_clock_far_ahead_is_not_believed() -> None:
-    packet = put(Cache(), scan(), NOW + 100 * 3600 * NS)
+    packet = put(PacketCache(), scan(), NOW + 100 * 3600 * NS)
     assert packet is not None
     assert packet.time_ns == NOW
 
 
 def test_a_packet_without_a_time_is_published_at_ours() -> None:
-    packet = put(Cache(), scan(), None)
+    packet = put(PacketCache(), scan(), None)
     assert packet is not None
     assert packet.time_ns == NOW
 
 
 def test_what_a_translator_sends_again_when_it_reconnects_is_dropped() -> None:
-    cache = Cache()
+    cache = PacketCache()
     assert put(cache, scan(), 5 * NS) is not None
     assert put(cache, scan(), 5 * NS) is None
     assert len(cache) == 1
 
 
 def test_beyond_the_bytes_history_goes_before_the_last_of_an_envelope() -> None:
-    cache = Cache(max_bytes=4000)
+    cache = PacketCache(max_bytes=4000)
     put(cache, PacketHeader("ScanParameters2d"), 1 * NS)
     for n in range(2, 12):
         put(cache, scan(), n * NS, b"x" * 700)
@@ -173,7 +173,7 @@ def test_beyond_the_bytes_history_goes_before_the_last_of_an_envelope() -> None:
 
 
 def test_a_flood_of_envelopes_is_bounded() -> None:
-    cache = Cache(max_bytes=10_000)
+    cache = PacketCache(max_bytes=10_000)
     for n in range(5000):
         put(cache, scan(channel=str(n)), n * NS + NS)
     assert cache.size <= 10_000
@@ -181,7 +181,7 @@ def test_a_flood_of_envelopes_is_bounded() -> None:
 
 
 def test_what_is_too_large_is_published_and_not_kept() -> None:
-    cache = Cache(max_bytes=1000)
+    cache = PacketCache(max_bytes=1000)
     taken = cache.take(Packet("Scan2d", b"x" * 2000, NS), scan(), NOW)
     assert taken is not None
     assert taken[1] is False
@@ -189,11 +189,11 @@ def test_what_is_too_large_is_published_and_not_kept() -> None:
 
 
 def test_a_restart_brings_everything_back_and_goes_on_after_it() -> None:
-    cache = Cache()
+    cache = PacketCache()
     for n in range(1, 5):
         put(cache, scan(), n * NS)
     kept = list(cache)
-    again = Cache()
+    again = PacketCache()
     again.not_before(10 * NS)
     again.restore(kept)
     assert list(again) == kept
@@ -205,10 +205,10 @@ def test_a_restart_brings_everything_back_and_goes_on_after_it() -> None:
 
 
 def test_what_was_published_but_not_written_down_comes_again_at_its_first_time() -> None:
-    cache = Cache()
+    cache = PacketCache()
     cache.not_before(10 * NS)
     first = put(cache, scan(), 5 * NS)
-    again = Cache()
+    again = PacketCache()
     again.not_before(20 * NS)
     again.remember(cache.recent())
     second = put(again, scan(), 5 * NS)
@@ -230,7 +230,7 @@ packets = st.tuples(
 def test_whatever_comes_is_kept_in_order_within_its_bounds(
     story: list[tuple[str, str, int | None, bytes]], limit: int
 ) -> None:
-    cache, newest, last = Cache(max_bytes=limit), dict[str, int](), 0
+    cache, newest, last = PacketCache(max_bytes=limit), dict[str, int](), 0
     for message, channel, time_ns, payload in story:
         header = PacketHeader(message, channel, (1e-6, 1e-6), "IV")
         taken = cache.take(Packet(message, payload, time_ns), header, NOW)
@@ -251,7 +251,7 @@ def test_whatever_comes_is_kept_in_order_within_its_bounds(
 
 
 def test_what_was_passed_over_is_not_published_after_a_restart_either() -> None:
-    cache = Cache()
+    cache = PacketCache()
     passed, after = (
         Packet("ScopeStateMsg", b"FREE", 10 * TIME_STEP_NS),
         Packet("ScopeStateMsg", b"SCANNING", 20 * TIME_STEP_NS),
@@ -259,7 +259,7 @@ def test_what_was_passed_over_is_not_published_after_a_restart_either() -> None:
     assert cache.pass_over(passed)
     assert not cache.pass_over(passed)
     assert cache.take(after, PacketHeader("ScopeStateMsg"), 0) is not None
-    restarted = Cache()
+    restarted = PacketCache()
     restarted.remember(cache.recent())
     assert restarted.take(passed, PacketHeader("ScopeStateMsg"), 0) is None
     again = restarted.take(after, PacketHeader("ScopeStateMsg"), 0)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from afspm.logic.forwarding import NOT_SENT, UNKNOWN, End, Forwarder, Job, Settled
-from afspm.logic.once import Fate, OnceTable
+from afspm.logic.forwarder import NOT_SENT, UNKNOWN, ForwardedRequest, Forwarder, ForwardOutcome, SettledRequest
+from afspm.logic.idempotency_cache import IdempotencyCache, RequestStatus
 from afspm.model import ControlResponse, Request, Response
 
 OK = Response(int(ControlResponse.SUCCESS))
 
 
-def job(client: str, id_: str = "", command: bool = True) -> Job:
-    return Job(client, Request(1, "start-scan", b"x", id_), command)
+def job(client: str, id_: str = "", command: bool = True) -> ForwardedRequest:
+    return ForwardedRequest(client, Request(1, "start-scan", b"x", id_), command)
 
 
 def sent(forwarder: Forwarder) -> list[int]:
@@ -32,13 +32,13 @@ def test_one_is_in_flight_and_the_others_wait_their_turn() -> None:
     assert sent(forwarder) == [1]
     settled = forwarder.answered(1, OK, 0.1)
     assert settled is not None
-    assert (settled.job.client, settled.end, sent(forwarder)) == ("a", End.ANSWERED, [2])
+    assert (settled.job.client, settled.end, sent(forwarder)) == ("a", ForwardOutcome.ANSWERED, [2])
 
 
 def test_without_a_translator_everybody_is_answered_at_once() -> None:
     refused = Forwarder().ask(job("a"), 0.0)
     assert refused is not None
-    assert (refused.end, refused.response.code) == (End.NOT_SENT, ControlResponse.NO_RESPONSE)
+    assert (refused.end, refused.response.code) == (ForwardOutcome.NOT_SENT, ControlResponse.NO_RESPONSE)
     assert refused.response.reason.startswith(NOT_SENT)
 
 
@@ -47,9 +47,9 @@ def test_a_loss_says_what_may_have_been_done_and_what_was_not() -> None:
     forwarder.ask(job("a"), 0.0)
     forwarder.ask(job("b"), 0.0)
     ends = {settled.job.client: settled for settled in forwarder.lost()}
-    assert ends["a"].end is End.UNKNOWN
+    assert ends["a"].end is ForwardOutcome.UNKNOWN
     assert ends["a"].response.reason.startswith(UNKNOWN)
-    assert ends["b"].end is End.NOT_SENT
+    assert ends["b"].end is ForwardOutcome.NOT_SENT
 
 
 def test_after_its_timeout_everybody_is_told_there_was_no_response() -> None:
@@ -57,8 +57,8 @@ def test_after_its_timeout_everybody_is_told_there_was_no_response() -> None:
     forwarder.ask(job("a"), 0.0)
     forwarder.ask(job("b"), 1.0)
     assert forwarder.deadline_s() == 5.0
-    assert [(s.job.client, s.end) for s in forwarder.expire(5.0)] == [("a", End.UNKNOWN)]
-    assert [(s.job.client, s.end) for s in forwarder.expire(6.0)] == [("b", End.NOT_SENT)]
+    assert [(s.job.client, s.end) for s in forwarder.expire(5.0)] == [("a", ForwardOutcome.UNKNOWN)]
+    assert [(s.job.client, s.end) for s in forwarder.expire(6.0)] == [("b", ForwardOutcome.NOT_SENT)]
     assert sent(forwarder) == [1]
 
 
@@ -72,7 +72,7 @@ def test_a_late_answer_is_never_another_s() -> None:
     assert sent(forwarder) == [2]
     late = forwarder.answered(1, OK, 10.5)
     assert late is not None
-    assert (late.job.client, late.end) == ("a", End.LATE)
+    assert (late.job.client, late.end) == ("a", ForwardOutcome.LATE)
     assert forwarder.flight is not None
     assert forwarder.flight.client == "b"
     assert forwarder.answered(1, OK, 10.6) is None
@@ -86,7 +86,7 @@ def test_an_overdue_request_that_is_repeated_is_waited_for_again() -> None:
     assert forwarder.ask_again("a", "k", 5.5)
     settled = forwarder.answered(1, OK, 6.0)
     assert settled is not None
-    assert settled.end is End.ANSWERED
+    assert settled.end is ForwardOutcome.ANSWERED
 
 
 def test_who_repeats_for_ever_does_not_keep_the_line() -> None:
@@ -114,7 +114,7 @@ def test_our_own_requests_go_before_those_that_wait() -> None:
 def test_the_queue_is_bounded() -> None:
     forwarder = up(longest_queue=3)
     results = [forwarder.ask(job(str(n)), 0.0) for n in range(10)]
-    refused = [result for result in results if isinstance(result, Settled)]
+    refused = [result for result in results if isinstance(result, SettledRequest)]
     assert len(refused) == 6
     assert all(r.response.reason.startswith(NOT_SENT) for r in refused)
 
@@ -128,11 +128,11 @@ def test_what_waits_can_be_called_back_and_what_was_sent_not() -> None:
 
 
 def test_a_repeated_id_has_the_fate_of_the_first() -> None:
-    once = OnceTable()
+    once = IdempotencyCache()
     request = Request(1, "start-scan", b"x", "exp/a/1")
     assert once.look_up("exp", request) is None
-    once.note("exp", request, Fate.PENDING)
-    assert once.look_up("exp", request) is Fate.PENDING
+    once.note("exp", request, RequestStatus.PENDING)
+    assert once.look_up("exp", request) is RequestStatus.PENDING
     once.note("exp", request, OK)
     assert once.look_up("exp", request) is OK
     assert once.look_up("other", request) is None
@@ -141,7 +141,7 @@ def test_a_repeated_id_has_the_fate_of_the_first() -> None:
 
 
 def test_an_id_used_for_another_request_is_refused() -> None:
-    once = OnceTable()
+    once = IdempotencyCache()
     once.note("exp", Request(1, "start-scan", b"x", "key"), OK)
     other = once.look_up("exp", Request(1, "x-pulse", b"y", "key"))
     assert isinstance(other, Response)
@@ -149,7 +149,7 @@ def test_an_id_used_for_another_request_is_refused() -> None:
 
 
 def test_the_table_is_bounded_and_forgets_the_oldest() -> None:
-    once = OnceTable(per_client=5, clients=3)
+    once = IdempotencyCache(per_client=5, clients=3)
     for n in range(100):
         once.note("exp", Request(1, id=str(n)), OK)
         once.note(f"other-{n}", Request(1, id="1"), OK)

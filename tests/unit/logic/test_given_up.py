@@ -7,7 +7,7 @@ from logic_lab import Lab, killed, published
 
 from afspm.logic.events import TranslatorCaughtUp, TranslatorUp
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.telling import SILENT_S
+from afspm.logic.supervisor_registry import SILENT_S
 from afspm.model import ControlRequest, ProcessCondition, ProcessState
 
 ALIVE, RESTARTING = ProcessCondition.ALIVE, ProcessCondition.RESTARTING

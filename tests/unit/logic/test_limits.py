@@ -1,4 +1,4 @@
-"""Limits: what is refused, with which words."""
+"""ExperimentLimits: what is refused, with which words."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import math
 import pytest
 
 from afspm import wire
-from afspm.logic.guard import Guard
-from afspm.logic.limits import Limit, Limits
+from afspm.logic.limit_checker import LimitChecker
+from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -29,8 +29,8 @@ BIAS = "tip-bias-voltage"
 STAGE = Region((0.0, 0.0), (10e-6, 10e-6))
 
 
-def guard(**parameters: Limit) -> Guard:
-    return Guard(Limits({name.replace("_", "-"): limit for name, limit in parameters.items()}))
+def guard(**parameters: Limit) -> LimitChecker:
+    return LimitChecker(ExperimentLimits({name.replace("_", "-"): limit for name, limit in parameters.items()}))
 
 
 def set_(value: str, unit: str | None = None, name: str = BIAS) -> Request:
@@ -45,7 +45,7 @@ def probe(x: float, y: float) -> Request:
     return Request(int(ControlRequest.SET_PROBE_POS), ProbePosition((x, y)))
 
 
-def why(guard: Guard, request: Request, who: str = "experiment", now_ns: int = 0) -> str:
+def why(guard: LimitChecker, request: Request, who: str = "experiment", now_ns: int = 0) -> str:
     """The reason of the refusal; empty if there is none."""
     refusal = guard.check(who, request, now_ns)
     if refusal is None:
@@ -70,15 +70,15 @@ def test_a_range_is_checked_in_any_unit(value: str, unit: str | None, fits: bool
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "NaN", "abc", "", "0x10"])
 def test_base_parameters_are_finite_numbers_with_or_without_a_limit(value: str) -> None:
-    assert why(Guard(), set_(value, "V"))
+    assert why(LimitChecker(), set_(value, "V"))
 
 
 def test_a_unit_of_the_wrong_kind_is_refused() -> None:
-    assert why(Guard(), set_("1", "nm"))
+    assert why(LimitChecker(), set_("1", "nm"))
 
 
 def test_a_parameter_of_one_s_own_may_be_text_unless_it_is_limited() -> None:
-    assert not why(Guard(), set_("fast", None, "x-mode"))
+    assert not why(LimitChecker(), set_("fast", None, "x-mode"))
     assert why(guard(x_mode=Limit(0.0, 1.0)), set_("fast", None, "x-mode"))
 
 
@@ -112,7 +112,7 @@ def test_a_rate_allows_more_with_time() -> None:
 
 
 def test_an_interval_lies_between_two_uses() -> None:
-    g = Guard(Limits(actions={"x-pulse": Limit(interval_s=60.0, source="toml:3")}))
+    g = LimitChecker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0, source="toml:3")}))
     pulse = Request(int(ControlRequest.ACTION), "x-pulse")
     assert not why(g, pulse)
     g.carried_out(pulse, 0)
@@ -121,7 +121,7 @@ def test_an_interval_lies_between_two_uses() -> None:
 
 
 def test_only_those_named_may() -> None:
-    g = Guard(Limits({BIAS: Limit(only={"corrector"})}, {"x-crash": Limit(only={"corrector"})}))
+    g = LimitChecker(ExperimentLimits({BIAS: Limit(only={"corrector"})}, {"x-crash": Limit(only={"corrector"})}))
     crash = Request(int(ControlRequest.ACTION), "x-crash")
     for request in (crash, set_("1", "V")):
         assert "corrector" in why(g, request, "experiment")
@@ -144,7 +144,7 @@ def test_the_fields_of_messages_are_limited_like_the_parameters_of_their_names()
 
 
 def test_scans_stay_in_the_region_with_all_their_corners() -> None:
-    g = Guard(Limits(region=STAGE, region_source="toml:9"))
+    g = LimitChecker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert not why(g, scan(Region((0, 0), (10e-6, 10e-6))))
     assert "toml:9" in why(g, scan(Region((0, 0), (9e-6, 9e-6), math.pi / 4)))
     assert why(g, scan(Region((4e-6, 0), (3e-6, 1e-6))))
@@ -152,20 +152,20 @@ def test_scans_stay_in_the_region_with_all_their_corners() -> None:
 
 
 def test_a_turned_region_is_respected() -> None:
-    g = Guard(Limits(region=Region((0, 0), (10e-6, 2e-6), math.pi / 2)))
+    g = LimitChecker(ExperimentLimits(region=Region((0, 0), (10e-6, 2e-6), math.pi / 2)))
     assert not why(g, probe(0.5e-6, 4.5e-6))
     assert why(g, probe(4.5e-6, 0.5e-6))
 
 
 def test_the_probe_stays_in_the_region_and_goes_to_real_places() -> None:
-    g = Guard(Limits(region=STAGE))
+    g = LimitChecker(ExperimentLimits(region=STAGE))
     assert not why(g, probe(5e-6, -5e-6))
     assert why(g, probe(5.1e-6, 0.0))
     assert why(g, probe(math.nan, 0.0))
 
 
 def test_a_scan_moved_by_single_parameters_stays_in_the_region_too() -> None:
-    g = Guard(Limits(region=STAGE))
+    g = LimitChecker(ExperimentLimits(region=STAGE))
     move = set_("4", "um", "scan-top-left-x")
     assert "not known" in why(g, move)
     g.published(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
@@ -176,7 +176,7 @@ def test_a_scan_moved_by_single_parameters_stays_in_the_region_too() -> None:
 
 
 def test_a_part_of_a_region_is_checked_with_the_rest_of_it() -> None:
-    g = Guard(Limits(region=STAGE))
+    g = LimitChecker(ExperimentLimits(region=STAGE))
     assert "not known" in why(g, scan(RegionChange(left_m=0.0)))
     g.published(ScanParameters(Region((0, 0), (2e-6, 2e-6)), (64, 64)), 0)
     assert not why(g, scan(RegionChange(left_m=3e-6)))
@@ -185,13 +185,13 @@ def test_a_part_of_a_region_is_checked_with_the_rest_of_it() -> None:
 
 @pytest.mark.parametrize("size", [0.0, -1e-6, math.nan, math.inf])
 def test_a_scan_of_no_size_is_refused(size: float) -> None:
-    assert why(Guard(), scan(RegionChange(width_m=size)))
-    assert why(Guard(), set_(str(size), "m", "scan-size-x"))
+    assert why(LimitChecker(), scan(RegionChange(width_m=size)))
+    assert why(LimitChecker(), set_(str(size), "m", "scan-size-x"))
 
 
 def test_absurd_numbers_of_pixels_are_refused() -> None:
-    assert why(Guard(), scan(shape=(10**5, 10**4)))
-    g = Guard()
+    assert why(LimitChecker(), scan(shape=(10**5, 10**4)))
+    g = LimitChecker()
     g.published(ScanParameters(shape=(10**5, 10)), 0)
     assert why(g, set_("10000", None, "scan-resolution-x"))
     for value in ("0", "-4", "1.5"):
@@ -199,7 +199,7 @@ def test_absurd_numbers_of_pixels_are_refused() -> None:
 
 
 def test_a_part_of_a_position_is_checked_with_the_rest_of_it() -> None:
-    limits = Guard(Limits(region=STAGE))
+    limits = LimitChecker(ExperimentLimits(region=STAGE))
     half = Request(int(ControlRequest.SET_PROBE_POS), PositionChange(x_m=4e-6))
     assert "not known" in why(limits, half)
     limits.published(ProbePosition((0.0, 4.9e-6)), 0)
@@ -210,7 +210,7 @@ def test_a_part_of_a_position_is_checked_with_the_rest_of_it() -> None:
 
 
 def test_pixels_along_one_axis_are_counted_with_those_along_the_other() -> None:
-    limits = Guard(Limits(most_pixels=1000))
+    limits = LimitChecker(ExperimentLimits(most_pixels=1000))
     limits.published(ScanParameters(STAGE, (100, 5)), 0)
     assert why(limits, scan(shape=ShapeChange(columns=10))) == ""
     assert "11 x 100" in why(limits, scan(shape=ShapeChange(columns=11)))
@@ -226,7 +226,7 @@ def act(action: str, id_: str = "") -> Request:
     return Request(int(ControlRequest.ACTION), action, id=id_)
 
 
-def here(guard: Guard, action: str) -> str:
+def here(guard: LimitChecker, action: str) -> str:
     """The reason why it is refused where the scan and the probe are; empty if it is not."""
     refusal = guard.check_place(act(action))
     if refusal is None:
@@ -235,26 +235,26 @@ def here(guard: Guard, action: str) -> str:
     return refusal.reason
 
 
-def restarted(limits: Limits, before: Guard) -> Guard:
-    again = Guard(limits)
+def restarted(limits: ExperimentLimits, before: LimitChecker) -> LimitChecker:
+    again = LimitChecker(limits)
     again.restore(json.loads(json.dumps(before.snapshot())))
     return again
 
 
 def test_nothing_is_scanned_outside_the_region_whoever_set_the_frame() -> None:
-    g = Guard(Limits(region=STAGE, region_source="toml:9"))
+    g = LimitChecker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert "not known" in here(g, "start-scan")
     g.published(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
     assert "toml:9" in here(g, "start-scan")
     assert here(g, "stop-scan") == here(g, "x-retract") == ""
     g.published(ScanParameters(Region((4e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
     assert here(g, "start-scan") == ""
-    assert here(Guard(), "start-scan") == ""
+    assert here(LimitChecker(), "start-scan") == ""
 
 
 @pytest.mark.parametrize("action", ["start-spec", "x-pulse", "x-crash"])
 def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action: str) -> None:
-    g = Guard(Limits(region=STAGE, region_source="toml:9"))
+    g = LimitChecker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert "not known" in here(g, action)
     g.published(ProbePosition((9e-6, 0.0)), 0)
     assert "(9e-06, 0)" in here(g, action)
@@ -264,7 +264,7 @@ def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action
 
 
 def test_a_frame_up_to_the_border_may_be_told_in_the_precision_of_the_controller() -> None:
-    g = Guard(Limits(region=STAGE))
+    g = LimitChecker(ExperimentLimits(region=STAGE))
     assert why(g, scan(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6))))
     g.published(ScanParameters(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6)), (8, 8)), 0)
     g.published(ProbePosition((5.0000002e-6, 0.0)), 0)
@@ -276,7 +276,7 @@ def test_a_frame_up_to_the_border_may_be_told_in_the_precision_of_the_controller
 
 
 def test_a_place_set_by_single_parameters_is_known_before_it_is_published() -> None:
-    g = Guard(Limits(region=STAGE))
+    g = LimitChecker(ExperimentLimits(region=STAGE))
     g.published(ProbePosition((0.0, 0.0)), 0)
     g.published(ScanParameters(Region((0, 0), (1e-6, 1e-6)), (8, 8)), 0)
     g.carried_out(set_("9", "um", "probe-pos-x"), 0)
@@ -286,8 +286,8 @@ def test_a_place_set_by_single_parameters_is_known_before_it_is_published() -> N
 
 
 def test_an_interval_counts_from_the_sending_and_over_a_restart() -> None:
-    limits = Limits(actions={"x-pulse": Limit(interval_s=60.0)})
-    g = Guard(limits)
+    limits = ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)})
+    g = LimitChecker(limits)
     assert g.sending("corrector", act("x-pulse", "corrector/1"), 0)
     again = restarted(limits, g)
     assert why(again, act("x-pulse", "corrector/2"), "corrector", 59 * NS)
@@ -297,7 +297,7 @@ def test_an_interval_counts_from_the_sending_and_over_a_restart() -> None:
 
 
 def test_a_request_that_is_asked_again_is_not_too_soon_after_itself() -> None:
-    g = Guard(Limits(actions={"x-pulse": Limit(interval_s=60.0)}))
+    g = LimitChecker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
     g.sending("corrector", act("x-pulse", "corrector/1"), 0)
     assert not why(g, act("x-pulse", "corrector/1"), "corrector", NS)
     assert why(g, act("x-pulse", "corrector/1"), "another", NS)
@@ -305,14 +305,16 @@ def test_a_request_that_is_asked_again_is_not_too_soon_after_itself() -> None:
 
 
 def test_what_was_refused_by_the_microscope_does_not_count_as_used() -> None:
-    g = Guard(Limits(actions={"x-pulse": Limit(interval_s=60.0)}))
+    g = LimitChecker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
     g.sending("corrector", act("x-pulse", "corrector/1"), 0)
     g.not_done("corrector", act("x-pulse", "corrector/1"))
     assert not why(g, act("x-pulse", "corrector/2"), "corrector", NS)
 
 
 def test_only_what_is_measured_from_is_to_be_saved() -> None:
-    g = Guard(Limits({BIAS: Limit(step=0.5), "scan-speed": Limit(high=1.0)}, {"x-crash": Limit(only=["corrector"])}))
+    g = LimitChecker(
+        ExperimentLimits({BIAS: Limit(step=0.5), "scan-speed": Limit(high=1.0)}, {"x-crash": Limit(only=["corrector"])})
+    )
     assert not g.sending("corrector", act("x-crash"), 0)
     assert not g.carried_out(set_("1e-6", "m/s", "scan-speed"), 0)
     assert g.carried_out(set_("1", "V"), 0)
@@ -320,8 +322,8 @@ def test_only_what_is_measured_from_is_to_be_saved() -> None:
 
 
 def test_steps_rates_and_places_are_known_after_a_restart() -> None:
-    limits = Limits({BIAS: Limit(step=0.5, rate_per_s=0.1)}, region=STAGE)
-    g = Guard(limits)
+    limits = ExperimentLimits({BIAS: Limit(step=0.5, rate_per_s=0.1)}, region=STAGE)
+    g = LimitChecker(limits)
     g.carried_out(set_("1", "V"), 0)
     g.published(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6), 0.5), (8, 9)), 0)
     g.published(ProbePosition((4e-6, 0.0)), 0)
@@ -377,17 +379,17 @@ def test_an_action_is_limited_by_what_it_sets() -> None:
         (Limit(only={"corrector"}), "only corrector"),
         (Limit(step=0.5), "step of 7 V"),
     ):
-        g = Guard(Limits({BIAS: limit}, sets=HIGH))
+        g = LimitChecker(ExperimentLimits({BIAS: limit}, sets=HIGH))
         g.carried_out(set_("1", "V"), 0)
         assert word in why(g, act)
         assert "x-high" in why(g, act)
-    away = Guard(Limits(region=STAGE, sets={"x-away": (Parameter("probe-pos-x", "20", "um"),)}))
+    away = LimitChecker(ExperimentLimits(region=STAGE, sets={"x-away": (Parameter("probe-pos-x", "20", "um"),)}))
     away.published(ProbePosition((0.0, 0.0)), 0)
     assert "outside the region" in why(away, Request(int(ControlRequest.ACTION), "x-away", id="i"))
 
 
 def test_what_an_action_has_set_is_in_force() -> None:
-    g = Guard(Limits({BIAS: Limit(step=0.5)}, sets=HIGH))
+    g = LimitChecker(ExperimentLimits({BIAS: Limit(step=0.5)}, sets=HIGH))
     g.carried_out(Request(int(ControlRequest.ACTION), "x-high"), 0)
     assert not why(g, set_("8.4", "V"))
     assert why(g, set_("1.0", "V"))
@@ -396,7 +398,9 @@ def test_what_an_action_has_set_is_in_force() -> None:
 def test_what_an_action_sets_is_limited_as_a_whole() -> None:
     large = (Parameter("scan-resolution-x", "2048"), Parameter("scan-resolution-y", "2048"))
     to_the_left = (Parameter("scan-top-left-x", "-5", "um"), Parameter("scan-size-x", "10", "um"))
-    g = Guard(Limits(region=STAGE, most_pixels=1_000_000, sets={"x-large": large, "x-left": to_the_left}))
+    g = LimitChecker(
+        ExperimentLimits(region=STAGE, most_pixels=1_000_000, sets={"x-large": large, "x-left": to_the_left})
+    )
     g.published(ScanParameters(Region((4e-6, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
     assert "2048 x 2048" in why(g, Request(int(ControlRequest.ACTION), "x-large", id="i"))
     assert not why(g, Request(int(ControlRequest.ACTION), "x-left", id="i"))
@@ -406,7 +410,7 @@ def test_what_an_action_sets_is_limited_as_a_whole() -> None:
     ("name", "value"), [("scan-resolution-x", "0"), ("scan-resolution-y", "2.5"), ("scan-size-x", "0")]
 )
 def test_a_place_without_sense_that_a_microscope_tells_is_none_and_no_harm(name: str, value: str) -> None:
-    g = Guard(Limits(region=STAGE))
+    g = LimitChecker(ExperimentLimits(region=STAGE))
     g.published(ScanParameters(Region((0.0, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
     g.carried_out(Request(int(ControlRequest.PARAM), Parameter(name)), 0, Parameter(name, value))
     assert here(g, "start-scan") == ""
@@ -445,9 +449,9 @@ def test_a_microscope_that_does_not_say_the_value_when_asked_is_not_taken_to_hav
 
 @pytest.mark.parametrize("by_action", [True, False])
 def test_a_parameter_that_may_be_set_every_so_often_counts_from_when_it_is_sent(by_action: bool) -> None:
-    limits = Limits({BIAS: Limit(interval_s=600.0)}, sets=HIGH)
+    limits = ExperimentLimits({BIAS: Limit(interval_s=600.0)}, sets=HIGH)
     request = Request(int(ControlRequest.ACTION), "x-high", id="1") if by_action else set_("1", "V")
-    g = Guard(limits)
+    g = LimitChecker(limits)
     assert g.sending("experiment", request, 0)
     again = restarted(limits, g)
     other = Request(int(ControlRequest.PARAM), Parameter(BIAS, "2", "V"), id="2")
@@ -458,8 +462,10 @@ def test_a_parameter_that_may_be_set_every_so_often_counts_from_when_it_is_sent(
 
 
 def test_only_what_nobody_publishes_is_to_be_read_and_only_where_it_matters() -> None:
-    g = Guard(
-        Limits({BIAS: Limit(step=0.5), "scan-size-x": Limit(step=1e-6), "scan-speed": Limit(high=1.0)}, sets=HIGH)
+    g = LimitChecker(
+        ExperimentLimits(
+            {BIAS: Limit(step=0.5), "scan-size-x": Limit(step=1e-6), "scan-speed": Limit(high=1.0)}, sets=HIGH
+        )
     )
     assert g.to_be_read(set_("1", "V")) == [BIAS]
     assert g.to_be_read(Request(int(ControlRequest.ACTION), "x-high")) == [BIAS]

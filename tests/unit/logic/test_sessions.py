@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.logic.sessions import Hearing, Sessions, token_of
+from afspm.logic.sessions import Hearing, SessionTable, token_of
 
 ACCEPTED, TAKEN, STALE, UNCLEAR = Hearing.ACCEPTED, Hearing.TAKEN, Hearing.STALE, Hearing.UNCLEAR
 
@@ -18,7 +18,7 @@ def test_the_token_is_read_from_ids_of_our_form_only() -> None:
 
 
 def test_a_restarted_component_is_the_same_client() -> None:
-    sessions = Sessions()
+    sessions = SessionTable()
     sessions.connected(1)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
     assert sessions.disconnected(1, 1.0) == "exp"
@@ -29,7 +29,7 @@ def test_a_restarted_component_is_the_same_client() -> None:
 
 
 def test_a_second_live_one_of_the_same_name_is_refused() -> None:
-    sessions = Sessions()
+    sessions = SessionTable()
     for connection in (1, 2):
         sessions.connected(connection)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
@@ -39,7 +39,7 @@ def test_a_second_live_one_of_the_same_name_is_refused() -> None:
 
 def test_handing_the_name_over_does_not_make_the_impostor_its_owner() -> None:
     """ROUTER closes the owner's connection when the impostor connects; the owner comes back, and so on."""
-    sessions = Sessions(takeover_s=3.0)
+    sessions = SessionTable(takeover_s=3.0)
     sessions.connected(1)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
     sessions.connected(2)
@@ -54,7 +54,7 @@ def test_handing_the_name_over_does_not_make_the_impostor_its_owner() -> None:
 
 
 def test_a_peer_without_ids_that_connects_anew_is_the_same_client_whichever_is_seen_first() -> None:
-    sessions = Sessions()
+    sessions = SessionTable()
     sessions.connected(1)
     assert sessions.hear(1, "old", "", 0.0) is ACCEPTED
     sessions.connected(2)
@@ -64,7 +64,7 @@ def test_a_peer_without_ids_that_connects_anew_is_the_same_client_whichever_is_s
 
 
 def test_a_peer_without_ids_does_not_take_the_name_of_one_with_ids() -> None:
-    sessions = Sessions(takeover_s=3.0)
+    sessions = SessionTable(takeover_s=3.0)
     sessions.connected(1)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
     sessions.connected(2)
@@ -75,7 +75,7 @@ def test_a_peer_without_ids_does_not_take_the_name_of_one_with_ids() -> None:
 
 def test_a_name_whose_owner_never_comes_back_is_free_in_the_end() -> None:
     """Its connection had died without our noticing: the restarted process looked like an impostor."""
-    sessions = Sessions(takeover_s=3.0)
+    sessions = SessionTable(takeover_s=3.0)
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     sessions.connected(2)
@@ -85,7 +85,7 @@ def test_a_name_whose_owner_never_comes_back_is_free_in_the_end() -> None:
 
 
 def test_who_was_taken_for_dead_has_its_name_back_when_it_speaks() -> None:
-    sessions = Sessions()
+    sessions = SessionTable()
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     sessions.disconnected(1, 1.0)
@@ -97,7 +97,7 @@ def test_who_was_taken_for_dead_has_its_name_back_when_it_speaks() -> None:
 
 
 def test_also_when_others_had_it_in_between_that_never_said_who_they_are() -> None:
-    sessions = Sessions()
+    sessions = SessionTable()
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     for connection in (2, 3, 4):
@@ -109,7 +109,7 @@ def test_also_when_others_had_it_in_between_that_never_said_who_they_are() -> No
 
 
 def test_what_comes_by_a_closed_connection_is_stale() -> None:
-    sessions = Sessions()
+    sessions = SessionTable()
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     sessions.disconnected(1, 1.0)
@@ -117,7 +117,7 @@ def test_what_comes_by_a_closed_connection_is_stale() -> None:
 
 
 def test_a_connection_that_never_speaks_is_nobody() -> None:
-    sessions = Sessions()
+    sessions = SessionTable()
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
     sessions.disconnected(1, 1.0)
@@ -126,10 +126,10 @@ def test_a_connection_that_never_speaks_is_nobody() -> None:
 
 
 def test_an_owner_that_lives_on_over_our_restart_has_its_name_back() -> None:
-    before = Sessions()
+    before = SessionTable()
     before.connected(1)
     before.hear(1, "exp", "exp/a/1", 0.0)
-    sessions = Sessions()
+    sessions = SessionTable()
     sessions.restore(before.tokens())
     for connection in (1, 2):
         sessions.connected(connection)
@@ -139,7 +139,7 @@ def test_an_owner_that_lives_on_over_our_restart_has_its_name_back() -> None:
 
 
 def test_names_that_are_gone_are_forgotten_some_day() -> None:
-    sessions = Sessions(keep=10)
+    sessions = SessionTable(keep=10)
     for n in range(1000):
         sessions.connected(n)
         sessions.hear(n, f"peer-{n}", "", 0.0)

@@ -6,7 +6,7 @@ import pytest
 
 from afspm.logic.arbitration import Cause
 from afspm.logic.lease import Lease
-from afspm.logic.watchdog import Result, Watchdog, WatchdogSettings
+from afspm.logic.watchdog import SafetyResult, Watchdog, WatchdogSettings
 from afspm.model import ControlResponse, Feedback, ScopeState
 
 OK, NOT_FREE, SILENCE = (
@@ -60,15 +60,15 @@ def test_a_dead_holder_s_tip_is_retracted_in_a_dangerous_state_once_it_has_stopp
     assert dog.owes_retract
     assert dog.next_action() == "stop-scan"
     assert dog.next_action() is None
-    assert dog.answered(OK, 0.0) is Result.DONE
+    assert dog.answered(OK, 0.0) is SafetyResult.DONE
     assert dog.next_action() is None
     dog.scope_is(ScopeState.INTERRUPTED)
     assert dog.next_action() == "x-retract"
-    assert dog.answered(NOT_FREE, 0.0) is Result.AGAIN
+    assert dog.answered(NOT_FREE, 0.0) is SafetyResult.AGAIN
     assert dog.next_action() is None
     dog.scope_is(FREE)
     assert dog.next_action() == "x-retract"
-    assert dog.answered(OK, 0.0) is Result.DONE
+    assert dog.answered(OK, 0.0) is SafetyResult.DONE
     assert not dog.owes_retract
 
 
@@ -102,7 +102,7 @@ def test_a_danger_that_is_seen_to_is_not_told_nor_seen_to_again() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.PROBLEM, None)
     assert dog.next_action() == "x-retract"
-    assert dog.answered(OK, 0.0) is Result.DONE
+    assert dog.answered(OK, 0.0) is SafetyResult.DONE
     assert dog.danger.untold() is None
     assert dog.control_taken(Cause.ENDED, None) == []
 
@@ -163,7 +163,7 @@ def test_silence_is_tried_again_and_given_up_loudly() -> None:
     for _ in range(3):
         assert dog.next_action() == "stop-scan"
         results.append(dog.answered(SILENCE, 0.0))
-    assert results == [Result.AGAIN, Result.AGAIN, Result.FAILED]
+    assert results == [SafetyResult.AGAIN, SafetyResult.AGAIN, SafetyResult.FAILED]
     assert dog.snapshot()["stops"] == []
 
 
@@ -186,7 +186,7 @@ def refused(**settings: object) -> Watchdog:
     dog = off(FREE, **settings)
     dog.control_taken(Cause.DEAD, None)
     assert dog.next_action() == "x-retract"
-    assert dog.answered(ERROR, 100.0) is Result.FAILED
+    assert dog.answered(ERROR, 100.0) is SafetyResult.FAILED
     return dog
 
 
@@ -203,11 +203,11 @@ def test_a_tip_that_was_not_retracted_is_tried_again_and_again_ever_less_often()
         assert dog.look_again(now_s, is_seen_to=False) is None
         assert not dog.put_off
         assert dog.next_action() == "x-retract"
-        assert dog.answered(ERROR, now_s) is Result.FAILED
+        assert dog.answered(ERROR, now_s) is SafetyResult.FAILED
     assert times == [10.0, 20.0, 30.0, 30.0]
     dog.look_again(now_s + 30.0, is_seen_to=False)
     assert dog.next_action() == "x-retract"
-    assert dog.answered(OK, now_s + 30.0) is Result.DONE
+    assert dog.answered(OK, now_s + 30.0) is SafetyResult.DONE
     assert (dog.due_s, dog.danger.now, dog.owes_retract) == (None, None, False)
 
 
@@ -248,7 +248,7 @@ def test_a_microscope_that_is_never_free_for_it_is_left_to_people_and_tried_late
     dog = off(FREE, again_s=10.0)
     dog.control_taken(Cause.DEAD, None)
     dog.next_action()
-    assert dog.answered(NOT_FREE, 100.0) is Result.AGAIN
+    assert dog.answered(NOT_FREE, 100.0) is SafetyResult.AGAIN
     assert (dog.due_s, dog.left_to_people, dog.put_off) == (110.0, False, False)
     told = dog.look_again(110.0, is_seen_to=True)
     assert told == "the tip was left in danger and can't be retracted: the microscope is never free for that"
@@ -348,7 +348,7 @@ def test_what_a_microscope_can_not_do_is_not_tried_again() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.DEAD, None)
     dog.next_action()
-    assert dog.answered(int(ControlResponse.ACTION_NOT_SUPPORTED), 0.0) is Result.FAILED
+    assert dog.answered(int(ControlResponse.ACTION_NOT_SUPPORTED), 0.0) is SafetyResult.FAILED
     assert (dog.due_s, dog.owes_retract, dog.left_to_people) == (None, False, True)
 
 

@@ -1,4 +1,4 @@
-"""Limits, through the whole scheduler: where something is done, over its own death."""
+"""ExperimentLimits, through the whole scheduler: where something is done, over its own death."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from logic_lab import NS, Lab, in_control, killed, kinds, replies
 
-from afspm.logic.arbitration import Roles, Rules
+from afspm.logic.arbitration import RoleTable, Rules
 from afspm.logic.events import Effect, Forward, Tick, TranslatorCaughtUp, TranslatorDown, TranslatorUp
-from afspm.logic.limits import Limit, Limits
+from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
     ControlMode,
@@ -24,12 +24,12 @@ from afspm.model import (
 
 ACTION, PARAM = ControlRequest.ACTION, ControlRequest.PARAM
 STAGE = Region((0.0, 0.0), (6e-6, 6e-6))
-PULSES = SchedulerSettings(limits=Limits(actions={"x-pulse": Limit(interval_s=600.0)}))
+PULSES = SchedulerSettings(limits=ExperimentLimits(actions={"x-pulse": Limit(interval_s=600.0)}))
 
 
 @pytest.mark.parametrize("action", ["start-scan", "x-pulse"])
 def test_what_was_moved_out_of_the_region_at_the_panel_is_refused_when_it_is_to_be_used(action: str) -> None:
-    lab = in_control(SchedulerSettings(limits=Limits(region=STAGE, region_source="experiment.toml:9")))
+    lab = in_control(SchedulerSettings(limits=ExperimentLimits(region=STAGE, region_source="experiment.toml:9")))
     lab.publish("ScanParameters2d", ScanParameters(Region((8e-6, 8e-6), (1e-6, 1e-6)), (32, 32)))
     lab.publish("ProbePosition", ProbePosition((9e-6, 0.0)))
     (reply,) = replies(lab.ask("experiment", ACTION, action, "experiment/a/1"))
@@ -69,7 +69,7 @@ def test_what_may_have_been_done_counts() -> None:
 
 
 BIAS = "tip-bias-voltage"
-STEPS = SchedulerSettings(limits=Limits({BIAS: Limit(step=0.1)}))
+STEPS = SchedulerSettings(limits=ExperimentLimits({BIAS: Limit(step=0.1)}))
 
 
 def told(lab: Lab, value: str) -> list[Effect]:
@@ -121,7 +121,7 @@ def test_who_loses_control_while_the_value_is_read_does_not_set_it() -> None:
 
 
 def test_two_do_not_change_one_value_at_a_time() -> None:
-    lab = in_control(replace(STEPS, rules=Rules(Roles(operate=("ada", "ben")))))
+    lab = in_control(replace(STEPS, rules=Rules(RoleTable(operate=("ada", "ben")))))
     lab.mode("ada", ControlMode.MANUAL)
     lab.ask("ada", PARAM, Parameter(BIAS, "0.1", "V"), "ada/a/1")
     read = lab.forwarded[-1]
@@ -135,7 +135,7 @@ def test_two_do_not_change_one_value_at_a_time() -> None:
 
 
 def test_what_a_person_waits_to_set_is_not_set_when_the_mode_is_automated_again() -> None:
-    lab = in_control(replace(STEPS, rules=Rules(Roles(operate=("ada", "ben")))))
+    lab = in_control(replace(STEPS, rules=Rules(RoleTable(operate=("ada", "ben")))))
     lab.mode("ada", ControlMode.MANUAL)
     lab.ask("ada", PARAM, Parameter(BIAS, "0.1", "V"), "ada/a/1")
     read = lab.forwarded[-1]
@@ -157,7 +157,7 @@ def test_who_has_a_new_connection_by_the_time_it_is_refused_hears_so_there() -> 
 
 
 def test_how_fast_a_value_may_change_is_known_once_the_translator_has_been_there_for_a_while() -> None:
-    settings = SchedulerSettings(limits=Limits({BIAS: Limit(rate_per_s=0.1)}))
+    settings = SchedulerSettings(limits=ExperimentLimits({BIAS: Limit(rate_per_s=0.1)}))
     lab = Lab(settings)
     lab.step(TranslatorUp())
     lab.answer(next(one for one in lab.forwarded if one.request.kind == ControlRequest.ACTION_SUPPORT))
@@ -171,7 +171,7 @@ def test_how_fast_a_value_may_change_is_known_once_the_translator_has_been_there
 
 
 def test_without_a_translator_nothing_is_read() -> None:
-    lab = in_control(SchedulerSettings(limits=Limits({BIAS: Limit(high=3.0)})))
+    lab = in_control(SchedulerSettings(limits=ExperimentLimits({BIAS: Limit(high=3.0)})))
     lab.step(TranslatorDown())
     (reply,) = replies(lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1"))
     assert reply.response.code == ControlResponse.NO_RESPONSE

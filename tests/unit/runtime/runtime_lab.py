@@ -88,7 +88,7 @@ class Lab:
     def __init__(self, name: str = "experiment") -> None:
         self.name = name
         self.clock = FakeClock()
-        self.control = a.Control()
+        self.control = a.ArbitrationState()
         self.state = ScopeState.FREE
         self.parameters = ScanParameters(OTHER_REGION, (8, 8))
         self.position = ProbePosition((0.0, 0.0))
@@ -179,9 +179,9 @@ class Lab:
     def parent_goes(self) -> None:
         self._inbox.append(ParentGone())
 
-    def does(self, event: a.Event, who: str, number: int = 0) -> Response:
+    def does(self, event: a.ControlEvent, who: str, number: int = 0) -> Response:
         """Somebody asks the scheduler."""
-        ask = a.Ask(event, who, number)
+        ask = a.ControlInput(event, who, number)
         rules = a.Rules(problems=PROBLEMS)
         row = a.row_for(self.control, ask, rules)
         reason = a.reason(row, self.control, ask, rules)
@@ -195,13 +195,13 @@ class Lab:
         return Response(int(row.response or 0), reason=reason)
 
     def flag(self, problem: int) -> None:
-        self.does(a.Event.FLAG, "classifier", problem)
+        self.does(a.ControlEvent.FLAG, "classifier", problem)
 
     def clear(self, problem: int) -> None:
-        self.does(a.Event.CLEAR, "corrector", problem)
+        self.does(a.ControlEvent.CLEAR, "corrector", problem)
 
     def set_mode(self, mode: int) -> None:
-        self.does(a.Event.SET_MODE, "person", mode)
+        self.does(a.ControlEvent.SET_MODE, "person", mode)
 
     def stop(self) -> None:
         """Stop what the microscope is doing."""
@@ -258,13 +258,13 @@ class Lab:
         return response
 
     def _answer(self, request: Request) -> Response:
-        asks: Mapping[int, a.Event] = {
-            ControlRequest.REQUEST_CTRL: a.Event.REQUEST_CONTROL,
-            ControlRequest.RELEASE_CTRL: a.Event.RELEASE_CONTROL,
-            ControlRequest.ADD_EXP_PRBLM: a.Event.FLAG,
-            ControlRequest.RMV_EXP_PRBLM: a.Event.CLEAR,
-            ControlRequest.SET_CONTROL_MODE: a.Event.SET_MODE,
-            ControlRequest.END_EXPERIMENT: a.Event.END,
+        asks: Mapping[int, a.ControlEvent] = {
+            ControlRequest.REQUEST_CTRL: a.ControlEvent.REQUEST_CONTROL,
+            ControlRequest.RELEASE_CTRL: a.ControlEvent.RELEASE_CONTROL,
+            ControlRequest.ADD_EXP_PRBLM: a.ControlEvent.FLAG,
+            ControlRequest.RMV_EXP_PRBLM: a.ControlEvent.CLEAR,
+            ControlRequest.SET_CONTROL_MODE: a.ControlEvent.SET_MODE,
+            ControlRequest.END_EXPERIMENT: a.ControlEvent.END,
         }
         if request.kind in asks:
             return self.does(asks[request.kind], self.name, request.subject or 0)

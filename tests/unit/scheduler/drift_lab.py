@@ -25,7 +25,7 @@ from afspm.logic.events import (
     TranslatorReply,
     TranslatorUp,
 )
-from afspm.logic.limits import Limits
+from afspm.logic.limits import ExperimentLimits
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
     ControlRequest,
@@ -44,8 +44,8 @@ from afspm.model import (
 )
 from afspm.scheduler.drift.codec import DriftWireCodec
 from afspm.scheduler.drift.core import DriftCore
-from afspm.scheduler.drift.settings import DriftSettings
-from afspm.scheduler.drift.told import Forecasted, Registered, ScanJob, WorkerSaid
+from afspm.scheduler.drift.messages import Forecasted, Registered, ScanJob, WorkerSaid
+from afspm.scheduler.drift.settings import DriftCompensationSettings
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as ProbePositionMessage
 
 NS = 10**9
@@ -128,8 +128,8 @@ class Lab:
 
     def __init__(
         self,
-        drift: DriftSettings | None = None,
-        limits: Limits | None = None,
+        drift: DriftCompensationSettings | None = None,
+        limits: ExperimentLimits | None = None,
         *,
         state: dict[str, Any] | None = None,
         now_s: float = START_S,
@@ -137,8 +137,10 @@ class Lab:
     ) -> None:
         self.worker = FakeWorker()
         self.now_s = now_s
-        settings = SchedulerSettings(limits=limits or Limits())
-        self.core = DriftCore(settings, drift or DriftSettings(), DriftWireCodec(), self.worker, "scheduler")
+        settings = SchedulerSettings(limits=limits or ExperimentLimits())
+        self.core = DriftCore(
+            settings, drift or DriftCompensationSettings(), DriftWireCodec(), self.worker, "scheduler"
+        )
         if state is not None:
             self.core.restore(state)
         self.effects: list[Effect] = []

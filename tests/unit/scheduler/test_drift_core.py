@@ -21,8 +21,8 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.scheduler.drift.settings import Compensate, DriftSettings
-from afspm.scheduler.drift.told import NotRegistered, WorkerGone
+from afspm.scheduler.drift.messages import NotRegistered, WorkerGone
+from afspm.scheduler.drift.settings import Compensate, DriftCompensationSettings
 
 DRIFT = (100e-9, -50e-9)
 BACK = (-100e-9, 50e-9)
@@ -120,7 +120,7 @@ def test_a_scan_without_the_channel_goes_out_as_predicted_at_its_end(lab: Lab) -
 
 
 def test_the_channel_may_be_said() -> None:
-    lab = Lab(DriftSettings(channel="Amplitude"))
+    lab = Lab(DriftCompensationSettings(channel="Amplitude"))
     lab.in_force()
     lab.scan(channels=("Height", "Amplitude"))
     assert lab.worker.jobs[0].scan.channel == "Amplitude"
@@ -376,7 +376,7 @@ def test_three_scans_in_a_row_that_nobody_could_register_are_a_sample_that_is_lo
 
 
 def test_scans_without_the_channel_tell_as_little() -> None:
-    lab = Lab(DriftSettings(channel="Heigth"))
+    lab = Lab(DriftCompensationSettings(channel="Heigth"))
     lab.in_force()
     for _ in range(3):
         assert not problems(lab)
@@ -394,7 +394,7 @@ def test_how_many_there_were_is_known_after_a_kill(lab: Lab) -> None:
 
 
 def test_where_nothing_is_corrected_scans_need_not_be_registered() -> None:
-    lab = Lab(DriftSettings(correct=False))
+    lab = Lab(DriftCompensationSettings(correct=False))
     lab.in_force()
     for _ in range(4):
         fail(lab)
@@ -405,7 +405,7 @@ def test_where_nothing_is_corrected_scans_need_not_be_registered() -> None:
 
 def test_a_person_is_called_though_correction_has_not_begun_yet() -> None:
     """When it begins, nobody would correct anything."""
-    lab = Lab(DriftSettings(correct_after=1000.0))
+    lab = Lab(DriftCompensationSettings(correct_after=1000.0))
     lab.in_force()
     for _ in range(MOST_ENDS):
         lab.says(WorkerGone("another tracker's state"))
@@ -483,7 +483,7 @@ def test_a_flag_of_somebody_else_is_not_touched(lab: Lab) -> None:
 
 
 def test_at_the_start_the_first_scan_is_wanted_in_the_other_direction() -> None:
-    lab = Lab(DriftSettings(at_start="up-down"))
+    lab = Lab(DriftCompensationSettings(at_start="up-down"))
     lab.in_force()
     set_direction(lab, "up")
     lab.scan()
@@ -492,7 +492,7 @@ def test_at_the_start_the_first_scan_is_wanted_in_the_other_direction() -> None:
     (told,) = lab.published("DriftRescan")
     assert (told.kind, told.upwards) == (2, False)
     assert problems(lab) == (Problem.THERMAL_DRIFT,)
-    again = Lab(DriftSettings(at_start="up-down"), state=lab.saved())
+    again = Lab(DriftCompensationSettings(at_start="up-down"), state=lab.saved())
     again.scan()
     again.effects.clear()
     again.says(registered(again.worker.jobs[0], forecast()))
@@ -500,7 +500,7 @@ def test_at_the_start_the_first_scan_is_wanted_in_the_other_direction() -> None:
 
 
 def test_a_microscope_that_tells_no_direction_is_not_waited_for() -> None:
-    lab = Lab(DriftSettings(at_start="up-down"))
+    lab = Lab(DriftCompensationSettings(at_start="up-down"))
     lab.in_force()
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast()))
@@ -509,7 +509,7 @@ def test_a_microscope_that_tells_no_direction_is_not_waited_for() -> None:
 
 
 def test_without_correction_drift_is_told_and_nothing_is_done_about_it() -> None:
-    lab = Lab(DriftSettings(correct=False, at_start="up-down"))
+    lab = Lab(DriftCompensationSettings(correct=False, at_start="up-down"))
     lab.in_force()
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), lost=True, rescan="far off"))
@@ -524,7 +524,7 @@ def test_without_correction_drift_is_told_and_nothing_is_done_about_it() -> None
 
 def test_what_the_controller_compensates_is_what_is_reckoned_with_from_the_start_on() -> None:
     """Not what was left of the night before; and after its restart what it was told before."""
-    drift = DriftSettings(compensate=Compensate("x-rate-x", "x-rate-y"))
+    drift = DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y"))
     lab = Lab(drift, answer_start=False)
     told = []
     while forwards := lab.forwards():
@@ -536,7 +536,7 @@ def test_what_the_controller_compensates_is_what_is_reckoned_with_from_the_start
 
 
 def test_a_rate_that_is_known_is_handed_over_and_the_worker_hears_since_when() -> None:
-    lab = Lab(DriftSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
+    lab = Lab(DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
     lab.in_force()
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT, (1e-10, -2e-10), at_s=lab.now_s, rate_sd_m_s=1e-11)))
@@ -559,7 +559,7 @@ def test_a_rate_that_is_known_is_handed_over_and_the_worker_hears_since_when() -
 
 
 def test_a_controller_that_does_not_take_the_rate_is_told_of() -> None:
-    lab = Lab(DriftSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
+    lab = Lab(DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
     lab.in_force()
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT, (1e-10, -2e-10), at_s=lab.now_s)))
@@ -570,7 +570,7 @@ def test_a_controller_that_does_not_take_the_rate_is_told_of() -> None:
 
 
 def test_under_a_person_s_hands_the_rate_is_left_as_it_is() -> None:
-    lab = Lab(DriftSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
+    lab = Lab(DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
     lab.in_force()
     lab.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL), name="dashboard:Ada")
     lab.scan()
@@ -592,7 +592,7 @@ def test_the_plain_scheduler_s_answers_are_the_same(lab: Lab) -> None:
 
 
 def test_what_is_corrected_later_needs_no_scan_down() -> None:
-    lab = Lab(DriftSettings(at_start="up-down", correct_after=1000.0))
+    lab = Lab(DriftCompensationSettings(at_start="up-down", correct_after=1000.0))
     lab.in_force()
     set_direction(lab, "up")
     for number in range(2):

@@ -10,7 +10,7 @@ from drift_lab import HERE, NS, SHAPE, START_S, Lab, forecast
 
 from afspm import wire
 from afspm.logic.events import Publish
-from afspm.logic.limits import Limit, Limits
+from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -24,7 +24,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.scheduler.drift.settings import DriftSettings
+from afspm.scheduler.drift.settings import DriftCompensationSettings
 
 DRIFT = (100e-9, -50e-9)
 TURN = math.radians(10.0)
@@ -368,7 +368,7 @@ def test_a_spectrum_lies_where_the_sample_was_at_its_own_time(lab: Lab) -> None:
 
 def limited(**limits: Limit) -> Lab:
     stage = Region((0.0, 0.0), (4e-6, 4e-6))
-    lab = Lab(limits=Limits({name.replace("_", "-"): limit for name, limit in limits.items()}, region=stage))
+    lab = Lab(limits=ExperimentLimits({name.replace("_", "-"): limit for name, limit in limits.items()}, region=stage))
     lab.in_force()
     lab.take_control()
     lab.knows(forecast((1.5e-6, 0.0)))
@@ -437,8 +437,10 @@ def test_what_is_in_force_is_known_in_both_coordinates_after_a_restart(lab: Lab)
 # --- without correction ---
 
 
-@pytest.mark.parametrize("drift", [DriftSettings(correct=False), DriftSettings(correct_after=1000.0)])
-def test_without_correction_nothing_is_mapped(drift: DriftSettings) -> None:
+@pytest.mark.parametrize(
+    "drift", [DriftCompensationSettings(correct=False), DriftCompensationSettings(correct_after=1000.0)]
+)
+def test_without_correction_nothing_is_mapped(drift: DriftCompensationSettings) -> None:
     lab = Lab(drift)
     lab.in_force()
     lab.take_control()
@@ -456,7 +458,7 @@ def test_without_correction_nothing_is_mapped(drift: DriftSettings) -> None:
 
 
 def test_correction_that_begins_later_goes_back_to_where_the_sample_was() -> None:
-    lab = Lab(DriftSettings(correct_after=1000.0))
+    lab = Lab(DriftCompensationSettings(correct_after=1000.0))
     lab.in_force()
     lab.take_control()
     lab.knows(forecast(DRIFT))

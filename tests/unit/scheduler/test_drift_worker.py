@@ -15,12 +15,12 @@ from afspm.drift.registration import DriftScan
 from afspm.drift.trackers import tracker
 from afspm.errors import ConfigError, FileError
 from afspm.model import Frame, Region, Scan
-from afspm.scheduler.drift import registrar
+from afspm.scheduler.drift import worker_process
 from afspm.scheduler.drift.estimation import Estimation
-from afspm.scheduler.drift.registrar import Registrar
-from afspm.scheduler.drift.settings import DriftSettings, RescanRule
-from afspm.scheduler.drift.store import Store
-from afspm.scheduler.drift.told import Forecasted, NotRegistered, Registered, ScanJob, WorkerGone, WorkerSaid
+from afspm.scheduler.drift.messages import Forecasted, NotRegistered, Registered, ScanJob, WorkerGone, WorkerSaid
+from afspm.scheduler.drift.settings import DriftCompensationSettings, RescanRule
+from afspm.scheduler.drift.worker_process import DriftWorkerProcess
+from afspm.scheduler.drift.worker_state import WorkerStateFile
 
 DEADLINE_S = 30.0
 HERE = Region((0.0, 0.0), (63e-9, 63e-9))
@@ -41,7 +41,7 @@ def drift_scan(number: int, x: int, y: int) -> DriftScan:
     return DriftScan(picture(x, y), HERE, number * 100.0, number * 100.0 + 50.0, None, f"{number}.nc 0")
 
 
-def estimation(store: Store, rule: RescanRule | None = None) -> Estimation:
+def estimation(store: WorkerStateFile, rule: RescanRule | None = None) -> Estimation:
     made = Estimation(tracker("paper", Brightest()), rule or RescanRule(), store.save)
     if (state := store.load()) is not None:
         made.restore(state)
@@ -52,7 +52,7 @@ def estimation(store: Store, rule: RescanRule | None = None) -> Estimation:
 
 
 def test_a_scan_is_answered_again_and_not_taken_twice(tmp_path: Path) -> None:
-    store = Store(tmp_path / "drift.npz")
+    store = WorkerStateFile(tmp_path / "drift.npz")
     first = estimation(store)
     first.register(drift_scan(0, 30, 30))
     answer = first.register(drift_scan(1, 33, 28))
@@ -67,7 +67,7 @@ def test_a_scan_is_answered_again_and_not_taken_twice(tmp_path: Path) -> None:
 
 
 def test_before_the_first_scan_nothing_is_known(tmp_path: Path) -> None:
-    assert estimation(Store(None)).forecast is None
+    assert estimation(WorkerStateFile(None)).forecast is None
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_before_the_first_scan_nothing_is_known(tmp_path: Path) -> None:
 )
 def test_a_scan_too_far_from_where_it_was_asked_for_is_wanted_again(rule: RescanRule, again: bool) -> None:
     asked = Region((0.0, 0.0), HERE.size_m, frame=Frame.SAMPLE)
-    made = estimation(Store(None), rule)
+    made = estimation(WorkerStateFile(None), rule)
     assert not made.register(drift_scan(0, 20, 20), asked).rescan  # nothing was known before
     assert bool(made.register(drift_scan(1, 35, 28), asked).rescan) is again
     assert not made.register(drift_scan(2, 60, 60), None).rescan  # nobody asked for it
@@ -91,7 +91,7 @@ def test_a_scan_too_far_from_where_it_was_asked_for_is_wanted_again(rule: Rescan
 
 def test_a_tracker_that_can_not_follow_a_compensation_says_so() -> None:
     with pytest.raises(ConfigError, match="compensates"):
-        estimation(Store(None)).compensated(0.0, (1e-9, 0.0))
+        estimation(WorkerStateFile(None)).compensated(0.0, (1e-9, 0.0))
 
 
 # --- on disk ---
@@ -99,24 +99,24 @@ def test_a_tracker_that_can_not_follow_a_compensation_says_so() -> None:
 
 def test_what_is_stored_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     state = {"a": [1, {"b": np.array([[0.1, np.nan], [-0.0, 1e300]])}], "c": "ü", "d": None, "e": np.float64(0.1)}
-    Store(tmp_path / "deep" / "drift.npz").save(state)
-    found = Store(tmp_path / "deep" / "drift.npz").load()
+    WorkerStateFile(tmp_path / "deep" / "drift.npz").save(state)
+    found = WorkerStateFile(tmp_path / "deep" / "drift.npz").load()
     assert found is not None
     assert found["a"][1]["b"].tobytes() == state["a"][1]["b"].tobytes()  # type: ignore[index]
     assert (found["a"][0], found["c"], found["d"], found["e"]) == (1, "ü", None, 0.1)
 
 
 def test_nothing_stored_is_no_error_and_damage_is_one(tmp_path: Path) -> None:
-    assert Store(tmp_path / "drift.npz").load() is None
+    assert WorkerStateFile(tmp_path / "drift.npz").load() is None
     (tmp_path / "drift.npz").write_bytes(b"PK\x03\x04 half")
     with pytest.raises(FileError, match="can't be read"):
-        Store(tmp_path / "drift.npz").load()
+        WorkerStateFile(tmp_path / "drift.npz").load()
 
 
 def test_what_is_stored_is_no_code(tmp_path: Path) -> None:
     np.savez(tmp_path / "drift.npz", json=np.array([{"x": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(FileError):
-        Store(tmp_path / "drift.npz").load()
+        WorkerStateFile(tmp_path / "drift.npz").load()
 
 
 # --- as a process ---
@@ -125,7 +125,7 @@ def test_what_is_stored_is_no_code(tmp_path: Path) -> None:
 class Heard:
     """What a worker's process has said, waited for."""
 
-    def __init__(self, registrar: Registrar) -> None:
+    def __init__(self, registrar: DriftWorkerProcess) -> None:
         self.registrar = registrar
         self.all: list[WorkerSaid] = []
         self._changed = threading.Condition()
@@ -149,11 +149,11 @@ class Heard:
 def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Heard]]:
     """Starts workers with an estimator of `drift_parts`."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
-    made: list[Registrar] = []
+    made: list[DriftWorkerProcess] = []
 
     def start(estimator: str = "Brightest") -> Heard:
-        settings = DriftSettings(estimator=f"drift_parts.{estimator}", tracker="paper")
-        made.append(Registrar(settings, tmp_path / "drift.npz", logging.getLogger("test")))
+        settings = DriftCompensationSettings(estimator=f"drift_parts.{estimator}", tracker="paper")
+        made.append(DriftWorkerProcess(settings, tmp_path / "drift.npz", logging.getLogger("test")))
         heard = Heard(made[-1])
         made[-1].start()
         return heard
@@ -217,7 +217,7 @@ def test_settings_that_can_not_work_are_the_reason(work: Callable[..., Heard]) -
 
 
 def test_a_state_of_another_tracker_is_refused_with_what_to_do(work: Callable[..., Heard], tmp_path: Path) -> None:
-    Store(tmp_path / "drift.npz").save({"tracker": {"kind": "bank", "version": 1}, "answers": []})
+    WorkerStateFile(tmp_path / "drift.npz").save({"tracker": {"kind": "bank", "version": 1}, "answers": []})
     gone = work().next(WorkerGone)
     assert isinstance(gone, WorkerGone)
     assert "of another tracker" in gone.reason
@@ -251,7 +251,7 @@ def test_a_scan_out_of_its_turn_is_refused_and_the_next_is_not(work: Callable[..
 
 
 def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registrar, "_FAREWELL_S", DEADLINE_S)  # or it is killed where the computer is busy
+    monkeypatch.setattr(worker_process, "_FAREWELL_S", DEADLINE_S)  # or it is killed where the computer is busy
     heard = work()
     heard.next(Forecasted)
     process = heard.registrar._process

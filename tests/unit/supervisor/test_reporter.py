@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.logic.telling import LONGEST
+from afspm.logic.supervisor_registry import LONGEST
 from afspm.model import ControlResponse, Response
 from afspm.runtime.launch import Launch
 from afspm.supervisor import reporter as reporting

@@ -8,7 +8,7 @@ import pytest
 
 from afspm.experiment import Role
 from afspm.logic.liveness import LivenessPolicy
-from afspm.logic.supervision import ChildWatch, Policy
+from afspm.logic.supervision import ChildPolicy, ChildWatch
 from afspm.model import ProcessCondition
 from afspm.runtime.launch import Launch
 from afspm.supervisor.standing import Standing
@@ -16,7 +16,7 @@ from afspm.supervisor.task import Task
 from afspm.transport.heartbeat import Heartbeat
 
 Condition = ProcessCondition
-POLICY = Policy(LivenessPolicy(beat_period_s=1.0))
+POLICY = ChildPolicy(LivenessPolicy(beat_period_s=1.0))
 
 
 @dataclass

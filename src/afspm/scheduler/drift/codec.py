@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from afspm.clock import NS_PER_S
-from afspm.scheduler.codec import WireCodec
-from afspm.scheduler.drift.told import Matrix, Registered, RescanWanted, ScanJob
+from afspm.scheduler.drift.messages import Matrix, Registered, RescanWanted, ScanJob
+from afspm.scheduler.wire_codec import WireCodec
 from afspm.wire.convert import timestamp
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.scan_pb2 import ScanParameters2d

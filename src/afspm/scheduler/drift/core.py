@@ -9,7 +9,7 @@ from typing import Any
 
 from afspm.drift.mapping import Mapping
 from afspm.errors import AfspmError
-from afspm.logic.arbitration import Control
+from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.events import (
     Announced,
     Effect,
@@ -22,7 +22,7 @@ from afspm.logic.events import (
     TranslatorCaughtUp,
     TranslatorUp,
 )
-from afspm.logic.scheduling import SchedulerCore, SchedulerSettings
+from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
 from afspm.model import (
     ControlRequest,
     ControlState,
@@ -38,14 +38,9 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.scheduler.drift.beginning import Beginning
-from afspm.scheduler.drift.consequences import Consequences, Step
+from afspm.scheduler.drift.forecast import CurrentForecast
 from afspm.scheduler.drift.frame import DriftFrame
-from afspm.scheduler.drift.gate import Gate, Held, Matrix
-from afspm.scheduler.drift.knowledge import Knowledge
-from afspm.scheduler.drift.places import is_same
-from afspm.scheduler.drift.settings import DriftSettings
-from afspm.scheduler.drift.told import (
+from afspm.scheduler.drift.messages import (
     DriftCodec,
     NotRegistered,
     Registered,
@@ -54,6 +49,11 @@ from afspm.scheduler.drift.told import (
     WorkerGone,
     WorkerSaid,
 )
+from afspm.scheduler.drift.positions import is_same
+from afspm.scheduler.drift.response import DriftResponse, Step
+from afspm.scheduler.drift.scan_gate import HeldScan, Matrix, ScanGate
+from afspm.scheduler.drift.scan_start import ScanStartTracker
+from afspm.scheduler.drift.settings import DriftCompensationSettings
 from afspm.units import same_kind
 
 MAPPING = "DriftMapping"
@@ -75,19 +75,24 @@ class DriftCore:
     """
 
     def __init__(
-        self, settings: SchedulerSettings, drift: DriftSettings, codec: DriftCodec, worker: Worker, name: str
+        self,
+        settings: SchedulerSettings,
+        drift: DriftCompensationSettings,
+        codec: DriftCodec,
+        worker: Worker,
+        name: str,
     ) -> None:
-        self.knowledge = Knowledge(drift)
+        self.knowledge = CurrentForecast(drift)
         self.frame = DriftFrame(codec, self.knowledge.mapping_at)
         self.frame.beside = self._kept
         self.core = SchedulerCore(settings, codec, self.frame)
         self._settings = drift
         self._codec = codec
         self._worker = worker
-        self._consequences = Consequences(drift, self.core, codec, self.frame, self.knowledge, worker, name)
-        self._gate = Gate()
+        self._consequences = DriftResponse(drift, self.core, codec, self.frame, self.knowledge, worker, name)
+        self._gate = ScanGate()
         self._jobs: dict[str, ScanJob] = {}
-        self._beginning = Beginning()
+        self._beginning = ScanStartTracker()
         self._channel = drift.channel
         self._following: deque[tuple[float, Following]] = deque()
         self._ends = 0
@@ -178,7 +183,7 @@ class DriftCore:
         return self.core.newest_source_ns
 
     @property
-    def control(self) -> Control:
+    def control(self) -> ArbitrationState:
         return self.core.control
 
     @property
@@ -212,7 +217,7 @@ class DriftCore:
             return self.core.step(self._relocated(event, scan, self._gate.mapping_of(key)), now_s, now_ns)
         self._beginning.scan_came()
         until_s = now_s + self._settings.longest_registration
-        self._gate.hold(Held(key, self._middle_s(scan, event, now_ns), until_s))
+        self._gate.hold(HeldScan(key, self._middle_s(scan, event, now_ns), until_s))
         self.core.put_off(until_s)
         self._gate.keep(event)
         return self._look_at(event, now_s, now_ns)
@@ -249,7 +254,7 @@ class DriftCore:
         self._told_channel = True
         return effects + self._give_up(key, why, now_s, now_ns)
 
-    def _register(self, held: Held, scan: Scan, event: PacketIn, now_ns: int) -> None:
+    def _register(self, held: HeldScan, scan: Scan, event: PacketIn, now_ns: int) -> None:
         end_s = self._end_s(scan, event, now_ns)
         start_s, upwards = 2 * held.middle_s - end_s, None
         begun = self._beginning.of_scan(end_s)
@@ -334,7 +339,7 @@ class DriftCore:
             return [Log("ERROR", f"the forecast of the drift can't be understood: {error}")]
         return []
 
-    def _slow(self, held: Held, now_s: float) -> list[Effect]:
+    def _slow(self, held: HeldScan, now_s: float) -> list[Effect]:
         """Told once, before it takes too long: with more references it takes several times as long."""
         limit_s = self._settings.longest_registration
         took_s = now_s - (held.until_s - limit_s)
@@ -352,7 +357,7 @@ class DriftCore:
         self._following.append((now_s, lambda step, now_ns: self._consequences.unregistered(why, step, now_ns)))
         return self._publish_as_predicted(held, now_s, now_ns)
 
-    def _publish_as_predicted(self, held: Held, now_s: float, now_ns: int) -> list[Effect]:
+    def _publish_as_predicted(self, held: HeldScan, now_s: float, now_ns: int) -> list[Effect]:
         self._gate.settle(held.key, self.knowledge.matrix_at(held.middle_s))
         return [SaveState(self.snapshot()), *self._release(now_s, now_ns)]
 

@@ -18,8 +18,8 @@ from afspm.drift.registration import DriftScan
 from afspm.drift.tracking import Tracker, Update
 from afspm.errors import ConfigError
 from afspm.model import Region
+from afspm.scheduler.drift.messages import Registered
 from afspm.scheduler.drift.settings import RescanRule
-from afspm.scheduler.drift.told import Registered
 
 _ANSWERS = 16
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from afspm.drift.mapping import Mapping
 from afspm.errors import AfspmError, InvalidValue
-from afspm.logic.frame import Mapped
-from afspm.logic.places import PROBE_CHANGES, REGION_CHANGES, scan_values
+from afspm.logic.coordinate_frame import MappedRequest
+from afspm.logic.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -27,9 +27,9 @@ from afspm.model import (
     ScanParameters,
     names,
 )
-from afspm.scheduler.drift.durations import Durations
 from afspm.scheduler.drift.parameters import number_of, told_as, value_in
-from afspm.scheduler.drift.places import InForce, Place, PlaceCodec, away_m, is_same
+from afspm.scheduler.drift.positions import PlaceCodec, PositionPair, TargetPosition, away_m, is_same
+from afspm.scheduler.drift.scan_durations import ScanDurations
 
 MOVES_PX = 0.01
 """A region that lies this far off in the tip's coordinates is set again before it is scanned."""
@@ -50,7 +50,7 @@ class _Remembered:
     """What a request with an id was mapped to."""
 
     kind: int
-    place: Place[Any]
+    place: PositionPair[Any]
     payload: bytes
 
 
@@ -69,9 +69,9 @@ class DriftFrame:
         self.upwards: bool | None = None
         self.beside: Callable[[], dict[str, Any]] = dict
         self.restored: dict[str, Any] = {}
-        self.durations = Durations()
-        self.region: InForce[Region] = InForce()
-        self.probe: InForce[ProbePosition] = InForce()
+        self.durations = ScanDurations()
+        self.region: TargetPosition[Region] = TargetPosition()
+        self.probe: TargetPosition[ProbePosition] = TargetPosition()
         self.shape: tuple[int, int] | None = None
         self._codec = codec
         self._mapping_at = mapping_at
@@ -79,7 +79,7 @@ class DriftFrame:
 
     # --- requests ---
 
-    def outgoing(self, who: str, request: Request, now_ns: int) -> Mapped | Response | None:
+    def outgoing(self, who: str, request: Request, now_ns: int) -> MappedRequest | Response | None:
         now_s = now_ns * 1e-9
         mapping = self._mapping_at(now_s)
         change = _place_of(request)
@@ -100,7 +100,7 @@ class DriftFrame:
             return None  # its answer will be mapped
         return self._mapped(key, request, sample, now_s)
 
-    def _mapped(self, key: str, request: Request, sample: Region | ProbePosition, now_s: float) -> Mapped:
+    def _mapped(self, key: str, request: Request, sample: Region | ProbePosition, now_s: float) -> MappedRequest:
         """Map a place as a whole, whatever part of it was asked for, and remember what comes of it."""
         kind, asked = (_SET_SCAN if isinstance(sample, Region) else _SET_PROBE), request.subject
         rest = asked if isinstance(asked, ScanParameters) else ScanParameters()
@@ -111,20 +111,20 @@ class DriftFrame:
             self._remembered[key] = _Remembered(kind, place, payload)
             if len(self._remembered) > _REMEMBERED:
                 self._remembered.popitem(last=False)
-        return Mapped(Request(kind, subject, payload, request.id), _names(asked), _said(place))
+        return MappedRequest(Request(kind, subject, payload, request.id), _names(asked), _said(place))
 
-    def _again(self, known: _Remembered, request: Request) -> Mapped:
+    def _again(self, known: _Remembered, request: Request) -> MappedRequest:
         (self.region if known.kind == _SET_SCAN else self.probe).sending(known.place)
         subject = self._codec.decode_packet(_MESSAGES[known.kind], known.payload)
-        return Mapped(
+        return MappedRequest(
             Request(known.kind, subject, known.payload, request.id), _names(request.subject), _said(known.place)
         )
 
-    def move_before(self, action: str, now_ns: int) -> Mapped | None:
+    def move_before(self, action: str, now_ns: int) -> MappedRequest | None:
         now_s = now_ns * 1e-9
         if self._mapping_at(now_s) is None:
             return None
-        here: Place[Any] | None = None
+        here: PositionPair[Any] | None = None
         if action == names.START_SCAN:
             here = self.region.current
         elif action in names.AT_PROBE:
@@ -136,7 +136,7 @@ class DriftFrame:
             return None
         place, subject = self._to_tip(here.sample, here.said, ScanParameters(), now_s)
         kind = _SET_SCAN if isinstance(place.tip, Region) else _SET_PROBE
-        return Mapped(Request(kind, subject, place.sent), (), _said(place))
+        return MappedRequest(Request(kind, subject, place.sent), (), _said(place))
 
     def _tip_of(self, sample: Region | ProbePosition, now_s: float) -> Any:
         """Where the tip must be: for a scan that begins now at its middle, for the probe now."""
@@ -151,18 +151,18 @@ class DriftFrame:
 
     def _to_tip(
         self, sample: Region | ProbePosition, said: bytes | None, rest: ScanParameters, now_s: float
-    ) -> tuple[Place[Any], Any]:
+    ) -> tuple[PositionPair[Any], Any]:
         """The place in both coordinates, and what the microscope is to be sent for it."""
         tip = self._tip_of(sample, now_s)
         if isinstance(sample, Region):
             subject: Any = ScanParameters(tip, rest.shape, rest.unit)
             if said is None:
                 said = self._codec.encode(ScanParameters(sample))
-            region_place = Place(sample, said, tip, self._codec.encode(subject))
+            region_place = PositionPair(sample, said, tip, self._codec.encode(subject))
             self.region.sending(region_place)
             return region_place, subject
         said = self._codec.encode(sample) if said is None else said
-        probe_place = Place(sample, said, tip, self._codec.encode(tip))
+        probe_place = PositionPair(sample, said, tip, self._codec.encode(tip))
         self.probe.sending(probe_place)
         return probe_place, tip
 
@@ -264,7 +264,7 @@ class DriftFrame:
         mapping, place = self._mapping_at(time_s), self.region.told(told.region)
         if place is None or mapping is None:
             sample = told.region if mapping is None else mapping.to_sample(told.region)
-            place = Place(sample, self._codec.encode(ScanParameters(sample)), told.region, bytes(payload))
+            place = PositionPair(sample, self._codec.encode(ScanParameters(sample)), told.region, bytes(payload))
             self.region.current = place
         return None if mapping is None else self._codec.relocated("ScanParameters2d", payload, place.said)
 
@@ -283,7 +283,7 @@ class DriftFrame:
         mapping, place = self._mapping_at(time_s), self.probe.told(told)
         if place is None or mapping is None:
             sample = told if mapping is None else _position(mapping, told.xy_m)
-            place = Place(sample, self._codec.encode(sample), told, bytes(payload))
+            place = PositionPair(sample, self._codec.encode(sample), told, bytes(payload))
             self.probe.current = place
         return None if mapping is None else self._codec.relocated("ProbePosition", payload, place.said)
 
@@ -323,15 +323,15 @@ class DriftFrame:
             place = self._place(int(kind), said, sent)
             self._remembered[str(key)] = _Remembered(int(kind), place, base64.b64decode(payload))
 
-    def _place(self, kind: int, said: str, sent: str) -> Place[Any]:
-        """What `Place.to_list` wrote. Raises ValueError if it is no such place."""
+    def _place(self, kind: int, said: str, sent: str) -> PositionPair[Any]:
+        """What `PositionPair.to_list` wrote. Raises ValueError if it is no such place."""
         parts = [base64.b64decode(part) for part in (said, sent)]
         sample, tip = (self._codec.decode_packet(_MESSAGES[kind], part) for part in parts)
         if isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters):
             sample, tip = sample.region, tip.region
         if sample is None or tip is None:
             raise ValueError("a place in force that can't be read")
-        return Place(sample, parts[0], tip, parts[1])
+        return PositionPair(sample, parts[0], tip, parts[1])
 
 
 def _place_of(request: Request) -> Region | RegionChange | ProbePosition | PositionChange | None:
@@ -362,7 +362,7 @@ def _names(asked: Any) -> tuple[str, ...]:
     return (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
-def _said(place: Place[Any]) -> str:
+def _said(place: PositionPair[Any]) -> str:
     def centre(where: Region | ProbePosition) -> str:
         x, y = where.center_m if isinstance(where, Region) else where.xy_m
         return f"({x:.6g}, {y:.6g}) m"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from afspm.drift.registration import DriftScan
 from afspm.model import Frame, Region
-from afspm.scheduler.drift.told import ScanJob
+from afspm.scheduler.drift.messages import ScanJob
 
 _LENGTHS = struct.Struct("<IQ")
 _NOTHING = b""

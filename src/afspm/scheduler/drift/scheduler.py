@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from afspm.errors import ConfigError
 from afspm.model import Frame
 from afspm.scheduler.drift.codec import DriftWireCodec
-from afspm.scheduler.drift.consequences import RESCAN
 from afspm.scheduler.drift.core import MAPPING, DriftCore
-from afspm.scheduler.drift.registrar import Registrar
-from afspm.scheduler.drift.settings import DriftSettings
-from afspm.scheduler.drift.told import Forecasted
+from afspm.scheduler.drift.messages import Forecasted
+from afspm.scheduler.drift.response import RESCAN
+from afspm.scheduler.drift.settings import DriftCompensationSettings
+from afspm.scheduler.drift.worker_process import DriftWorkerProcess
 from afspm.scheduler.scheduler import Scheduler, SchedulerContext
-from afspm.scheduler.shell import Core, Shell
+from afspm.scheduler.shell import Core, SchedulerShell
 from afspm.transport.scheduler_sockets import SchedulerSockets
 
 if TYPE_CHECKING:
@@ -45,13 +45,17 @@ class DriftCompensatedScheduler(Scheduler):
 
     def __init__(
         self,
-        drift: DriftSettings | None = None,
+        drift: DriftCompensationSettings | None = None,
         control: Mapping[str, Any] | None = None,
         limits: Mapping[str, Any] | None = None,
         cache: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(control, limits, cache)
-        self.drift = DriftSettings.from_table(drift or {}) if not isinstance(drift, DriftSettings) else drift
+        self.drift = (
+            DriftCompensationSettings.from_table(drift or {})
+            if not isinstance(drift, DriftCompensationSettings)
+            else drift
+        )
         if (compensate := self.drift.compensate) is not None:
             self.needs_parameters = (compensate.x, compensate.y)
 
@@ -71,20 +75,20 @@ class DriftCompensatedScheduler(Scheduler):
     def _core(self, context: SchedulerContext) -> Core:
         launch = context.launch
         file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
-        self._registrar = Registrar(self.drift, file, context.log)
+        self._registrar = DriftWorkerProcess(self.drift, file, context.log)
         self._registrar.late = context.clock.late
         return DriftCore(self._settings(context), self.drift, DriftWireCodec(), self._registrar, launch.name)
 
-    def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> Shell:
+    def _shell(self, core: Core, sockets: SchedulerSockets, *others: Any) -> SchedulerShell:
         assert isinstance(core, DriftCore)
         self._registrar.wake = sockets.wake_up
         return DriftShell(self._registrar, core, sockets, *others)
 
 
-class DriftShell(Shell):
+class DriftShell(SchedulerShell):
     """A shell that also hears the worker."""
 
-    def __init__(self, registrar: Registrar, core: DriftCore, sockets: SchedulerSockets, *others: Any) -> None:
+    def __init__(self, registrar: DriftWorkerProcess, core: DriftCore, sockets: SchedulerSockets, *others: Any) -> None:
         super().__init__(core, sockets, *others)
         self._registrar = registrar
         self._drift_core = core

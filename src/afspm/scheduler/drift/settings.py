@@ -47,7 +47,7 @@ class Compensate:
 
 
 @dataclass(frozen=True)
-class DriftSettings:
+class DriftCompensationSettings:
     """How drift is followed and corrected.
 
     Attributes:
@@ -80,7 +80,7 @@ class DriftSettings:
                 raise InvalidValue(f"{name} = {value} s can't be", where="drift")
 
     @classmethod
-    def from_table(cls, table: dict[str, Any]) -> DriftSettings:
+    def from_table(cls, table: dict[str, Any]) -> DriftCompensationSettings:
         """Out of plain JSON, already in SI.
 
         Raises:

@@ -16,7 +16,7 @@ from typing import IO, Any
 from afspm import garbage
 from afspm.errors import AfspmError, FileError
 from afspm.scheduler.drift import pipe
-from afspm.scheduler.drift.settings import DriftSettings
+from afspm.scheduler.drift.settings import DriftCompensationSettings
 
 
 def main() -> int:
@@ -45,10 +45,10 @@ class _Worker:
     """Answers what it is asked, one after the other."""
 
     def __init__(self, settings: dict[str, Any], answers: IO[bytes]) -> None:
-        from afspm.scheduler.drift.store import Store
+        from afspm.scheduler.drift.worker_state import WorkerStateFile
 
-        self._drift = DriftSettings.from_table(settings["drift"])
-        self._store = Store(Path(settings["file"]) if settings["file"] else None)
+        self._drift = DriftCompensationSettings.from_table(settings["drift"])
+        self._store = WorkerStateFile(Path(settings["file"]) if settings["file"] else None)
         self._answers = answers
         self._scheduler = os.getppid()
         self._told_full = False

@@ -16,7 +16,7 @@ from afspm.addresses import connectable
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
-from afspm.logic.telling import LOGGED_AS
+from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.microscopes import Microscope
 from afspm.model import Frame
 from afspm.record.facts import STATE_DIR

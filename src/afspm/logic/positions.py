@@ -1,0 +1,146 @@
+"""Where the scan and the probe are, in tip coordinates, and the parameters that are a part of that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import asdict, replace
+from typing import Any
+
+from afspm.errors import InvalidValue
+from afspm.model import PositionChange, ProbePosition, Region, RegionChange, ScanParameters, ShapeChange, names
+from afspm.model.geometry import XY
+
+SHAPE_CHANGES: dict[str, Callable[[int], ShapeChange]] = {
+    names.SCAN_RESOLUTION_X: lambda value: ShapeChange(columns=value),
+    names.SCAN_RESOLUTION_Y: lambda value: ShapeChange(rows=value),
+}
+PROBE_CHANGES: dict[str, Callable[[float], PositionChange]] = {
+    names.PROBE_POS_X: lambda value: PositionChange(x_m=value),
+    names.PROBE_POS_Y: lambda value: PositionChange(y_m=value),
+}
+REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
+    names.SCAN_TOP_LEFT_X: lambda value: RegionChange(left_m=value),
+    names.SCAN_TOP_LEFT_Y: lambda value: RegionChange(low_m=value),
+    names.SCAN_SIZE_X: lambda value: RegionChange(width_m=value),
+    names.SCAN_SIZE_Y: lambda value: RegionChange(height_m=value),
+    names.SCAN_ANGLE: lambda value: RegionChange(angle_rad=value),
+}
+
+
+class KnownPosition:
+    """What is known of it, from what was set and what is published.
+
+    Attributes:
+        scan: the region and shape; None in it, or a part of one: not known.
+        probe: the probe position, m; None: not known.
+    """
+
+    def __init__(self) -> None:
+        self.scan = ScanParameters()
+        self.probe: XY | None = None
+
+    @property
+    def region(self) -> Region | None:
+        """Where the scan is; None: not known."""
+        return self.scan.region if isinstance(self.scan.region, Region) else None
+
+    @property
+    def shape(self) -> tuple[int, int] | None:
+        """Its pixels as (rows, columns); None: not known."""
+        return self.scan.shape if isinstance(self.scan.shape, tuple) else None
+
+    def is_at(self, subject: object) -> None:
+        """What was set, or told."""
+        if isinstance(subject, ScanParameters):
+            with suppress(InvalidValue):  # a part of a region that is not known yet
+                self.scan = subject.onto(self.scan)
+        elif isinstance(subject, ProbePosition):
+            self.probe = subject.xy_m
+        elif isinstance(subject, PositionChange) and self.probe is not None:
+            self.probe = moved(self.probe, subject)
+
+    def has_values(self, values: Iterable[tuple[str, float]]) -> None:
+        """Single parameters, by their names, in SI; what is no place is not learned."""
+        with suppress(InvalidValue):
+            for change in changes_by(values):
+                self.is_at(change)
+
+    def snapshot(self) -> dict[str, Any]:
+        """As plain JSON."""
+        region, shape = self.region, self.shape
+        return {
+            "region": None if region is None else [*region.center_m, *region.size_m, region.angle_rad],
+            "shape": None if shape is None else list(shape),
+            "probe": None if self.probe is None else list(self.probe),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take up what `snapshot` wrote."""
+        region, shape, probe = state["region"], state["shape"], state["probe"]
+        if region is not None:
+            x, y, width, height, angle = map(float, region)
+            self.scan = ScanParameters(Region((x, y), (width, height), angle))
+        if shape is not None:
+            self.scan = replace(self.scan, shape=(int(shape[0]), int(shape[1])))
+        if probe is not None:
+            self.probe = (float(probe[0]), float(probe[1]))
+
+
+def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | ScanParameters]:
+    """How single parameters, set together, move the probe and the scan.
+
+    Raises:
+        InvalidValue: a number of pixels that is none.
+    """
+    given: dict[type, dict[str, Any]] = {}
+    for name, value in values:
+        change: PositionChange | RegionChange | ShapeChange
+        if name in SHAPE_CHANGES:
+            if value < 1 or value != int(value):
+                raise InvalidValue(f"{name} = {value:g}: pixels are counted from 1 in whole numbers")
+            change = SHAPE_CHANGES[name](int(value))
+        elif name in PROBE_CHANGES:
+            change = PROBE_CHANGES[name](value)
+        elif name in REGION_CHANGES:
+            change = REGION_CHANGES[name](value)
+        else:
+            continue
+        parts = given.setdefault(type(change), {})
+        parts.update((part, one) for part, one in asdict(change).items() if one is not None)
+    found: list[PositionChange | ScanParameters] = []
+    if PositionChange in given:
+        found.append(PositionChange(**given[PositionChange]))
+    if RegionChange in given or ShapeChange in given:
+        region = RegionChange(**given[RegionChange]) if RegionChange in given else None
+        shape = ShapeChange(**given[ShapeChange]) if ShapeChange in given else None
+        found.append(ScanParameters(region, shape))
+    return found
+
+
+def moved(xy_m: XY, change: PositionChange) -> XY:
+    """Where the probe is after it was moved along one axis, or both."""
+    return (xy_m[0] if change.x_m is None else change.x_m, xy_m[1] if change.y_m is None else change.y_m)
+
+
+def scan_values(wanted: ScanParameters) -> list[tuple[str, float]]:
+    """The parameters that a request for a scan sets, with their values in SI."""
+    region, values = wanted.region, list[tuple[str, float]]()
+    if isinstance(region, Region):
+        (left, low), (width, height) = region.top_left_m, region.size_m
+        region = RegionChange(left, low, width, height, region.angle_rad)
+    if region is not None:
+        given = (
+            (names.SCAN_TOP_LEFT_X, region.left_m),
+            (names.SCAN_TOP_LEFT_Y, region.low_m),
+            (names.SCAN_SIZE_X, region.width_m),
+            (names.SCAN_SIZE_Y, region.height_m),
+            (names.SCAN_ANGLE, region.angle_rad),
+        )
+        values += [(name, value) for name, value in given if value is not None]
+    shape = wanted.shape
+    if shape is not None:
+        change = shape if isinstance(shape, ShapeChange) else ShapeChange(*shape)
+        pixels = ((names.SCAN_RESOLUTION_X, change.columns), (names.SCAN_RESOLUTION_Y, change.rows))
+        values += [(name, value) for name, value in pixels if value is not None]
+    return values

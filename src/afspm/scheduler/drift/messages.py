@@ -1,0 +1,131 @@
+"""What is told of drift: to and from the worker, and to the components."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from afspm.drift.mapping import Mapping
+from afspm.model import Region, RescanKind, Scan
+from afspm.scheduler.drift.positions import PlaceCodec
+
+Matrix = list[list[float]]
+
+
+@dataclass(frozen=True)
+class Registered:
+    """What came of a scan.
+
+    Attributes:
+        key: of the scan.
+        time_s: its middle, experiment time.
+        matrix: 3 x 3, of the mapping then.
+        covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`.
+        matched, lost, reason: see `drift.tracking.Update`.
+        residual_m: (x, y) by which the sample was found elsewhere than predicted.
+        references: keys of the scans that it was compared with.
+        rescan: why it should be taken again; empty if not.
+        forecast: of what is known now, for `forecast_from_dict`.
+    """
+
+    key: str
+    time_s: float
+    matrix: Matrix
+    covariance_m2: Matrix
+    rate_m_s: list[float]
+    rate_covariance: Matrix
+    matched: bool
+    lost: bool
+    reason: str
+    residual_m: list[float]
+    references: list[str]
+    rescan: str
+    forecast: dict[str, Any]
+
+    @property
+    def mapping(self) -> Mapping:
+        return Mapping(self.matrix)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Forecasted:
+    """The worker is there, or knows something new without a scan."""
+
+    forecast: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class NotRegistered:
+    """A scan could not be looked at at all."""
+
+    key: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class WorkerGone:
+    """The worker has ended."""
+
+    reason: str
+
+
+WorkerSaid = Registered | Forecasted | NotRegistered | WorkerGone
+
+
+@dataclass(frozen=True)
+class ScanJob:
+    """A scan to be registered; its region is in tip coordinates.
+
+    Attributes:
+        start_s, end_s: experiment time.
+        upwards: direction of the slow axis; None: not known.
+        asked: the region that was meant, in sample coordinates; None: not known.
+    """
+
+    key: str
+    scan: Scan
+    start_s: float
+    end_s: float
+    upwards: bool | None
+    asked: Region | None
+
+
+class Worker(Protocol):
+    """The process that registers scans, as far as decisions need it. What it says comes later, as an input."""
+
+    def start(self) -> None:
+        """Begin, or begin anew: whatever it was at is forgotten."""
+
+    def register(self, job: ScanJob) -> None:
+        """Register a scan, which the worker may have registered already."""
+
+    def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
+        """From that time on the controller moves the tip along with this velocity."""
+
+
+@dataclass(frozen=True)
+class RescanWanted:
+    """What the Rescanner is asked for.
+
+    Attributes:
+        said: the ScanParameters2d of the region, in the coordinates of components.
+        shape: (rows, columns); None: what is set.
+        upwards: the direction wanted; None: any.
+    """
+
+    kind: RescanKind
+    said: bytes
+    shape: tuple[int, int] | None
+    reason: str
+    time_ns: int
+    upwards: bool | None = None
+
+
+class DriftCodec(PlaceCodec, Protocol):
+    """The wire as far as drift compensation needs it."""
+
+    def encode_mapping(self, registered: Registered, scan: ScanJob, *, correcting: bool) -> bytes:
+        """A DriftMapping as the payload of a packet."""
+
+    def encode_rescan(self, wanted: RescanWanted) -> bytes:
+        """A DriftRescan as the payload of a packet."""

@@ -1,0 +1,92 @@
+"""What is in force at the microscope, in both coordinates: what was asked for, and what it was set to."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+from afspm.logic.events import Codec
+from afspm.model import ProbePosition, Region
+
+P = TypeVar("P", bound=Region | ProbePosition)
+
+SAME = 1e-3
+"""Part of a region's size by which a controller may round: what it tells then is what it was set to."""
+SAME_PLACE_M = 1e-9
+
+_CANDIDATES = 8
+
+
+class PlaceCodec(Codec, Protocol):
+    """The wire as far as places matter."""
+
+    def encode(self, thing: Any) -> bytes:
+        """A ScanParameters or ProbePosition as a message."""
+
+    def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
+        """A message with the place of another: of a ScanParameters2d (for scans too), or of a ProbePosition."""
+
+
+@dataclass(frozen=True)
+class PositionPair(Generic[P]):
+    """A place in both coordinates.
+
+    Attributes:
+        sample: as components say it.
+        said: the message in which they said it, to the last bit.
+        tip: as the microscope was set.
+        sent: the message by which it was.
+    """
+
+    sample: P
+    said: bytes
+    tip: P
+    sent: bytes
+
+    def to_list(self) -> list[str]:
+        """As plain JSON."""
+        return [base64.b64encode(part).decode() for part in (self.said, self.sent)]
+
+
+class TargetPosition(Generic[P]):
+    """The place in force, and those that were lately sent: what is published may come before the answer to it."""
+
+    def __init__(self) -> None:
+        self.current: PositionPair[P] | None = None
+        self._sent: deque[PositionPair[P]] = deque(maxlen=_CANDIDATES)
+
+    def sending(self, place: PositionPair[P]) -> None:
+        """The microscope is going to be set to this."""
+        self._sent.append(place)
+
+    def was_set(self, sent: bytes) -> None:
+        """The microscope accepted it."""
+        self.current = next((place for place in reversed(self._sent) if place.sent == sent), self.current)
+
+    def told(self, tip: P) -> PositionPair[P] | None:
+        """The place that the microscope tells, if it is one that we set; it is in force from now on."""
+        known: list[PositionPair[P]] = [*self._sent] if self.current is None else [self.current, *self._sent]
+        near = [place for place in reversed(known) if is_same(place.tip, tip)]  # the newest first, of those as near
+        if not near:
+            return None
+        self.current = min(near, key=lambda place: away_m(place.tip, tip))
+        return self.current
+
+
+def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:
+    """The largest distance of two corners, or of two positions, m."""
+    if isinstance(a, Region) and isinstance(b, Region):
+        corners = zip(a.corners_m(), b.corners_m(), strict=True)
+        return max(math.dist(one, other) for one, other in corners)
+    assert isinstance(a, ProbePosition)
+    assert isinstance(b, ProbePosition)
+    return math.dist(a.xy_m, b.xy_m)
+
+
+def is_same(a: Region | ProbePosition, b: Region | ProbePosition) -> bool:
+    """Whether two places are one but for rounding."""
+    near_m = SAME * math.hypot(*a.size_m) if isinstance(a, Region) else SAME_PLACE_M
+    return away_m(a, b) <= near_m
