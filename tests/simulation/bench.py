@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from afspm.microscopes import in_force, simulator
-from afspm.microscopes.microscope import Microscope, action
-from afspm.microscopes.parameters import Value
+from afspm.microscopes import simulator
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator import settings
+from afspm.translator.driver import Driver, action
+from afspm.translator.parameters import Value
 
 CHANNELS = ("Height", "Phase")
 _KEPT = 16
@@ -26,7 +27,7 @@ _AT_FIRST: dict[str, Value] = {
 }
 
 
-class BenchMicroscope(Microscope):
+class BenchMicroscope(Driver):
     """Scans of 4 x 4 pixels, each with what it was taken with; no state outside of its memory.
 
     Args:
@@ -81,7 +82,7 @@ class BenchMicroscope(Microscope):
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         values: dict[str, Any]
         values, end_s = next((v, s) for number, v, s in self.memory["finished"] if f"scan-{number}" == result)
-        region, shape = in_force.frame(values)
+        region, shape = settings.frame(values)
         return [Scan(region, channel, "m", np.zeros(shape), round(end_s * 1e9), result) for channel in CHANNELS]
 
     @action(names.START_SCAN)

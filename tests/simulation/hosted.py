@@ -1,6 +1,6 @@
 """Real components and the real translator as simulated processes: their own code, in-memory ports, a folder for a disk.
 
-`HostedComponent` runs a `Component` as the host of `afspm.runtime` does, `HostedTranslator` a `Microscope` behind the
+`HostedComponent` runs a `Component` as the host of `afspm.runtime` does, `HostedTranslator` a `Driver` behind the
 real `Translator`. All of it speaks the real wire format.
 """
 
@@ -12,8 +12,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from afspm import wire
-from afspm.microscopes.microscope import Microscope
-from afspm.microscopes.translator import Translator
 from afspm.model import Packet, Request, Response
 from afspm.runtime.component import Component
 from afspm.runtime.host import MEASURED
@@ -21,6 +19,8 @@ from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.memory import Memory
 from afspm.runtime.process import Activity, Context
 from afspm.runtime.view import KEPT
+from afspm.translator.driver import Driver
+from afspm.translator.process import Translator
 from afspm.transport.history import Published
 from afspm.transport.port import (
     CaughtUp,
@@ -262,7 +262,7 @@ class MemoryPort:
 
 
 class HostedTranslator(HostedProcess):
-    """A `Microscope`, made anew for every life, behind the real `Translator`.
+    """A `Driver`, made anew for every life, behind the real `Translator`.
 
     Args:
         make: makes the microscope.
@@ -272,7 +272,7 @@ class HostedTranslator(HostedProcess):
     def __init__(
         self,
         timeline: Timeline,
-        make: Callable[[], Microscope],
+        make: Callable[[], Driver],
         folder: Path,
         *,
         dies_in_call: float = 0.0,

@@ -17,7 +17,7 @@ from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, Gathered
 from afspm.exit_codes import ExitCode
-from afspm.microscopes.emulated import Notice, notice_file
+from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.launching import open_port
 from afspm.transport.port import Killed
 from afspm.transport.wakeup import WakeUp
@@ -240,10 +240,12 @@ class Emulator(ABC):
         with ExitStack() as stack:
             launch, notice = context.launch, None
             if launch.state_dir:
-                notice = stack.enter_context(closing(Notice(notice_file(launch.state_dir, launch.name), launch.run)))
+                notice = stack.enter_context(
+                    closing(AddressNotice(notice_file(launch.state_dir, launch.name), launch.run))
+                )
             return self._run_telling(context, notice)
 
-    def _run_telling(self, context: Context, notice: Notice | None) -> int:
+    def _run_telling(self, context: Context, notice: AddressNotice | None) -> int:
         def listening(address: str) -> None:
             if address:
                 context.log.warning("SIMULATED: an emulated %s controller listens at %s", self.vendor, address)

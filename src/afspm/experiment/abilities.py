@@ -10,7 +10,7 @@ from afspm.errors import AfspmError
 from afspm.model import Parameter, names
 
 if TYPE_CHECKING:
-    from afspm.microscopes.parameters import ParameterTable
+    from afspm.translator.parameters import ParameterTable
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Abilities:
 
 
 def of_class(microscope: type, settings: Mapping[str, Any]) -> Abilities | None:
-    """The abilities of a `Microscope` class with these settings; None where the class does not tell."""
-    from afspm.microscopes.microscope import Microscope
+    """The abilities of a `Driver` class with these settings; None where the class does not tell."""
+    from afspm.translator.driver import Driver
 
-    if not issubclass(microscope, Microscope):
+    if not issubclass(microscope, Driver):
         return None
     marks = (getattr(getattr(microscope, name), "_afspm_action", None) for name in dir(microscope))
     added = settings.get("actions") or {}

@@ -18,7 +18,7 @@ from enum import Enum
 from pathlib import Path
 
 from afspm.addresses import ListeningAddress
-from afspm.microscopes.microscope import Microscope
+from afspm.translator.driver import Microscope
 from afspm.runtime.component import Component
 from afspm.units import Angle, Duration, Length, Voltage
 

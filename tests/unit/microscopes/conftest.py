@@ -15,8 +15,7 @@ import pytest
 from afspm import wire
 from afspm.errors import FileError, Refused
 from afspm.exit_codes import ExitCode
-from afspm.microscopes import Microscope, Value, action
-from afspm.microscopes.translator import Translator
+from afspm.microscopes import Driver, Value, action
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -30,6 +29,7 @@ from afspm.model import (
     names,
 )
 from afspm.runtime.memory import Memory
+from afspm.translator.process import Translator
 from afspm.transport.port import RequestReceived, Served
 
 TABLE = """
@@ -98,7 +98,7 @@ class FakePort:
     def close(self) -> None: ...
 
 
-class FakeMicroscope(Microscope):
+class FakeMicroscope(Driver):
     """A controller whose state, values and files are set by the test."""
 
     def __init__(self, **settings: Any) -> None:

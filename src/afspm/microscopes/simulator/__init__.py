@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from afspm.errors import AfspmError, ConfigError, Gathered, Refused
-from afspm.microscopes.microscope import Action, Microscope, action
-from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.microscopes.simulator import files
 from afspm.microscopes.simulator.faults import Fault, Faults
 from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
@@ -23,6 +21,8 @@ from afspm.simulation import World
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.settings import build
 from afspm.simulation.world_settings import read_settings
+from afspm.translator.driver import Action, Driver, action
+from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.units import Duration
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ _AT_FIRST: dict[str, Any] = {
 }
 
 
-class Simulator(Microscope):
+class Simulator(Driver):
     """The simulated microscope.
 
     Args:
@@ -293,7 +293,7 @@ class Simulator(Microscope):
     def run_process(self, context: Context) -> int:
         """Be the translator, with the faults that are not the controller's."""
         from afspm.microscopes.simulator.faulty import FaultyTranslator
-        from afspm.microscopes.translator import run_translator
+        from afspm.translator.process import run_translator
 
         return run_translator(self, context, FaultyTranslator)
 

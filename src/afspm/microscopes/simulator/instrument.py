@@ -19,14 +19,14 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.errors import AfspmError, FileError, Refused
-from afspm.microscopes.in_force import feedback, frame
-from afspm.microscopes.parameters import ParameterTable, Value
 from afspm.microscopes.simulator.faults import Faults
 from afspm.microscopes.simulator.files import Measured, encode_scan, encode_spectrum
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.record.whole import write_whole
 from afspm.simulation import SimulatedScan, World
+from afspm.translator.parameters import ParameterTable, Value
+from afspm.translator.settings import feedback, frame
 
 LISTED_RESULTS = 16
 

@@ -17,7 +17,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.microscopes import Microscope
+from afspm.microscopes import Driver
 from afspm.model import Frame
 from afspm.record.facts import STATE_DIR
 from afspm.runtime.component import Component
@@ -144,7 +144,7 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
         class_ = resolved.classes.get(translator.name)
         excused: Mapping[str, str] = {}
-        if isinstance(class_, type) and issubclass(class_, Microscope):
+        if isinstance(class_, type) and issubclass(class_, Driver):
             excused = class_.excused(support.controller)
         yield CheckSession(client, support, named, simulated, folder, options, excused, complaints)
 

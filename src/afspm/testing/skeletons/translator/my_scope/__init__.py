@@ -13,11 +13,11 @@ import numpy as np
 
 from afspm.clock import Clock
 from afspm.errors import FileError
-from afspm.microscopes import Microscope, Value, action
+from afspm.microscopes import Driver, Value, action
 from afspm.model import Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 
 
-class MyScope(Microscope):
+class MyScope(Driver):
     """The microscope behind the controller.
 
     Args:

@@ -11,7 +11,7 @@ from afspm.model import ControlResponse, Request, Response
 CAPACITY = 300
 
 
-class Ledger:
+class RequestOutcomes:
     """The outcomes of the last requests that had an id.
 
     Args:

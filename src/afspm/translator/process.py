@@ -22,20 +22,20 @@ from afspm.logic.fencing import Epoch, SchedulerFence
 from afspm.logic.forwarder import NOT_SENT
 from afspm.logic.sessions import run_of
 from afspm.logic.watchdog import feedback_of
-from afspm.microscopes import in_force
-from afspm.microscopes.emulated import EmulatedController, wired_to
-from afspm.microscopes.ledger import Ledger
-from afspm.microscopes.live import LiveLines
-from afspm.microscopes.microscope import LOST, MEASURING, ControllerLost, Microscope
-from afspm.microscopes.outbox import Outbox
-from afspm.microscopes.pace import Pace
-from afspm.microscopes.parameters import Value
-from afspm.microscopes.sequence import Complain, Deliver, Discard, Say, Step
-from afspm.microscopes.sequence import Sequence as StateSequence
-from afspm.microscopes.service import Service
-from afspm.microscopes.sole import ControllerTaken, commanding
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus, names
 from afspm.runtime.memory import Memory
+from afspm.translator import settings
+from afspm.translator.controller_lock import ControllerTaken, commanding
+from afspm.translator.driver import LOST, MEASURING, ControllerLost, Driver
+from afspm.translator.emulated_controller import EmulatedController, wired_to
+from afspm.translator.live_lines import LiveLines
+from afspm.translator.outbox import Outbox
+from afspm.translator.outcomes import RequestOutcomes
+from afspm.translator.parameters import Value
+from afspm.translator.polling import AdaptivePolling
+from afspm.translator.requests import RequestHandler
+from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, SequenceStep
+from afspm.translator.sequence import StatusSequence as StateSequence
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Translator:
 
     def __init__(
         self,
-        microscope: Microscope,
+        microscope: Driver,
         port: ServerPort,
         memory: Memory,
         run_dir: Path,
@@ -95,14 +95,14 @@ class Translator:
         microscope.memory = memory.setdefault("microscope", {})
         self._kept: dict[str, Any] = memory.setdefault("translator", {"said": 0, "ledger": {}, "outbox": {}})
         said = ScopeStatus(ScopeState(self._kept["said"]))
-        self._sequence = StateSequence(said, 2 * microscope.patience_s(microscope.result_timeout_s / 2))
-        self._ledger = Ledger(self._kept["ledger"], all_or_nothing=microscope.memory_is_all)
+        self._sequence = StatusSequence(said, 2 * microscope.patience_s(microscope.result_timeout_s / 2))
+        self._ledger = RequestOutcomes(self._kept["ledger"], all_or_nothing=microscope.memory_is_all)
         self._outbox = Outbox(microscope, self._kept["outbox"], self._stamp, log)
-        self._service = Service(microscope, self._sequence, self._about_to_act, self._kept, self._save, log)
+        self._service = RequestHandler(microscope, self._sequence, self._about_to_act, self._kept, self._save, log)
         self._temporary = self._service.temporary
         self._values: dict[str, Value] = {}
         self._connected = self._started = self._told_lost = False
-        self._pace = Pace(microscope.poll_period_s, microscope.eager_poll_s)
+        self._pace = AdaptivePolling(microscope.poll_period_s, microscope.eager_poll_s)
         self._live = LiveLines(microscope)
         self._paced = ScopeState.UNDEFINED
         self._retry_at_s = self._all_at_s = 0.0
@@ -264,9 +264,9 @@ class Translator:
 
     def _observe_values(self, announce: Sequence[str]) -> None:
         values = self._read()
-        before = in_force.messages(self._values)
+        before = settings.messages(self._values)
         self._take_in(values)
-        for name, thing in in_force.messages(values).items():
+        for name, thing in settings.messages(values).items():
             if name in announce or before.get(name) != thing:
                 self._publish(thing)
         wait_s, next_s = self.microscope.poll_period_s, self.microscope.next_change_s()
@@ -280,7 +280,7 @@ class Translator:
         One that was begun since the last look, by this process or by one that was killed then.
         """
         self._values = values
-        is_on, kept = in_force.feedback(values).on, self._kept
+        is_on, kept = settings.feedback(values).on, self._kept
         switched_off = is_on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
         kept["feedback_off"] = is_on is False and (switched_off or bool(kept.get("feedback_off")))
         kept["feedback_was_on"], kept["may_have_switched"] = is_on, False
@@ -290,24 +290,24 @@ class Translator:
     def _read(self) -> dict[str, Value]:
         """What is in force; differences below the controller's precision are none."""
         table = self.microscope.table
-        values = self.microscope.in_force(in_force.watched(table))
+        values = self.microscope.in_force(settings.watched(table))
         old = self._values
         return {
             name: old[name] if name in old and table[name].same(old[name], value) else value
             for name, value in values.items()
         }
 
-    def _play(self, steps: Sequence[Step]) -> None:
+    def _play(self, steps: Sequence[SequenceStep]) -> None:
         for step in steps:
-            if isinstance(step, Say):
+            if isinstance(step, PublishStatus):
                 self._publish(step.status)
                 self._pace_for(step.status.state)
-            elif isinstance(step, Deliver):
+            elif isinstance(step, PublishResults):
                 self._deliver()
-            elif isinstance(step, Discard):
+            elif isinstance(step, DiscardResults):
                 self._outbox.discard()
                 self._save()
-            elif isinstance(step, Complain):
+            elif isinstance(step, LogError):
                 self._log.error("%s", step.text)
 
     def _pace_for(self, state: ScopeState) -> None:
@@ -327,7 +327,7 @@ class Translator:
 
     def _scan_s(self) -> tuple[float | None, tuple[Value, ...]]:
         """How long, in real seconds, the scan lasts if no time is lost at its edges, and what that depends on."""
-        what = tuple(self._values.get(name, 0.0) for name in in_force.EXTENT)
+        what = tuple(self._values.get(name, 0.0) for name in settings.EXTENT)
         with contextlib.suppress(*LOST, AfspmError, ArithmeticError):
             if all(what) and names.SCAN_SPEED in self.microscope.table:
                 speed_m_s = float(self.microscope.in_force([names.SCAN_SPEED])[names.SCAN_SPEED])
@@ -491,7 +491,7 @@ class Translator:
 
     def _publish_all(self) -> None:
         """Everything in force, for a scheduler that has just come."""
-        for thing in in_force.messages(self._values).values():
+        for thing in settings.messages(self._values).values():
             self._publish(thing)
         said = self._sequence.said
         if said.state is not ScopeState.UNDEFINED:
@@ -500,7 +500,7 @@ class Translator:
             self._paced = said.state
             self._pace.began(object(), self._clock.monotonic_s())
 
-    def _publish(self, thing: in_force.Published | ScopeStatus) -> None:
+    def _publish(self, thing: settings.Published | ScopeStatus) -> None:
         name, payload = wire.encode(thing)
         self._port.publish(name, payload, self._stamp(1)[0])
 
@@ -524,7 +524,7 @@ def _only_asks(request: Request) -> bool:
     return request.kind == ControlRequest.ACTION_SUPPORT
 
 
-def run_translator(microscope: Microscope, context: Context, make: Callable[..., Translator] = Translator) -> int:
+def run_translator(microscope: Driver, context: Context, make: Callable[..., Translator] = Translator) -> int:
     """What the host runs. While another run commands the controller, it is said which, and the process ends."""
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, microscope)
@@ -537,7 +537,7 @@ def run_translator(microscope: Microscope, context: Context, make: Callable[...,
         return _run_alone(microscope, context, partial(make, controller=controller))
 
 
-def _run_alone(microscope: Microscope, context: Context, make: Callable[..., Translator]) -> int:
+def _run_alone(microscope: Driver, context: Context, make: Callable[..., Translator]) -> int:
     """The sockets, the memory and the translator itself."""
     from afspm.transport.launching import open_server_port
 

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from afspm.errors import AfspmError
-from afspm.microscopes.microscope import Microscope
 from afspm.model import Scan, Spectrum
+from afspm.translator.driver import Driver
 from afspm.wire import encode
 
 KEPT_FOR_REPLAY = 8
@@ -38,7 +38,7 @@ class Outbox:
 
     def __init__(
         self,
-        microscope: Microscope,
+        microscope: Driver,
         kept: dict[str, Any],
         stamp: Callable[[int], list[int]],
         log: logging.Logger,

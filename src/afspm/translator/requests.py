@@ -13,13 +13,13 @@ from typing import Any
 
 from afspm import units
 from afspm.errors import AfspmError, ConfigError, Refused
-from afspm.microscopes.changes import asked_for, wanted_values
-from afspm.microscopes.in_force import FRAME, MOVES, check_together, of_message
-from afspm.microscopes.microscope import LOST, Action, Microscope
-from afspm.microscopes.parameters import ParameterTable, Value, refuse_value
-from afspm.microscopes.sequence import Sequence, Step
-from afspm.microscopes.temporary import Temporary, state_for
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
+from afspm.translator.driver import LOST, Action, Driver
+from afspm.translator.parameters import ParameterTable, Value, refuse_value
+from afspm.translator.sequence import SequenceStep, StatusSequence
+from afspm.translator.setters import asked_for, wanted_values
+from afspm.translator.settings import FRAME, MOVES, check_together, of_message
+from afspm.translator.temporary_settings import TemporarySettings, state_for
 from afspm.wire import encode
 
 _ANNOUNCED = {
@@ -41,11 +41,11 @@ class Answer:
     """
 
     response: Response
-    steps: list[Step] = field(default_factory=list)
+    steps: list[SequenceStep] = field(default_factory=list)
     announce: tuple[str, ...] = ()
 
 
-class Service:
+class RequestHandler:
     """Answers requests to one microscope.
 
     Args:
@@ -59,8 +59,8 @@ class Service:
 
     def __init__(
         self,
-        microscope: Microscope,
-        sequence: Sequence,
+        microscope: Driver,
+        sequence: StatusSequence,
         about_to_act: Callable[[Request], None],
         kept: dict[str, Any],
         save: Callable[[], None],
@@ -70,7 +70,7 @@ class Service:
         self._sequence = sequence
         self._about_to_act = about_to_act
         self._log = log
-        self.temporary = Temporary(microscope, kept, self._apply_unasked, save, log)
+        self.temporary = TemporarySettings(microscope, kept, self._apply_unasked, save, log)
         microscope.for_a_while = self.temporary.begin
         self.actions = microscope.own_actions() | self._added_actions(microscope.added_actions)
 

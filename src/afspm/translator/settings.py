@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from afspm.errors import InvalidValue, Refused
-from afspm.microscopes.parameters import FEEDBACK_ON, ParameterTable, Value, refuse_value
 from afspm.model import ControlResponse, Feedback, ProbePosition, Region, ScanParameters, names
+from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value, refuse_value
 
 Published = ScanParameters | Feedback | ProbePosition
 

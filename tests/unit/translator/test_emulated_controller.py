@@ -12,16 +12,16 @@ from typing import Any
 import pytest
 
 from afspm.errors import ConfigError
-from afspm.microscopes.emulated import EmulatedController, Notice, notice_file, wired_to
-from afspm.microscopes.microscope import ControllerLost
 from afspm.runtime.launch import Launch
+from afspm.translator.driver import ControllerLost
+from afspm.translator.emulated_controller import AddressNotice, EmulatedController, notice_file, wired_to
 
 RUN = "0123456789abcdef"
 TELLS = """
 import sys
 from pathlib import Path
-from afspm.microscopes.emulated import Notice
-notice = Notice(Path(sys.argv[1]), sys.argv[2])
+from afspm.translator.emulated_controller import AddressNotice
+notice = AddressNotice(Path(sys.argv[1]), sys.argv[2])
 notice.tell("127.0.0.1:1234")
 print("told", flush=True)
 sys.stdin.read()
@@ -50,8 +50,8 @@ def file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def notice(file: Path) -> Iterator[Notice]:
-    with closing(Notice(file, RUN)) as made:
+def notice(file: Path) -> Iterator[AddressNotice]:
+    with closing(AddressNotice(file, RUN)) as made:
         yield made
 
 
@@ -61,7 +61,7 @@ def reach(file: Path, vendor: Vendor, run: str = RUN) -> EmulatedController:
     return found
 
 
-def test_it_goes_where_the_emulator_tells_and_not_where_the_settings_say(file: Path, notice: Notice) -> None:
+def test_it_goes_where_the_emulator_tells_and_not_where_the_settings_say(file: Path, notice: AddressNotice) -> None:
     notice.tell("127.0.0.1:40001")
     vendor = Vendor()
     reach(file, vendor).prove()
@@ -72,7 +72,7 @@ def test_nothing_is_reached_before_the_emulator_listens(file: Path) -> None:
     vendor = Vendor()
     with pytest.raises(ControllerLost, match="not started"):
         reach(file, vendor)
-    with closing(Notice(file, RUN)), pytest.raises(ControllerLost, match="does not listen"):
+    with closing(AddressNotice(file, RUN)), pytest.raises(ControllerLost, match="does not listen"):
         reach(file, vendor)
     assert vendor.connected == []
 
@@ -95,7 +95,7 @@ def test_the_address_of_an_emulator_that_was_killed_is_worth_nothing(file: Path)
 
 def test_the_emulator_of_another_run_is_not_this_run_s(file: Path) -> None:
     vendor = Vendor()
-    with closing(Notice(file, "another")) as notice:
+    with closing(AddressNotice(file, "another")) as notice:
         notice.tell("127.0.0.1:40001")
         with pytest.raises(ControllerLost, match="another run"):
             reach(file, vendor)
@@ -103,7 +103,7 @@ def test_the_emulator_of_another_run_is_not_this_run_s(file: Path) -> None:
 
 
 def test_one_that_has_let_go_of_its_address_proves_nothing_until_it_is_reached_again(
-    file: Path, notice: Notice
+    file: Path, notice: AddressNotice
 ) -> None:
     notice.tell("127.0.0.1:40001")
     reached = reach(file, Vendor())
@@ -115,7 +115,7 @@ def test_one_that_has_let_go_of_its_address_proves_nothing_until_it_is_reached_a
         reached.prove()
 
 
-def test_a_connection_that_was_made_while_the_emulator_changed_is_closed(file: Path, notice: Notice) -> None:
+def test_a_connection_that_was_made_while_the_emulator_changed_is_closed(file: Path, notice: AddressNotice) -> None:
     notice.tell("127.0.0.1:40001")
     vendor = Vendor()
     vendor.at_connect = lambda: notice.tell("127.0.0.1:40002")

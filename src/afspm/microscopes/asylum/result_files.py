@@ -12,16 +12,8 @@ from typing import Any, Final
 
 from afspm.errors import AfspmError, FileError
 from afspm.files import read
-from afspm.microscopes.measurements import (
-    SCAN,
-    Content,
-    Measurements,
-    as_set,
-    lines_missing,
-    modified_ns,
-    region_of,
-)
 from afspm.model import Scan, Spectrum
+from afspm.translator.result_files import SCAN, Content, ResultFiles, as_set, lines_missing, modified_ns, region_of
 
 _PRINTED: Final = 1e-4
 """Relative: what a note has of a number, of which it prints five digits."""
@@ -46,7 +38,7 @@ class Target:
         return self.folder / f"{self.base}{self.suffix:04d}.ibw"
 
 
-class Harvest(Measurements):
+class AsylumFiles(ResultFiles):
     """The measurement that is running or has just ended, and the results."""
 
     def __init__(self, kept: dict[str, Any], log: logging.Logger) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from afspm.clock import NS_PER_S
-from afspm.microscopes.microscope import Microscope
+from afspm.translator.driver import Driver
 from afspm.wire import encode
 
 
@@ -16,7 +16,7 @@ class LiveLines:
         microscope: its `live_lines_s` says how often it is asked for lines; None: never.
     """
 
-    def __init__(self, microscope: Microscope) -> None:
+    def __init__(self, microscope: Driver) -> None:
         self._microscope = microscope
         self._every_s = microscope.live_lines_s
         self._began_ns = 0

@@ -15,11 +15,11 @@ from typing import IO, TYPE_CHECKING
 
 from afspm.errors import ConfigError
 from afspm.file_lock import lock
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 if TYPE_CHECKING:
-    from afspm.microscopes.microscope import Microscope
     from afspm.runtime.launch import Launch
+    from afspm.translator.driver import Driver
 
 _LOCKED_BYTES = 1
 """Windows lets nobody read what is locked: the text begins behind it."""
@@ -39,7 +39,7 @@ class Listening:
     life: str
 
 
-class Notice:
+class AddressNotice:
     """Tells, as long as this process lives, where its emulated controller listens. Made by the emulator.
 
     Args:
@@ -78,11 +78,11 @@ class EmulatedController:
         self._name, self._file, self._run = name, file, run
         self._reached: Listening | None = None
 
-    def reach(self, microscope: Microscope) -> None:
+    def reach(self, microscope: Driver) -> None:
         """Connect to this run's emulator, or to nobody.
 
         Raises:
-            ControllerLost: the emulator does not listen. And whatever `Microscope.connect` raises.
+            ControllerLost: the emulator does not listen. And whatever `Driver.connect` raises.
         """
         found = self._reached = self._find()
         microscope.controller_at, microscope.prove = found.address, self.prove
@@ -127,7 +127,7 @@ def notice_file(state_dir: str, name: str) -> Path:
     return Path(state_dir) / f"{name}.controller"
 
 
-def wired_to(launch: Launch, microscope: Microscope) -> EmulatedController | None:
+def wired_to(launch: Launch, microscope: Driver) -> EmulatedController | None:
     """The emulator that a translator may talk to; None: the controller in its settings, or none at all.
 
     Raises:

@@ -13,8 +13,8 @@ from typing import Final
 from google.protobuf.message import DecodeError, Message
 
 from afspm.errors import Refused
-from afspm.microscopes.parameters import FEEDBACK_ON, ParameterSpec, ParameterTable, Value
 from afspm.model import ControlRequest, ControlResponse, names
+from afspm.translator.parameters import FEEDBACK_ON, ParameterSpec, ParameterTable, Value
 from afspm.wire.convert import shortest
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
@@ -22,7 +22,7 @@ _ANY: Final = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
-class Asked:
+class AskedValue:
     """One value as the peer gave it; a text is parsed by the parameter's own type."""
 
     name: str
@@ -30,7 +30,7 @@ class Asked:
     unit: str | None
 
 
-def _scan_parameters(message: scan_pb2.ScanParameters2d) -> Iterator[Asked]:
+def _scan_parameters(message: scan_pb2.ScanParameters2d) -> Iterator[AskedValue]:
     spatial, roi, shape = message.spatial, message.spatial.roi, message.data.shape
     length, angle = spatial.length_units or None, spatial.angular_units or None
     for name, part, axis, unit in (
@@ -43,10 +43,10 @@ def _scan_parameters(message: scan_pb2.ScanParameters2d) -> Iterator[Asked]:
         (names.SCAN_RESOLUTION_Y, shape, "y", None),
     ):
         if part.HasField(axis):
-            yield Asked(name, getattr(part, axis), unit)
+            yield AskedValue(name, getattr(part, axis), unit)
 
 
-def _feedback(message: feedback_pb2.ZCtrlParameters) -> Iterator[Asked]:
+def _feedback(message: feedback_pb2.ZCtrlParameters) -> Iterator[AskedValue]:
     for name, field in (
         (FEEDBACK_ON, "feedbackOn"),
         (names.ZCTRL_PGAIN, "proportionalGain"),
@@ -55,18 +55,18 @@ def _feedback(message: feedback_pb2.ZCtrlParameters) -> Iterator[Asked]:
     ):
         if message.HasField(field):
             value = getattr(message, field)
-            yield Asked(name, value if isinstance(value, bool) else shortest(value), None)
+            yield AskedValue(name, value if isinstance(value, bool) else shortest(value), None)
 
 
-def _probe_position(message: spectroscopy_pb2.ProbePosition) -> Iterator[Asked]:
+def _probe_position(message: spectroscopy_pb2.ProbePosition) -> Iterator[AskedValue]:
     for name, axis in ((names.PROBE_POS_X, "x"), (names.PROBE_POS_Y, "y")):
         if message.point.HasField(axis):
-            yield Asked(name, getattr(message.point, axis), message.units or None)
+            yield AskedValue(name, getattr(message.point, axis), message.units or None)
 
 
-def _parameter(message: control_pb2.ParameterMsg) -> Iterator[Asked]:
+def _parameter(message: control_pb2.ParameterMsg) -> Iterator[AskedValue]:
     if message.HasField("value"):
-        yield Asked(message.parameter, message.value, message.units or None)
+        yield AskedValue(message.parameter, message.value, message.units or None)
 
 
 _READERS = {
@@ -77,7 +77,7 @@ _READERS = {
 }
 
 
-def asked_for(kind: int, payload: bytes) -> list[Asked]:
+def asked_for(kind: int, payload: bytes) -> list[AskedValue]:
     """What a request to set something asks for; empty if it only gets.
 
     Raises:
@@ -94,7 +94,7 @@ def asked_for(kind: int, payload: bytes) -> list[Asked]:
 
 
 def wanted_values(
-    asked: list[Asked], table: ParameterTable, is_in_force: Callable[[str, Value], bool]
+    asked: list[AskedValue], table: ParameterTable, is_in_force: Callable[[str, Value], bool]
 ) -> dict[str, Value]:
     """Return what is asked for in SI, each value checked by itself.
 
@@ -116,7 +116,7 @@ def wanted_values(
     return values
 
 
-def _value(one: Asked, spec: ParameterSpec) -> Value:
+def _value(one: AskedValue, spec: ParameterSpec) -> Value:
     if isinstance(one.value, str):
         return spec.parse(one.value, one.unit)
     return spec.checked(one.value if isinstance(one.value, bool) else spec.from_unit(one.value, one.unit))

@@ -20,7 +20,7 @@ _REMEMBERED = 64
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedEnd:
     """When something that began at `began_s` should end, and how sure that is; None: nothing is known of it."""
 
     began_s: float
@@ -28,7 +28,7 @@ class Expected:
     doubt_s: float = 0.0
 
 
-class Pace:
+class AdaptivePolling:
     """Learns how long measurements take, and says when to look next. All times are real seconds.
 
     Args:
@@ -42,7 +42,7 @@ class Pace:
         self._lasted_s: OrderedDict[Hashable, float] = OrderedDict()
         self._ratio: float | None = None
         self._measuring: tuple[Hashable, float | None] | None = None
-        self._expected: Expected | None = None
+        self._expected: ExpectedEnd | None = None
         self._over_s: float | None = None
 
     def began(self, what: Hashable, now_s: float, guess_s: float | None = None) -> None:
@@ -52,20 +52,20 @@ class Pace:
         if lasts_s is None and guess_s is not None:
             lasts_s, doubt = guess_s * (self._ratio or 1.0), _GUESSED if self._ratio is None else _BY_OTHERS
         if lasts_s is None:
-            self._expected = Expected(now_s)
+            self._expected = ExpectedEnd(now_s)
         else:
-            self._expected = Expected(now_s, now_s + lasts_s, max(_LEAST_DOUBT_S, doubt * lasts_s))
+            self._expected = ExpectedEnd(now_s, now_s + lasts_s, max(_LEAST_DOUBT_S, doubt * lasts_s))
 
     def moved(self, now_s: float) -> None:
         """Something else began that should not take long."""
         self._measuring = None
-        self._expected = Expected(now_s, now_s)
+        self._expected = ExpectedEnd(now_s, now_s)
 
     def over(self, now_s: float) -> None:
         """The controller has ended the measurement; what came of it may take a moment to be there."""
         if self._over_s is None and self._expected is not None:
             self._over_s = now_s
-            self._expected = Expected(self._expected.began_s, now_s)
+            self._expected = ExpectedEnd(self._expected.began_s, now_s)
 
     def ended(self, now_s: float, *, as_expected: bool) -> None:
         """All is done; what was broken off is nothing to learn from."""

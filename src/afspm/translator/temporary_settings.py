@@ -10,15 +10,15 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from afspm.microscopes.in_force import MOVES
-from afspm.microscopes.microscope import LOST, Microscope
-from afspm.microscopes.parameters import Value
 from afspm.model import ScopeState, ScopeStatus
+from afspm.translator.driver import LOST, Driver
+from afspm.translator.parameters import Value
+from afspm.translator.settings import MOVES
 
 _KEY = "temporary"
 
 
-class Temporary:
+class TemporarySettings:
     """What is in force for a while, if anything is.
 
     Args:
@@ -29,7 +29,7 @@ class Temporary:
 
     def __init__(
         self,
-        microscope: Microscope,
+        microscope: Driver,
         kept: dict[str, Any],
         apply: Callable[[Mapping[str, Value]], None],
         save: Callable[[], None],

@@ -23,7 +23,7 @@ _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
 Content = list[Scan | Spectrum]
 
 
-class Measurements:
+class ResultFiles:
     """To be derived from by what knows one controller's files.
 
     Args:

@@ -15,19 +15,19 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.exit_codes import ExitCode
-from afspm.microscopes import sole
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
 from afspm.microscopes.simulator import Simulator
-from afspm.microscopes.sole import ControllerTaken, commanding
-from afspm.microscopes.translator import run_translator
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.process import Activity, Context
+from afspm.translator import controller_lock
+from afspm.translator.controller_lock import ControllerTaken, commanding
+from afspm.translator.process import run_translator
 
 DIES_HOLDING = """
 import os, sys
-from afspm.microscopes.sole import commanding
+from afspm.translator.controller_lock import commanding
 with commanding(sys.argv[1], "runs/the-dead"):
     os._exit(1)
 """
@@ -60,7 +60,7 @@ def test_nothing_is_left_behind_and_nobody_holds_what_has_been_removed(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[Path] = []
-    locked = sole.lock
+    locked = controller_lock.lock
 
     def lock_too_late(file: BinaryIO) -> None:
         """Whoever had it removes it just after it was opened."""
@@ -69,7 +69,7 @@ def test_nothing_is_left_behind_and_nobody_holds_what_has_been_removed(
             opened[0].unlink()
         locked(file)
 
-    monkeypatch.setattr(sole, "lock", lock_too_late)
+    monkeypatch.setattr(controller_lock, "lock", lock_too_late)
     with commanding("lab:1", "a"), pytest.raises(ControllerTaken, match="commanded by a"), commanding("lab:1", "b"):
         pass
     assert opened
@@ -125,7 +125,7 @@ def test_the_lock_of_another_user_holds_too(tmp_path: Path, folder: Path) -> Non
     with commanding("lab:1", "a"):
         pass
     code = f"import os, tempfile; tempfile.tempdir = {str(tmp_path)!r}\n"
-    code += "from afspm.microscopes.sole import commanding\nimport fcntl; os.setuid(65534)\n"
+    code += "from afspm.translator.controller_lock import commanding\nimport fcntl; os.setuid(65534)\n"
     code += "with commanding('lab:1', 'runs/of-nobody'): print('has it', flush=True); input()"
     other = subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"

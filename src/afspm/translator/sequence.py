@@ -9,40 +9,40 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from afspm.microscopes.microscope import MEASURING
 from afspm.model import ScopeState, ScopeStatus
+from afspm.translator.driver import MEASURING
 
 
 @dataclass(frozen=True)
-class Say:
+class PublishStatus:
     """Publish this status."""
 
     status: ScopeStatus
 
 
 @dataclass(frozen=True)
-class Deliver:
+class PublishResults:
     """Publish the results that have come."""
 
 
 @dataclass(frozen=True)
-class Discard:
+class DiscardResults:
     """The results that have come, if any, are of something broken off: they are not published."""
 
 
 @dataclass(frozen=True)
-class Complain:
+class LogError:
     """Something that should not be: into the log."""
 
     text: str
 
 
-Step = Say | Deliver | Discard | Complain
+SequenceStep = PublishStatus | PublishResults | DiscardResults | LogError
 
 _INTERRUPTED = ScopeStatus(ScopeState.INTERRUPTED)
 
 
-class Sequence:
+class StatusSequence:
     """Turns what is seen at the controller into what is published.
 
     Args:
@@ -56,15 +56,15 @@ class Sequence:
         self._waiting_since_s: float | None = None
         self._broken_off = ScopeState.UNDEFINED
 
-    def begin(self, state: ScopeState) -> list[Step]:
+    def begin(self, state: ScopeState) -> list[SequenceStep]:
         """A request was accepted that leads to `state`, seen at the controller already or not."""
         return self._say(ScopeStatus(state))
 
-    def interrupt(self) -> list[Step]:
+    def interrupt(self) -> list[SequenceStep]:
         """What is running was told to stop."""
         return self._say(_INTERRUPTED)
 
-    def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[Step]:
+    def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
         """The controller was looked at.
 
         Args:
@@ -82,33 +82,33 @@ class Sequence:
             return (self._unseen(results) if seen.state is ScopeState.FREE else []) + self._say(seen)
         return self._after_measuring(seen, results, now_s)
 
-    def _unseen(self, results: bool) -> list[Step]:
+    def _unseen(self, results: bool) -> list[SequenceStep]:
         """Someone at the controller's panel took a scan between two looks at it."""
         if not results or self.said.state is ScopeState.UNDEFINED:
             return []
         after = self.said
-        return [*self._say(ScopeStatus(ScopeState.SCANNING)), Deliver(), *self._say(after)]
+        return [*self._say(ScopeStatus(ScopeState.SCANNING)), PublishResults(), *self._say(after)]
 
-    def _after_measuring(self, seen: ScopeStatus, results: bool, now_s: float) -> list[Step]:
+    def _after_measuring(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
         if seen.state is ScopeState.INTERRUPTED:
             return self._say(seen)
         if results:
-            return [Deliver(), *self._say(seen)]
+            return [PublishResults(), *self._say(seen)]
         if not self._timed_out(now_s):
             return []
         text = "a scan or spectrum ended without a result: it was stopped at the controller, or its file is missing"
-        return [Complain(text), *self._say(_INTERRUPTED), Discard(), *self._say(seen)]
+        return [LogError(text), *self._say(_INTERRUPTED), DiscardResults(), *self._say(seen)]
 
-    def _after_interruption(self, seen: ScopeStatus, now_s: float) -> list[Step]:
+    def _after_interruption(self, seen: ScopeStatus, now_s: float) -> list[SequenceStep]:
         if seen.state is ScopeState.INTERRUPTED:
             return []
         if seen.state not in MEASURING:
-            return [Discard(), *self._say(seen)]
+            return [DiscardResults(), *self._say(seen)]
         if self._broken_off in MEASURING and seen.state is not self._broken_off:
-            return [Discard(), *self._say(seen)]  # of the other kind: somebody began it
+            return [DiscardResults(), *self._say(seen)]  # of the other kind: somebody began it
         if not self._timed_out(now_s):
             return []
-        return [Complain("the controller goes on in spite of being stopped"), *self._say(seen)]
+        return [LogError("the controller goes on in spite of being stopped"), *self._say(seen)]
 
     def _timed_out(self, now_s: float) -> bool:
         if self._waiting_since_s is None:
@@ -119,11 +119,11 @@ class Sequence:
         """When `observe` should be called again at the latest, experiment time."""
         return None if self._waiting_since_s is None else self._waiting_since_s + self._timeout_s
 
-    def _say(self, status: ScopeStatus) -> list[Step]:
+    def _say(self, status: ScopeStatus) -> list[SequenceStep]:
         self._waiting_since_s = None
         if status == self.said:
             return []
         if status == _INTERRUPTED:
             self._broken_off = self.said.state
         self.said = status
-        return [Say(status)]
+        return [PublishStatus(status)]

@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import pytest
 
-from afspm.microscopes.pace import EAGER_S, Pace
+from afspm.translator.polling import EAGER_S, AdaptivePolling
 
 IDLE_S = 0.25
 
 
-def looks(pace: Pace, began_s: float, end_s: float) -> tuple[int, float]:
+def looks(pace: AdaptivePolling, began_s: float, end_s: float) -> tuple[int, float]:
     """How often the controller is looked at while it measures, and how late the end is noticed."""
     now_s, count = began_s, 0
     while now_s < end_s:
@@ -21,12 +21,12 @@ def looks(pace: Pace, began_s: float, end_s: float) -> tuple[int, float]:
 
 
 def test_at_rest_it_is_looked_at_seldom() -> None:
-    assert Pace(IDLE_S).wait_s(5.0) == IDLE_S
+    assert AdaptivePolling(IDLE_S).wait_s(5.0) == IDLE_S
 
 
 @pytest.mark.parametrize("error_s", [-0.3, -0.04, 0.0, 0.04, 0.3])
 def test_the_second_scan_of_a_kind_is_noticed_at_once_for_few_looks(error_s: float) -> None:
-    pace = Pace(IDLE_S)
+    pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     pace.ended(100.0, as_expected=True)
     pace.began("a", 200.0)
@@ -36,7 +36,7 @@ def test_the_second_scan_of_a_kind_is_noticed_at_once_for_few_looks(error_s: flo
 
 
 def test_another_frame_is_expected_by_what_its_settings_say_and_by_how_wrong_that_was() -> None:
-    pace = Pace(IDLE_S)
+    pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0, guess_s=100.0)
     pace.ended(125.0, as_expected=True)  # this controller turns round slowly
     pace.began("b", 200.0, guess_s=40.0)
@@ -47,20 +47,20 @@ def test_another_frame_is_expected_by_what_its_settings_say_and_by_how_wrong_tha
 
 @pytest.mark.parametrize("lasts_s", [70.0, 100.0, 130.0])
 def test_the_first_is_looked_at_eagerly_as_long_as_the_guess_may_be_wrong(lasts_s: float) -> None:
-    pace = Pace(IDLE_S)
+    pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0, guess_s=100.0)
     assert pace.wait_s(1.0) == IDLE_S
     assert looks(pace, 0.0, lasts_s)[1] <= EAGER_S + 1e-9
 
 
 def test_what_nothing_is_known_of_is_looked_at_eagerly() -> None:
-    pace = Pace(IDLE_S)
+    pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     assert {pace.wait_s(t_s) for t_s in (0.0, 10.0, 1000.0)} == {EAGER_S}
 
 
 def test_what_takes_far_longer_than_expected_is_looked_at_less_and_less() -> None:
-    pace = Pace(IDLE_S)
+    pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     pace.ended(10.0, as_expected=True)
     pace.began("a", 20.0)
@@ -70,7 +70,7 @@ def test_what_takes_far_longer_than_expected_is_looked_at_less_and_less() -> Non
 
 
 def test_what_was_broken_off_teaches_nothing() -> None:
-    pace = Pace(IDLE_S)
+    pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     pace.ended(1.0, as_expected=False)
     pace.began("a", 10.0)
@@ -78,7 +78,7 @@ def test_what_was_broken_off_teaches_nothing() -> None:
 
 
 def test_a_file_that_comes_late_is_waited_for_eagerly_and_makes_no_scan_longer() -> None:
-    pace = Pace(IDLE_S)
+    pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     pace.over(100.0)
     assert [pace.wait_s(t_s) for t_s in (100.0, 110.0)] == [EAGER_S, IDLE_S]
@@ -90,7 +90,7 @@ def test_a_file_that_comes_late_is_waited_for_eagerly_and_makes_no_scan_longer()
 
 
 def test_a_move_is_looked_at_eagerly_at_first() -> None:
-    pace = Pace(IDLE_S)
+    pace = AdaptivePolling(IDLE_S)
     pace.moved(10.0)
     assert [pace.wait_s(t_s) for t_s in (10.0, 11.0, 20.0)] == [EAGER_S, pytest.approx(0.1), IDLE_S]
     pace.ended(12.0, as_expected=True)
@@ -98,7 +98,7 @@ def test_a_move_is_looked_at_eagerly_at_first() -> None:
 
 
 @pytest.mark.parametrize("change", [lambda pace: pace.began("a", 0.0), lambda pace: pace.moved(0.0)])
-def test_it_is_never_more_eager_than_the_period_that_was_set(change: Callable[[Pace], None]) -> None:
-    pace = Pace(0.001)
+def test_it_is_never_more_eager_than_the_period_that_was_set(change: Callable[[AdaptivePolling], None]) -> None:
+    pace = AdaptivePolling(0.001)
     change(pace)
     assert pace.wait_s(0.0) == 0.001

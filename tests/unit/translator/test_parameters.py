@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes import Microscope, ParameterSpec, ParameterTable, Value
+from afspm.microscopes import Driver, ParameterSpec, ParameterTable, Value
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
@@ -79,7 +79,7 @@ def test_an_experiment_file_changes_single_attributes_of_a_row() -> None:
 
 
 @pytest.mark.parametrize("microscope", [Asylum, Gxsm, Nanonis])
-def test_how_the_controller_has_what_code_translates_is_not_a_rows_to_say(microscope: type[Microscope]) -> None:
+def test_how_the_controller_has_what_code_translates_is_not_a_rows_to_say(microscope: type[Driver]) -> None:
     narrow = microscope.parameter_table({"scan-angle": {"range": ["-90 deg", "90 deg"]}})
     assert narrow["scan-angle"].range[1] == pytest.approx(math.pi / 2)
     for row in ({"sign": -1}, {"vendor": "Rotation"}):

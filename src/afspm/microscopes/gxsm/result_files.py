@@ -14,8 +14,8 @@ from afspm.errors import AfspmError
 from afspm.files import read
 from afspm.files.content import FileContent
 from afspm.microscopes.gxsm.staleness import Rows
-from afspm.microscopes.measurements import SCAN, Measurements, as_set, lines_missing, region_of
 from afspm.model import Region, Scan, Spectrum
+from afspm.translator.result_files import SCAN, ResultFiles, as_set, lines_missing, region_of
 
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
 _STORED: Final = 1e-5
@@ -29,7 +29,7 @@ SOON_S: Final = 1.0
 """After so long a channel that did not come before will not come; 0.3 s were measured."""
 
 
-class Harvest(Measurements):
+class GxsmFiles(ResultFiles):
     """The measurement that is running or has just ended, and the results.
 
     Args:

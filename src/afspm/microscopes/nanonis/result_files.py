@@ -11,10 +11,10 @@ from typing import Any, Final
 
 from afspm.errors import AfspmError, FileError
 from afspm.files import read
-from afspm.microscopes.measurements import SCAN, Content, Measurements, as_set, lines_missing
-from afspm.microscopes.microscope import LOST
 from afspm.microscopes.nanonis import fetched
 from afspm.model import Scan, Spectrum
+from afspm.translator.driver import LOST
+from afspm.translator.result_files import SCAN, Content, ResultFiles, as_set, lines_missing
 
 _PRINTED: Final = 2e-6
 """Relative: what a file has of a position, of which it prints seven digits."""
@@ -25,7 +25,7 @@ _TURNED_RAD: Final = 1e-3
 Fetch = Callable[[Mapping[str, Any]], Sequence[Scan | Spectrum]]
 
 
-class Harvest(Measurements):
+class NanonisFiles(ResultFiles):
     """The measurement that is running or has just ended, and the results.
 
     Args:

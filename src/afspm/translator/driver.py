@@ -1,4 +1,4 @@
-"""`Microscope`: what one writes for a new controller. Everything else is done by the `Translator`, once for all."""
+"""`Driver`: what one writes for a new controller. Everything else is done by the `Translator`, once for all."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, InvalidValue, Refused
-from afspm.microscopes.pace import EAGER_S
-from afspm.microscopes.parameters import ParameterTable, Value
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator.parameters import ParameterTable, Value
+from afspm.translator.polling import EAGER_S
 from afspm.units import Duration
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class Action:
 
     Attributes:
         name: the generic name, e.g. "start-scan".
-        do: begins it and returns at once; what it leads to is seen by `Microscope.status`.
+        do: begins it and returns at once; what it leads to is seen by `Driver.status`.
         state: what the microscope is in from the moment that it is accepted, until `status` says otherwise.
         while_busy: it may be asked for while the microscope is not free.
         interrupts: the states that it breaks off.
@@ -82,7 +82,7 @@ Method = TypeVar("Method", bound=Callable[[Any], None])
 
 
 def action(name: str, *, state: ScopeState | None = None, while_busy: bool | None = None) -> Callable[[Method], Method]:
-    """Marks a method of a `Microscope` as the generic action `name`.
+    """Marks a method of a `Driver` as the generic action `name`.
 
     Args:
         state: what the microscope is in from the moment that it is accepted; known for the base actions.
@@ -102,10 +102,10 @@ def action(name: str, *, state: ScopeState | None = None, while_busy: bool | Non
     return marked
 
 
-class Microscope(ABC):
+class Driver(ABC):
     """A microscope behind its controller. Write the abstract methods and an `@action` for each action::
 
-        class Mine(Microscope):
+        class Mine(Driver):
             def __init__(self, *, address: str = "127.0.0.1:1234"): super().__init__(); self.controller_at = address
             def connect(self): self.link = Link(self.controller_at); self.prove()
             def status(self): return ScopeStatus(ScopeState.SCANNING if self.link.busy() else ScopeState.FREE)
@@ -183,7 +183,7 @@ class Microscope(ABC):
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
     ) -> None:
-        if live_lines_s is not None and type(self).lines is Microscope.lines:
+        if live_lines_s is not None and type(self).lines is Driver.lines:
             raise ConfigError(f"{type(self).__name__} can't give lines while it scans", where="live_lines_s")
         self.table = self.parameter_table(parameters or {})
         self.added_actions = dict(actions or {})
@@ -336,6 +336,6 @@ class Microscope(ABC):
 
     def run_process(self, context: Context) -> int:
         """Be the translator of an experiment (what the host calls)."""
-        from afspm.microscopes.translator import run_translator
+        from afspm.translator.process import run_translator
 
         return run_translator(self, context)
