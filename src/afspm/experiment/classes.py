@@ -21,7 +21,7 @@ from afspm.experiment.published import GUIDE
 # By where they come from: a class of the user is recognised by what it is derived from.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),
-    ("afspm.microscopes", Role.TRANSLATOR),
+    ("afspm.translator", Role.TRANSLATOR),
     ("afspm.runtime.component", Role.COMPONENT),
 )
 

@@ -105,7 +105,6 @@ DASHBOARD_PASSWORD: Final = "AFSPM_DASHBOARD_PASSWORD"
 SHORT_NAME_PACKAGES: Final[tuple[str, ...]] = (
     "afspm.components",
     "afspm.scheduler",
-    "afspm.microscopes",
     "afspm.microscopes.simulator",
     "afspm.microscopes.image",
     "afspm.microscopes.nanonis",

@@ -296,7 +296,7 @@ CLASSES: Final[dict[str, Published]] = {
 """By the name of the class, in whichever module of the published implementation it was."""
 
 _OWN = "derive a class of your own from afspm.Component, with on_scan, on_state … or a `run`"
-_TRANSLATOR = 'derive a class of your own from afspm.Microscope: "afspm new translator"'
+_TRANSLATOR = 'derive a class of your own from afspm.translator.Driver: "afspm new driver"'
 INSTEAD: Final[dict[str, str]] = {
     "ScanningComponent": "ScanSeries takes a region again and again, ScanList takes one after the other, RegionGrid a "
     "map; where its function chooses by what was measured, write the choice as `run` of an afspm.Component",

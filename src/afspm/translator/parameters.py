@@ -307,7 +307,7 @@ def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translat
             hint = f"did you mean {near[0]!r}?" if near else ""
             errors.add(ConfigError(f"unknown attribute {key!r}", where=at, hint=hint))
         if translated and key in _OF_THE_CONTROLLER:
-            hint = "a Microscope class of your own, made from this one, can translate it otherwise"
+            hint = "a Driver class of your own, made from this one, can translate it otherwise"
             told = f"{key}: code translates this parameter for this microscope, and would not look at that"
             errors.add(ConfigError(told, where=at, hint=hint))
     errors.raise_all()

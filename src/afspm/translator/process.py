@@ -34,8 +34,14 @@ from afspm.translator.outcomes import RequestOutcomes
 from afspm.translator.parameters import Value
 from afspm.translator.polling import AdaptivePolling
 from afspm.translator.requests import RequestHandler
-from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, SequenceStep
-from afspm.translator.sequence import StatusSequence as StateSequence
+from afspm.translator.sequence import (
+    DiscardResults,
+    LogError,
+    PublishResults,
+    PublishStatus,
+    SequenceStep,
+    StatusSequence,
+)
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 
 if TYPE_CHECKING:

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.errors import ConfigError, Refused
-from afspm.microscopes import Driver, ParameterSpec, ParameterTable, Value
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
 from afspm.microscopes.simulator import Simulator
 from afspm.model import names
+from afspm.translator import Driver, ParameterSpec, ParameterTable, Value
 
 TABLE = ParameterTable({}).extended(
     {

@@ -17,7 +17,6 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.microscopes import Driver
 from afspm.model import Frame
 from afspm.record.facts import STATE_DIR
 from afspm.runtime.component import Component
@@ -33,6 +32,7 @@ from afspm.testing.translators.client import CheckClient
 from afspm.testing.translators.processes import Processes
 from afspm.testing.translators.registry import Lost
 from afspm.testing.translators.support import Support, find_out
+from afspm.translator import Driver
 from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
 

@@ -15,7 +15,6 @@ import pytest
 from afspm import wire
 from afspm.errors import FileError, Refused
 from afspm.exit_codes import ExitCode
-from afspm.microscopes import Driver, Value, action
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -29,6 +28,7 @@ from afspm.model import (
     names,
 )
 from afspm.runtime.memory import Memory
+from afspm.translator import Driver, Value, action
 from afspm.translator.process import Translator
 from afspm.transport.port import RequestReceived, Served
 

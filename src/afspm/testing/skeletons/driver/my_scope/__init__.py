@@ -13,8 +13,8 @@ import numpy as np
 
 from afspm.clock import Clock
 from afspm.errors import FileError
-from afspm.microscopes import Driver, Value, action
 from afspm.model import Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator import Driver, Value, action
 
 
 class MyScope(Driver):
