@@ -79,8 +79,10 @@ def from_plain(type_: Any, plain: Any) -> Any:
         return plain
     if origin in (Union, types.UnionType):
         return _from_union(arguments, plain)
-    if type_ is np.ndarray or origin is np.ndarray:
-        return np.asarray(plain, dtype=get_args(arguments[1])[0] if arguments else None)
+    if origin is np.ndarray:
+        if not isinstance(plain, np.ndarray | list):
+            raise TypeError(f"{plain!r} is no array")
+        return np.asarray(plain, dtype=get_args(arguments[1])[0])
     if is_dataclass(type_):
         return _from_fields(type_, plain)
     if isinstance(type_, type) and issubclass(type_, Enum):

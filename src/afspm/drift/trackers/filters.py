@@ -8,15 +8,11 @@ later counts (as landmarks in simultaneous localisation and mapping: Smith, Self
 
 from __future__ import annotations
 
-from collections.abc import Mapping as Table
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from afspm.errors import InvalidValue
 
 Array = NDArray[np.float64]
 
@@ -193,24 +189,6 @@ class Filters:
         log_weight = np.maximum(log_weight - log_weight.max(), np.log(rarest))
         log_weight -= np.log(np.exp(log_weight).sum())
         return replace(self, mean=mean, covariance=covariance, log_weight=log_weight)
-
-    def to_dict(self) -> dict[str, Any]:
-        """All but the models."""
-        return {name: getattr(self, name) for name in ("time_s", "mean", "covariance", "log_weight")}
-
-    @classmethod
-    def from_dict(cls, models: Models, table: Table[str, Any]) -> Filters:
-        """What `to_dict` made.
-
-        Raises:
-            InvalidValue: of a bank with other filters.
-        """
-        mean, covariance, log_weight = (
-            np.asarray(table[name], dtype=np.float64) for name in ("mean", "covariance", "log_weight")
-        )
-        if len(log_weight) != len(models.density_m2_s3):
-            raise InvalidValue(f"a saved bank of {len(log_weight)} filters instead of {len(models.density_m2_s3)}")
-        return cls(models, float(table["time_s"]), mean, covariance, log_weight)
 
 
 def mixed(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:

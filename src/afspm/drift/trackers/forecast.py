@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
-from collections.abc import Mapping as Table
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.mapping import Mapping
 from afspm.drift.trackers.filters import Filters, Models, mixed
-from afspm.drift.tracking import Prediction
+from afspm.drift.tracking import FORECAST_VERSION, Prediction
+from afspm.model.snapshot import snapshot
 
 Array = NDArray[np.float64]
 
@@ -51,11 +50,6 @@ class Compensation:
             del before[0]
         return Compensation((*before, (float(since_s), float(velocity_m_s[0]), float(velocity_m_s[1]))))
 
-    @classmethod
-    def from_list(cls, changes: Iterable[Iterable[float]]) -> Compensation:
-        """From `changes` as JSON has them."""
-        return cls(tuple((float(since_s), float(x), float(y)) for since_s, x, y in changes))
-
 
 _LEAST_WEIGHT = 1e-4  # filters that are less likely are left out
 
@@ -73,6 +67,8 @@ class BankForecast:
         compensation: with which tip coordinates follow the sample.
         straight: from tip coordinates to those in which the sample is only displaced; None: they are the same.
     """
+
+    KIND: ClassVar = "bank forecast"
 
     time_s: float
     models: Models
@@ -119,28 +115,4 @@ class BankForecast:
 
     def to_dict(self) -> dict[str, Any]:
         """See `Forecast`."""
-        straight = {} if self.straight is None else {"straight": self.straight.matrix.tolist()}
-        return {
-            "kind": "bank",
-            "time_s": self.time_s,
-            "density_m2_s3": self.models.density_m2_s3.tolist(),
-            "fading_per_s": self.models.fading_per_s.tolist(),
-            "walk_m2_s": self.models.walk_m2_s,
-            "weight": self.weight.tolist(),
-            "mean": self.mean.tolist(),
-            "covariance": self.covariance.tolist(),
-            "compensation": [list(change) for change in self.compensation.changes],
-            **straight,
-        }
-
-    @classmethod
-    def from_dict(cls, table: Table[str, Any]) -> BankForecast:
-        """What `to_dict` made."""
-        arrays = {name: np.array(table[name], dtype=np.float64) for name in _ARRAYS}
-        models = Models(arrays.pop("density_m2_s3"), arrays.pop("fading_per_s"), float(table["walk_m2_s"]))
-        compensation = Compensation.from_list(table["compensation"])
-        straight = Mapping(table["straight"]) if "straight" in table else None
-        return cls(float(table["time_s"]), models, **arrays, compensation=compensation, straight=straight)
-
-
-_ARRAYS = ("density_m2_s3", "fading_per_s", "weight", "mean", "covariance")
+        return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.overlap import overlap_ratio, sr_norm
 from afspm.drift.registration import DriftScan
-from afspm.drift.trackers import saving
 
 Array = NDArray[np.float64]
 
@@ -35,27 +33,6 @@ class ReferenceScan:
     adrift: bool = False
     refusals: int = 0
     used: int = 0
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "scan": saving.scan_to_dict(self.scan),
-            "compensated_m_s": self.compensated_m_s,
-            "anchor": self.anchor,
-            "adrift": self.adrift,
-            "refusals": self.refusals,
-            "used": self.used,
-        }
-
-    @classmethod
-    def from_dict(cls, table: Table[str, Any]) -> ReferenceScan:
-        return cls(
-            saving.scan_from_dict(table["scan"]),
-            np.asarray(table["compensated_m_s"], dtype=np.float64),
-            bool(table["anchor"]),
-            bool(table["adrift"]),
-            int(table["refusals"]),
-            int(table["used"]),
-        )
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,13 @@ present, the state holds each reference that is kept, as the bank of filters doe
 from __future__ import annotations
 
 import cmath
-from collections.abc import Mapping as Table
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.mapping import Mapping
 from afspm.drift.registration import DriftScan, LinearSeen
-from afspm.errors import InvalidValue
 from afspm.model import Frame
 
 Array = NDArray[np.float64]
@@ -111,30 +108,6 @@ class Similarity:
         row = np.zeros(len(self.error))
         row[0], row[1 + number] = 1.0, -1.0
         return row
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON and numpy arrays."""
-        return {
-            "straight": self.straight.matrix,
-            "pivot_m": self.pivot_m,
-            "error": np.stack([self.error.real, self.error.imag]),
-            "covariance": self.covariance,
-            "doubted": self.doubted,
-        }
-
-    @classmethod
-    def from_dict(cls, table: Table[str, Any], references: int) -> Similarity:
-        """What `to_dict` made.
-
-        Raises:
-            InvalidValue: of another number of references.
-        """
-        pivot_m, parts, covariance = (
-            np.asarray(table[name], dtype=np.float64) for name in ("pivot_m", "error", "covariance")
-        )
-        if parts.shape != (2, 1 + references):
-            raise InvalidValue(f"a saved rotation of {parts.shape[-1] - 1} references instead of {references}")
-        return cls(Mapping(table["straight"]), pivot_m, parts[0] + 1j * parts[1], covariance, bool(table["doubted"]))
 
 
 @dataclass(frozen=True)
