@@ -17,7 +17,7 @@ from afspm.files import FileContent
 from afspm.microscopes.simulator.files import Measured, encode_scan
 from afspm.model import Region, Scan
 from afspm.simulation import World
-from afspm.study.recorded import series
+from afspm.study.scan_series import series
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 PIXELS = 48
