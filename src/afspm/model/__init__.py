@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.model.control import HAS_ENDED, Parameter, Request, Response
+from afspm.model.control import HAS_ENDED, Parameter, Request, Response, ResponseDetail
 from afspm.model.enums import (
     CLOCK_REQUEST,
     OTHER_RUN_RESPONSE,
@@ -18,6 +18,7 @@ from afspm.model.enums import (
 )
 from afspm.model.geometry import Frame, Region, RegionChange
 from afspm.model.journal import (
+    ControlEvent,
     JournalEntries,
     JournalEntry,
     LogLine,
@@ -43,6 +44,7 @@ __all__ = [
     "OTHER_RUN_RESPONSE",
     "RESTART_REQUEST",
     "TELL_REQUEST",
+    "ControlEvent",
     "ControlMode",
     "ControlRequest",
     "ControlResponse",
@@ -69,6 +71,7 @@ __all__ = [
     "Request",
     "RescanKind",
     "Response",
+    "ResponseDetail",
     "Scan",
     "ScanLines",
     "ScanParameters",

@@ -20,6 +20,7 @@ from afspm.model import (
     Packet,
     Request,
     Response,
+    ResponseDetail,
     Told,
     request_name,
 )
@@ -222,7 +223,8 @@ class Link:
                 self.port.send(frames)
                 answer = self._await_answer(connection, self._earlier(answered_within_s, until_s))
                 if answer is not None:
-                    self.ended = self.ended or answer.reason == HAS_ENDED  # that may come before the signal itself
+                    if answer.detail is ResponseDetail.EXPERIMENT_ENDED:
+                        self.ended = True  # this may come before the signal itself
                     self.check()
                     return answer
                 if until_s is not None and self.clock.monotonic_s() >= until_s:

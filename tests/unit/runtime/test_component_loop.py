@@ -12,7 +12,7 @@ from runtime_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of,
 from afspm import model, wire
 from afspm.errors import ConfigError, ExperimentEnded, Refused
 from afspm.exit_codes import ExitCode
-from afspm.model import HAS_ENDED, ControlResponse, Problem, Response, Scan, ScopeState, ScopeStatus
+from afspm.model import ControlResponse, Problem, Response, ResponseDetail, Scan, ScopeState, ScopeStatus
 from afspm.runtime.component import Component
 from afspm.runtime.launch import Launch
 from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
@@ -240,7 +240,7 @@ def test_who_asks_for_control_before_it_has_heard_of_the_end_has_ended_too() -> 
                 raise AssertionError("there is nothing to control any more")
 
     lab = Lab()
-    lab.intercept = lambda request: Response(ControlResponse.FAILURE, reason=HAS_ENDED)
+    lab.intercept = lambda request: Response(ControlResponse.FAILURE, detail=ResponseDetail.EXPERIMENT_ENDED)
     assert run(Script(), lab) == ExitCode.ENDED
 
 
