@@ -117,6 +117,15 @@ def spectra(heard: Iterable[Observation]) -> list[Spectrum]:
     return [one.thing for one in heard if isinstance(one.thing, Spectrum)]
 
 
+def states(heard: list[Observation]) -> list[str]:
+    """The states among what was heard, in words, each once where it is repeated."""
+    found: list[str] = []
+    for one in heard:
+        if one.state is not None and str(one) not in found[-1:]:
+            found.append(str(one))
+    return found
+
+
 STARTED_S = 30.0
 """Real seconds until translator and scheduler are up and the microscope has said that it is free."""
 ANSWERED_S = 15.0

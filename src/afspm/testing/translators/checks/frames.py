@@ -15,8 +15,7 @@ from afspm.model import (
     ShapeChange,
     names,
 )
-from afspm.testing.translators.checks.scans import states
-from afspm.testing.translators.client import Observation, told
+from afspm.testing.translators.client import Observation, states, told
 from afspm.testing.translators.measuring import NEAR, CheckMeasurements, FrameSetting, difference, in_words, number
 from afspm.testing.translators.registry import Failed, Skipped, check, expect, near
 from afspm.wire.generated import spectroscopy_pb2

@@ -5,18 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
-from afspm.testing.translators.client import Observation, scans, told
+from afspm.testing.translators.client import Observation, scans, states, told
 from afspm.testing.translators.measuring import SCAN_S, CheckMeasurements, Taken, difference
 from afspm.testing.translators.registry import Failed, Skipped, check, expect
-
-
-def states(heard: list[Observation]) -> list[str]:
-    """The states among what was heard, in words, each once where it is repeated."""
-    found: list[str] = []
-    for one in heard:
-        if one.state is not None and str(one) not in found[-1:]:
-            found.append(str(one))
-    return found
 
 
 def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
