@@ -32,7 +32,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 from afspm.translator import settings
 from afspm.translator.controller_lock import ControllerTaken, commanding
 from afspm.translator.driver import LOST, MEASURING, ControllerLost, Driver
@@ -54,7 +54,7 @@ from afspm.translator.sequence import (
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 _RECONNECT_S = 1.0
 _TIP_S = 8.0
@@ -542,7 +542,7 @@ def _only_asks(request: Request) -> bool:
     return request.kind == ControlRequest.ACTION_SUPPORT
 
 
-def run_translator(microscope: Driver, context: Context, make: Callable[..., Translator] = Translator) -> int:
+def run_translator(microscope: Driver, context: ProcessContext, make: Callable[..., Translator] = Translator) -> int:
     """What the host runs. While another run commands the controller, it is said which, and the process ends."""
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, microscope)
@@ -555,7 +555,7 @@ def run_translator(microscope: Driver, context: Context, make: Callable[..., Tra
         return _run_alone(microscope, context, partial(make, controller=controller))
 
 
-def _run_alone(microscope: Driver, context: Context, make: Callable[..., Translator]) -> int:
+def _run_alone(microscope: Driver, context: ProcessContext, make: Callable[..., Translator]) -> int:
     """The sockets, the memory and the translator itself."""
     from afspm.transport.launching import open_server_port
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 from afspm import wire
+from afspm.client.link import ExperimentLink
 from afspm.clock import Clock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import (
@@ -22,8 +23,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.runtime.link import Link
-from afspm.runtime.stopping import StopRequested
+from afspm.process.stopping import StopRequested
 from afspm.testing.translators.registry import Failed, Lost, expect
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ class Observations:
         self.all: list[Observation] = []
 
     def take(self, packet: Packet, ours: bool) -> None:
-        """A listener of a `Link`."""
+        """A listener of a `ExperimentLink`."""
         message = packet.envelope
         try:
             message = wire.message_of(packet.envelope)
@@ -156,7 +156,7 @@ class CheckClient:
         at_start: what of it was there before anything was asked.
     """
 
-    def __init__(self, link: Link, direct: Link | None, lost: Callable[[], str]) -> None:
+    def __init__(self, link: ExperimentLink, direct: ExperimentLink | None, lost: Callable[[], str]) -> None:
         self._link = link
         self._direct = direct or link
         self._lost = lost
@@ -224,7 +224,7 @@ class CheckClient:
         """As `ask`, past the scheduler: for what the translator has to refuse by itself."""
         return self._asked_by(self._direct, kind, subject)
 
-    def _asked_by(self, link: Link, kind: ControlRequest, subject: Any) -> Response:
+    def _asked_by(self, link: ExperimentLink, kind: ControlRequest, subject: Any) -> Response:
         self._heed()
         try:
             with self._alive():
