@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from afspm import wire
-from afspm.client.published_state import STATE_MESSAGES, PublishedState
+from afspm.client.published_state import PublishedState
 from afspm.clock import Clock
 from afspm.errors import ConfigError, ExperimentEnded, NoResponse, WireError
 from afspm.logic.sessions import run_of
@@ -25,7 +25,7 @@ from afspm.model import (
     ResponseDetail,
     request_name,
 )
-from afspm.process.context import ProcessActivity
+from afspm.process.context import STATE_MESSAGES, ProcessActivity
 from afspm.process.stopping import StopRequested
 from afspm.transport.port import (
     CaughtUp,

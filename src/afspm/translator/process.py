@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 _RECONNECT_S = 1.0
 _TIP_S = 8.0
 """So long, real time, it is tried to retract the tip when the run is stopped: a controller may be lost just then, or
-refuse. A little less than `runtime.parent` leaves."""
+refuse. A little less than `process.parent` leaves."""
 _STARTS_S = 2.0
 """So long, real time, a controller may take that is started together with its translator (an emulated one): until then
 it is looked for every `_SOON_S`, and nothing is wrong."""

@@ -165,7 +165,7 @@ def _interrupting(client: CheckClient) -> Iterator[None]:
 def _client(
     experiment: Experiment, options: CheckOptions, stack: ExitStack, complaints: list[str]
 ) -> tuple[CheckClient, Path, bool]:
-    """ProcessStart what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
+    """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
     common = _common(experiment, options)
     clock = common.clock
     folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
