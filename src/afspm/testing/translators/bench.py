@@ -11,7 +11,7 @@ from afspm.client.link import ExperimentLink
 from afspm.clock import Clock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import ControlRequest, ControlResponse, Parameter, Response, ScopeState, ScopeStatus, names
-from afspm.process.stopping import StopRequested
+from afspm.process.parent import StopRequested
 from afspm.testing.translators.story import Heard, Story, told
 from afspm.testing.translators.verdicts import Failed, Lost, expect
 

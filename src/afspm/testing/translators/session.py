@@ -242,15 +242,7 @@ def _translator_address(experiment: Experiment, starts: Sequence[Start]) -> str 
 
 
 def _link(port: Port, own: Launch, log: logging.Logger) -> ExperimentLink:
-    return ExperimentLink(
-        port,
-        NAME,
-        source=own.sockets.subscribe[0],
-        session=new_session(own.run),
-        request_timeout_s=own.request_timeout_s,
-        request_retries=own.request_retries,
-        log=log,
-    )
+    return ExperimentLink.of_launch(own, port, new_session(own.run), name=NAME, log=log)
 
 
 def is_simulated(experiment: Experiment, options: Options) -> bool:
