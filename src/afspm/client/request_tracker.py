@@ -7,7 +7,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.logic.sessions import run_of
-from afspm.model import CLOCK_REQUEST, TELL_REQUEST, Request, Response, Told
+from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, RelayedMessage, Request, Response
 
 Send = Callable[[Sequence[bytes]], None]
 
@@ -31,7 +31,7 @@ class RequestTracker:
         self._requests = 0
         self._asked = ""
         self._told: tuple[str, float] | None = None  # the id of what was told and not answered yet, and when
-        self._untold: dict[str, Told] = {}
+        self._untold: dict[str, RelayedMessage] = {}
         self.connections = 0
         self.connected = False
         self.answer: Response | None = None
@@ -56,7 +56,7 @@ class RequestTracker:
         """Have the scheduler publish `thing`. Until that is answered, only the newest of each kind waits."""
         if self.version is not wire.Version.OURS:
             return  # its answer could be taken for that to the next request
-        told = Told(*wire.encode(thing))
+        told = RelayedMessage(*wire.encode(thing))
         self._untold[told.message] = told
         if self._told is None or self._told[1] < now_s - timeout_s:
             self._tell_next(now_s)
@@ -79,4 +79,4 @@ class RequestTracker:
     def _tell_next(self, now_s: float) -> None:
         if self._untold:
             told = self._untold.pop(next(iter(self._untold)))
-            self._told = (self.send_only(TELL_REQUEST, told), now_s)
+            self._told = (self.send_only(RELAY_REQUEST, told), now_s)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from afspm.errors import InvalidValue
-from afspm.formatting import area, place
+from afspm.formatting import area_text, position_text
 from afspm.model import Frame, Region, Scan, ScanParameters, ScopeState, Spectrum, names
 
 XY = tuple[float, float]
@@ -70,7 +70,7 @@ class ScanTarget:
     def describe(self, scan: Scan) -> str:
         region, (rows, columns) = scan.region, scan.shape
         turned = f", turned by {math.degrees(region.angle_rad):.4g} degrees" if region.angle_rad else ""
-        return f"{area(region.size_m)} at {place(region.center_m)}{turned}, {rows} x {columns} pixels"
+        return f"{area_text(region.size_m)} at {position_text(region.center_m)}{turned}, {rows} x {columns} pixels"
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class SpectrumTarget:
         return ""
 
     def describe(self, spectrum: Spectrum) -> str:
-        where = "somewhere" if spectrum.position_m is None else f"at {place(spectrum.position_m)}"
+        where = "somewhere" if spectrum.position_m is None else f"at {position_text(spectrum.position_m)}"
         return f"{spectrum.kind or 'of no kind'} {where}"
 
 

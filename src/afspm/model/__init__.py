@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from afspm.model.control import HAS_ENDED, Parameter, Request, Response, ResponseDetail
 from afspm.model.enums import (
     CLOCK_REQUEST,
     OTHER_RUN_RESPONSE,
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -16,8 +15,7 @@ from afspm.model.enums import (
     ScopeState,
     request_name,
 )
-from afspm.model.geometry import Frame, Region, RegionChange
-from afspm.model.journal import (
+from afspm.model.events import (
     ControlEvent,
     JournalEntries,
     JournalEntry,
@@ -27,14 +25,16 @@ from afspm.model.journal import (
     ProcessState,
     ProcessStates,
     Progress,
-    Told,
+    RelayedMessage,
     component_of,
     is_process_name,
 )
-from afspm.model.lines import ScanLines
+from afspm.model.geometry import Frame, Region, RegionChange
 from afspm.model.packet import Packet, PacketHeader
 from afspm.model.problems import ProblemNames
+from afspm.model.requests import HAS_ENDED, Parameter, Request, Response, ResponseDetail
 from afspm.model.scan import Scan, ScanParameters, ScanSet, ShapeChange
+from afspm.model.scan_lines import ScanLines
 from afspm.model.spectrum import Spectrum
 from afspm.model.state import ControlState, Feedback, PositionChange, ProbePosition, ScopeStatus
 
@@ -43,7 +43,7 @@ __all__ = [
     "HAS_ENDED",
     "OTHER_RUN_RESPONSE",
     "RESTART_REQUEST",
-    "TELL_REQUEST",
+    "RELAY_REQUEST",
     "ControlEvent",
     "ControlMode",
     "ControlRequest",
@@ -80,7 +80,7 @@ __all__ = [
     "ScopeStatus",
     "ShapeChange",
     "Spectrum",
-    "Told",
+    "RelayedMessage",
     "component_of",
     "is_process_name",
     "request_name",

@@ -13,7 +13,7 @@ from afspm.errors import WireError
 from afspm.logic import events
 from afspm.model import (
     HAS_ENDED,
-    TELL_REQUEST,
+    RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
     Packet,
@@ -47,7 +47,7 @@ _CLOSED_WITHIN_S = 5.0
 _MOST_A_TURN = 20
 """Requests that are handled before everything else is looked at again: the component in control waits no longer."""
 _TOO_MANY = "too many requests of this client wait to be answered: ask again once others are"
-_TELL = bytes([TELL_REQUEST])
+_TELL = bytes([RELAY_REQUEST])
 
 
 class Core(Protocol):

@@ -34,7 +34,7 @@ from afspm.logic.events import (
 from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
 from afspm.model import (
     HAS_ENDED,
-    TELL_REQUEST,
+    RELAY_REQUEST,
     ControlResponse,
     Packet,
     PacketHeader,
@@ -196,7 +196,7 @@ class SchedulerHost(Process):
 
     def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
         connection = self._lines.get(line)
-        if self._has_ended and request.kind != TELL_REQUEST:
+        if self._has_ended and request.kind != RELAY_REQUEST:
             ended = ResponseDetail.EXPERIMENT_ENDED
             line.answer(Response(int(ControlResponse.FAILURE), b"", HAS_ENDED, request.id, ended))
         elif connection is not None:
