@@ -20,19 +20,19 @@ from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.asylum.link import Link as AsylumLink
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.gxsm.bridge_client import BridgeLink
-from afspm.microscopes.microscope import Microscope
 from afspm.microscopes.nanonis import Nanonis
 from afspm.microscopes.nanonis.link import Link as NanonisLink
-from afspm.microscopes.translator import Translator
 from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
+from afspm.translator.driver import Driver
+from afspm.translator.process import Translator
 from afspm.transport.port import RequestReceived, Served
 from benchmarks.processes import CLOCK, Roles, roles
 from benchmarks.rows import Row, measurement
 
 REQUESTS = 200
 AT_MOST_MS = 1.0
-VENDORS: dict[str, tuple[type[Microscope], type]] = {
+VENDORS: dict[str, tuple[type[Driver], type]] = {
     "asylum": (Asylum, AsylumLink),
     "nanonis": (Nanonis, NanonisLink),
     "gxsm": (Gxsm, BridgeLink),

@@ -12,8 +12,8 @@ import numpy as np
 import zmq
 
 from afspm import wire
-from afspm.microscopes import Microscope, Value, action
 from afspm.model import ControlRequest, Parameter, Region, Request, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator import Driver, Value, action
 from benchmarks.processes import roles
 from benchmarks.rows import Row, measurement
 
@@ -22,7 +22,7 @@ SCANS = 12
 LASTS_S = 1.7
 
 
-class Instant(Microscope):
+class Instant(Driver):
     """Knows everything at once. Its scans last `LASTS_S`, and hold the moment at which they were over."""
 
     parameters_file = Path(__file__).with_name("instant.toml")

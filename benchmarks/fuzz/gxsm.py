@@ -21,7 +21,7 @@ from afspm.emulators.gxsm import GxsmEmulator
 from afspm.emulators.gxsm.signalled import CONTENT, LENGTH, SIZE, STATUS
 from afspm.microscopes.gxsm.errors import GxsmError
 from afspm.microscopes.gxsm.link import Address, Link, open_link
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 from benchmarks.fuzz.frame import Fuzzer, Unfit
 
 _PATIENCE_S: Final = 60.0

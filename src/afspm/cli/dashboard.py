@@ -9,7 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from afspm.experiment import Experiment
-    from afspm.supervisor.resuming import Resumable
+    from afspm.supervisor.resume import ResumableRun
 
 RUNS = Path("runs")
 NAME_OF_CLASS = "Dashboard"
@@ -64,7 +64,7 @@ def with_dashboard(files: list[Path]) -> Experiment:
     return experiment if _has_dashboard(experiment) else load(*files, _overlay())
 
 
-def resumed_with_dashboard(found: Resumable) -> Resumable:
+def resumed_with_dashboard(found: ResumableRun) -> ResumableRun:
     """The run that is to go on, with a dashboard if it has none."""
     return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
 
@@ -106,9 +106,9 @@ def _people_in(file: Path) -> dict[str, str]:
 
 def _running_here(where: Path) -> Path | None:
     """The folder of the run that is meant; None: the file is of one that was started elsewhere."""
+    from afspm.client.connect import find_run
     from afspm.errors import FileError
-    from afspm.record.facts import ENDED, read_facts
-    from afspm.runtime.connect import find_run
+    from afspm.record.run_json import ENDED, read_run_json
 
     try:
         folder = find_run(where)
@@ -116,7 +116,7 @@ def _running_here(where: Path) -> Path | None:
         if where.suffix == ".toml" and where.is_file():
             return None
         raise
-    if not read_facts(folder).get(ENDED):
+    if not read_run_json(folder).get(ENDED):
         return folder
     if where.suffix == ".toml":
         return None
@@ -132,9 +132,9 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     from afspm.dashboard.joining import join, url_in
     from afspm.exit_codes import ExitCode
     from afspm.experiment.known import DASHBOARD
-    from afspm.record.facts import read_facts
+    from afspm.record.run_json import read_run_json
 
-    url = url_in(read_facts(folder).get("processes"), folder, DASHBOARD)
+    url = url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
     if url is not None:
         typer.echo(f"this run has a dashboard already: {url}")
         return 0
@@ -155,9 +155,9 @@ def _start_part(file: Path) -> int:
     experiment = with_dashboard([file])
     names = [name for name, path in experiment.resolved.class_paths.items() if path.endswith(f".{NAME_OF_CLASS}")]
     try:
-        running.dry_run(experiment, running.Options(only=tuple(names)))
+        running.dry_run(experiment, running.RunOptions(only=tuple(names)))
     except ConfigError as error:
         what = f"nothing of it runs here, and where its scheduler would be is not in the file: {error.what}"
         raise ConfigError(what, where=str(file), hint="start it with `afspm run`") from error
-    ended = running.run(experiment, running.Options(only=tuple(names)), terminal=sys.stdout)
+    ended = running.run(experiment, running.RunOptions(only=tuple(names)), terminal=sys.stdout)
     return ended.outcome.exit_code

@@ -41,7 +41,7 @@ def emulate(
     Runs until Ctrl-C. It listens on this computer only, at a free port unless it is told another: whoever connects
     to the vendor's usual port may expect a real controller there.
     """
-    from afspm.emulators.known import emulator, names
+    from afspm.emulators.registry import emulator, names
 
     if not name:
         for known in names():
@@ -59,7 +59,7 @@ def _run(emulator: Emulator, speed: float, folder: Path) -> None:
 
     from afspm.clock import ExperimentClock
     from afspm.emulators.emulator import Crashed
-    from afspm.runtime.log import set_up
+    from afspm.process.log import set_up
 
     log = set_up("emulate", "INFO")
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -15,17 +15,17 @@ def _new() -> None:
     """Make something to begin with."""
 
 
-@app.command("translator")
-def translator(
+@app.command("driver")
+def driver(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Of the package, e.g. my_scope.")],
     into: Annotated[Path, typer.Option("--into", metavar="DIR", help="Where to make its folder.")] = Path(),
 ) -> None:
-    """A package with a translator for a new controller.
+    """Make a package with a driver for a new controller.
 
     As it is, it drives a controller that only pretends, and passes the checks of what it has.
     """
-    from afspm.testing.skeletons import write_translator
+    from afspm.testing.skeletons import write_driver
 
-    folder = write_translator(name, into)
+    folder = write_driver(name, into)
     typer.echo(f"{folder}: replace its PretendController, and look how far it is with")
     typer.echo(f"    cd {folder} && afspm test-translator experiment.toml")

@@ -10,7 +10,7 @@ import typer
 from afspm.cli.arguments import FilesUnlessResumed, names_in
 
 if TYPE_CHECKING:
-    from afspm.experiment import Experiment, Start
+    from afspm.experiment import Experiment, ProcessStart
 
 
 def run(
@@ -18,7 +18,10 @@ def run(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            "--only", metavar="NAME[,NAME…]", help="Start these processes here, and no others.", show_default=False
+            "--only",
+            metavar="NAME[,NAME…]",
+            help="Start these processes here, and no others.",
+            show_default=False,
         ),
     ] = None,
     without: Annotated[
@@ -67,10 +70,10 @@ def run(
 
     from afspm.cli.dashboard import resumed_with_dashboard, with_dashboard
     from afspm.experiment import load
-    from afspm.supervisor import resuming
+    from afspm.supervisor import resume as resuming
     from afspm.supervisor import run as running
 
-    options = running.Options(
+    options = running.RunOptions(
         runs=runs,
         only=names_in(only),
         without=names_in(without),
@@ -112,6 +115,6 @@ def _check(experiment: Experiment) -> None:
         raise typer.Exit(1)
 
 
-def _told(start: Start) -> str:
+def _told(start: ProcessStart) -> str:
     what = " ".join(start.command) or start.launch.class_
     return f"{start.launch.name} ({start.role.value}): {what}"

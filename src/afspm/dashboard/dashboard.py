@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from afspm.addresses import Listens
+from afspm.client.component import Component
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, is_loopback
 from afspm.dashboard.allowed import allowed_region
@@ -15,13 +16,12 @@ from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
 from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.watch import Watch
 from afspm.errors import ConfigError
-from afspm.record.facts import name_in
-from afspm.record.going_on import cut_off
-from afspm.runtime.component import Component
-from afspm.runtime.priority import step_back
+from afspm.process.priority import step_back
+from afspm.record.run_json import experiment_name
+from afspm.record.run_lock import cut_off_message
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
 
@@ -63,7 +63,7 @@ class Dashboard(Component):
         self._certificate_key = None if certificate_key is None else Path(certificate_key)
         self._server: PageServer | None = None
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         step_back()
         self._context = context
         return super().run_process(context)
@@ -80,14 +80,14 @@ class Dashboard(Component):
         bound = listening(self._host, self._port or None, self._usual_ports())
         archive = Archive(self.run_dir if launch.run_dir else None)
         problems = self._context.problems
-        self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off(self.run_dir))
+        self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
         self._steering = Steering(launch, self.clock, self._watch, access)
         app, self._farewell = application(
             self._watch,
             self._steering,
             access,
             archive,
-            title=name_in(self.run_dir, "afspm"),
+            title=experiment_name(self.run_dir, "afspm"),
             limits=allowed_region(self.run_dir),
             simulated=self.simulated,
             host=self._host,

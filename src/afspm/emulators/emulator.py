@@ -15,15 +15,15 @@ from afspm.addresses import Listens
 from afspm.clock import Clock, ExperimentClock
 from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
-from afspm.errors import AfspmError, Gathered
+from afspm.errors import AfspmError, ErrorCollector
 from afspm.exit_codes import ExitCode
-from afspm.microscopes.emulated import Notice, notice_file
-from afspm.transport.launching import open_port
+from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.port import Killed
 from afspm.transport.wakeup import WakeUp
+from afspm.transport.zmq_port import open_port
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 LOOPBACK = "127.0.0.1"
 LONGEST_WAIT_S = 60.0
@@ -106,7 +106,7 @@ class Emulator(ABC):
         self._leave_at_s = math.inf
 
     def check(self) -> None:
-        """Whether the settings make sense.
+        """Check the settings.
 
         Raises:
             ConfigError: of the world or the faults. FileError: a sample that can't be read.
@@ -114,7 +114,7 @@ class Emulator(ABC):
         from afspm.simulation import World
         from afspm.simulation.settings import one_of
 
-        errors = Gathered()
+        errors = ErrorCollector()
         with errors:
             world = World.from_settings(self._world_settings, self.seed, 0.0)
             one_of(world.settings.feedback.mode, self.modes, "feedback.mode")
@@ -140,7 +140,7 @@ class Emulator(ABC):
         """
 
     def tick(self, now_s: float) -> float | None:
-        """What happens by itself up to now, experiment time: a scan ends, a file is written.
+        """Advance to now, in experiment time: end scans, write files.
 
         Called before every `serve`, so also right after whatever was served.
 
@@ -232,7 +232,7 @@ class Emulator(ABC):
         if failed:
             raise failed[0]
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         """Be a process of an experiment (what the host calls): with its clock, and its files in the run's folder."""
         context.when_stopping(self.stop)
         threading.Thread(target=self._until_the_end_of, args=(context,), name="experiment", daemon=True).start()
@@ -240,10 +240,12 @@ class Emulator(ABC):
         with ExitStack() as stack:
             launch, notice = context.launch, None
             if launch.state_dir:
-                notice = stack.enter_context(closing(Notice(notice_file(launch.state_dir, launch.name), launch.run)))
+                notice = stack.enter_context(
+                    closing(AddressNotice(notice_file(launch.state_dir, launch.name), launch.run))
+                )
             return self._run_telling(context, notice)
 
-    def _run_telling(self, context: Context, notice: Notice | None) -> int:
+    def _run_telling(self, context: ProcessContext, notice: AddressNotice | None) -> int:
         def listening(address: str) -> None:
             if address:
                 context.log.warning("SIMULATED: an emulated %s controller listens at %s", self.vendor, address)
@@ -257,7 +259,7 @@ class Emulator(ABC):
             return ExitCode.CRASHED
         return ExitCode.ORPHAN if self._stop.is_set() else ExitCode.ENDED
 
-    def _until_the_end_of(self, context: Context) -> None:
+    def _until_the_end_of(self, context: ProcessContext) -> None:
         """Hears of the end of the experiment; in a thread of its own, since `serve` waits for the vendor's clients."""
         port = open_port(context.launch, context.clock)
         while not any(isinstance(incoming, Killed) for incoming in port.poll(None)):

@@ -7,16 +7,23 @@ from dataclasses import replace
 from afspm.logic.arbitration import Cause
 from afspm.logic.event_log import AnsweredRequest
 from afspm.logic.events import Reply, RequestIn
-from afspm.logic.forwarder import NOT_SENT, UNKNOWN, ForwardedRequest
+from afspm.logic.forwarder import ForwardedRequest
 from afspm.logic.idempotency_cache import RequestStatus
 from afspm.logic.pending_requests import refused_again
 from afspm.logic.state import StateDraft
-from afspm.model import ControlResponse, Request, Response
+from afspm.model import ControlResponse, Request, Response, ResponseDetail
 
 
-def answer(draft: StateDraft, event: RequestIn, code: ControlResponse, reason: str = "", payload: bytes = b"") -> None:
+def answer(
+    draft: StateDraft,
+    event: RequestIn,
+    code: ControlResponse,
+    reason: str = "",
+    payload: bytes = b"",
+    detail: ResponseDetail = ResponseDetail.NONE,
+) -> None:
     """Answer a request by ourselves, once and for all."""
-    response = Response(int(code), payload, reason, event.request.id)
+    response = Response(int(code), payload, reason, event.request.id, detail)
     draft.idempotency = draft.idempotency.noted(event.name, event.request, response)
     reply(draft, event, response)
 
@@ -46,9 +53,9 @@ def answer_unsent(draft: StateDraft, event: RequestIn, response: Response) -> No
     """Answer a request that is not sent; it may have waited, and be asked by another connection by now."""
     job, reason = ForwardedRequest.of(event), response.reason
     if response.code == ControlResponse.NO_RESPONSE:
-        reason = NOT_SENT + reason.removeprefix(NOT_SENT).removeprefix(UNKNOWN)
+        reason = f"not sent: what had to come before it failed ({reason})"
         draft.idempotency = draft.idempotency.forgotten(event.name, event.request)
-        answer_job(draft, job, Response(response.code, b"", reason, event.request.id))
+        answer_job(draft, job, Response(response.code, b"", reason, event.request.id, ResponseDetail.NOT_SENT))
     else:
         finish(draft, job, Response(response.code, b"", reason, event.request.id), was_sent=False)
 
@@ -94,10 +101,10 @@ def call_back(draft: StateDraft, former: str | None, cause: Cause | None) -> Non
 
 
 def write_down(
-    draft: StateDraft, who: str, request: Request, response: Response, heard_s: float, note: str = ""
+    draft: StateDraft, who: str, request: Request, response: Response, heard_s: float, *, late: bool = False
 ) -> None:
     """Add an answer to the event log."""
-    answered = AnsweredRequest(draft.now_ns, who, request, response, draft.now_s - heard_s, note)
+    answered = AnsweredRequest(draft.now_ns, who, request, response, draft.now_s - heard_s, late)
     draft.event_log = draft.event_log.add_request(draft.now_s, answered)
 
 

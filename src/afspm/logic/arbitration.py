@@ -16,7 +16,7 @@ from afspm.model import ControlMode, ControlResponse, ControlState, Problem, Pro
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
 
-class ControlEvent(Enum):
+class ArbitrationEvent(Enum):
     """What control depends on: the requests, by kind, and two that time brings."""
 
     REQUEST_CONTROL = "asks for control"
@@ -119,7 +119,7 @@ class Rules:
 class ControlInput:
     """An event of `who`; `number` is the problem or mode that it is about."""
 
-    event: ControlEvent
+    event: ArbitrationEvent
     who: str
     number: int = 0
 
@@ -217,8 +217,8 @@ def _happen(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cau
     return Transition(when, None, do, why, cause)
 
 
-TABLE: dict[ControlEvent, tuple[Transition, ...]] = {
-    ControlEvent.REQUEST_CONTROL: (
+TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
+    ArbitrationEvent.REQUEST_CONTROL: (
         _refuse(IS_MANUAL, _R.WRONG_CONTROL_MODE, "the mode is manual: the person at the microscope is in control"),
         _refuse(SOLVES_UNFLAGGED, _R.WRONG_EXP_PROBLEM, "{problem} is not flagged; flagged: {problems}"),
         _refuse(
@@ -236,11 +236,11 @@ TABLE: dict[ControlEvent, tuple[Transition, ...]] = {
         _accept(ASKER_HOLDS, (_D.GRANT,), "asked for again: it stays in control, for the problem it now names"),
         _accept(OTHERWISE, (_D.GRANT,), "nobody is in control: the first to ask gets it"),
     ),
-    ControlEvent.RELEASE_CONTROL: (
+    ArbitrationEvent.RELEASE_CONTROL: (
         _accept(ASKER_HOLDS, (_D.TAKE,), "its own decision", Cause.RELEASED),
         _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is; nothing changed"),
     ),
-    ControlEvent.FLAG: (
+    ArbitrationEvent.FLAG: (
         _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
         _accept(IS_FLAGGED, (), "what was asked for is so: two may notice the same"),
         _accept(
@@ -257,7 +257,7 @@ TABLE: dict[ControlEvent, tuple[Transition, ...]] = {
         ),
         _accept(OTHERWISE, (_D.FLAG,), "a solver stays in control while its own problem is flagged"),
     ),
-    ControlEvent.CLEAR: (
+    ArbitrationEvent.CLEAR: (
         _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
         _accept(NOT_FLAGGED, (), "what was asked for is so: classifier and corrector may both clear"),
         _refuse(
@@ -271,7 +271,7 @@ TABLE: dict[ControlEvent, tuple[Transition, ...]] = {
         ),
         _accept(OTHERWISE, (_D.UNFLAG,), "who solves another problem stays in control"),
     ),
-    ControlEvent.SET_MODE: (
+    ArbitrationEvent.SET_MODE: (
         _refuse(MAY_NOT_SET_MODE, _R.FAILURE, "{who} has not the role 'mode' ([control] roles)"),
         _refuse(NO_SUCH_MODE, _R.WRONG_CONTROL_MODE, "there is no control mode {number}: 1 manual, 2 automated"),
         _accept(SAME_MODE, (), "what was asked for is so"),
@@ -283,21 +283,21 @@ TABLE: dict[ControlEvent, tuple[Transition, ...]] = {
         ),
         _accept(OTHERWISE, (_D.SET_MODE,), "components ask for control again, and go on"),
     ),
-    ControlEvent.END: (
+    ArbitrationEvent.END: (
         _refuse(MAY_NOT_END, _R.FAILURE, "{who} has not the role 'end' ([control] roles)"),
         _accept(OTHERWISE, (_D.END,), "all receivers close"),
     ),
-    ControlEvent.COMMAND: (
+    ArbitrationEvent.COMMAND: (
         _happen(ASKER_HOLDS, (_D.FORWARD,), "only who is in control commands the microscope"),
         _happen(IS_OPERATOR, (_D.FORWARD,), "in manual mode a person may, by a component"),
         _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is"),
     ),
-    ControlEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "it disturbs nothing, so anybody may, at any time"),),
-    ControlEvent.DEAD: (
+    ArbitrationEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "it disturbs nothing, so anybody may, at any time"),),
+    ArbitrationEvent.DEAD: (
         _happen(ASKER_HOLDS, (_D.TAKE,), "control never stays with the dead", Cause.DEAD),
         _happen(OTHERWISE, (), "it was not in control"),
     ),
-    ControlEvent.IDLE: (
+    ArbitrationEvent.IDLE: (
         _happen(ASKER_HOLDS, (_D.TAKE,), "a greedy component can't block the night", Cause.IDLE),
         _happen(OTHERWISE, (), "it was not in control"),
     ),

@@ -22,7 +22,7 @@ from afspm.logic.microscope_status import feedback_of
 from afspm.logic.publishing import publish_control
 from afspm.logic.sessions import token_of
 from afspm.logic.state import StateDraft
-from afspm.model import ControlMode, ControlRequest, ControlResponse, Problem
+from afspm.model import ControlMode, ControlRequest, ControlResponse, Problem, ResponseDetail
 
 TRANSLATOR = "translator"
 """Who flags a microscope that is lost: the translator asks for nothing, so it is done in its name."""
@@ -83,12 +83,18 @@ def begin_end(draft: StateDraft) -> None:
     draft.end = draft.end.begin(draft.now_s + settings.request_timeout_s + settings.patience_s)
 
 
-def answer_unless_ending(draft: StateDraft, event: RequestIn, code: ControlResponse, why: str) -> None:
+def answer_unless_ending(
+    draft: StateDraft,
+    event: RequestIn,
+    code: ControlResponse,
+    why: str,
+    detail: ResponseDetail = ResponseDetail.NONE,
+) -> None:
     """Answer a request, now or when the tip is seen to."""
-    if (kept := draft.end.keep((event, code, why))) is not None:
+    if (kept := draft.end.keep((event, code, why, detail))) is not None:
         draft.end = kept
     else:
-        answers.answer(draft, event, code, why)
+        answers.answer(draft, event, code, why, detail=detail)
 
 
 def _follow(draft: StateDraft, change: _Change) -> None:

@@ -7,13 +7,16 @@ is published.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from afspm.logic.arbitration import ArbitrationState, ControlInput, Transition
 from afspm.logic.descriptions import asked
 from afspm.model import (
     CLOCK_REQUEST,
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
+    ControlEvent,
+    ControlRequest,
     JournalEntries,
     JournalEntry,
     ProblemNames,
@@ -30,9 +33,11 @@ LONGEST = 1000
 """Characters of what was asked, and of the reason."""
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
+LATE = "late: it had been told that there was no answer"
+"""Of an answer of the translator that came after all."""
 SCHEDULER = "scheduler"
 """Who asks for what nobody else did."""
-_UNWRITTEN = frozenset({CLOCK_REQUEST, TELL_REQUEST})
+_UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +46,7 @@ class AnsweredRequest:
 
     Attributes:
         took_s: real time from the question to the answer.
-        note: what there is to say of the answer beside its reason.
+        late: the answer came after the client had been told that there was none.
     """
 
     time_ns: int
@@ -49,13 +54,25 @@ class AnsweredRequest:
     request: Request
     response: Response
     took_s: float
-    note: str = ""
+    late: bool = False
 
     def entry(self, problems: ProblemNames) -> JournalEntry:
         kind = ORDER if self.request.kind == RESTART_REQUEST else REQUEST
         what = asked(self.request, problems)[:LONGEST]
-        reason = "; ".join(filter(None, (self.note, self.response.reason[:LONGEST])))
-        return JournalEntry(self.time_ns, kind, self.who, what, self.response.code, reason, self.took_s)
+        reason = "; ".join(filter(None, (LATE if self.late else "", self.response.reason[:LONGEST])))
+        flags = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
+        return JournalEntry(
+            self.time_ns,
+            kind,
+            self.who,
+            what,
+            self.response.code,
+            reason,
+            self.took_s,
+            request=self.request.kind,
+            problem=int(self.request.subject or 0) if self.request.kind in flags else None,
+            late=self.late,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +118,10 @@ def unreadable_entry(now_ns: int, who: str, response: Response) -> JournalEntry:
 
 def start_entry(now_ns: int, control: ArbitrationState, *, is_restart: bool) -> JournalEntry:
     """Return the entry of the scheduler's start."""
-    what = f"started again; {control.holder or 'nobody'} is in control" if is_restart else "started"
-    return JournalEntry(now_ns, CONTROL, SCHEDULER, what)
+    if not is_restart:
+        return JournalEntry(now_ns, CONTROL, SCHEDULER, "started", event=ControlEvent.STARTED)
+    what = f"started again; {control.holder or 'nobody'} is in control"
+    return JournalEntry(now_ns, CONTROL, SCHEDULER, what, event=ControlEvent.RESTARTED)
 
 
 def control_entries(
@@ -114,21 +133,23 @@ def control_entries(
     problems: ProblemNames,
 ) -> list[JournalEntry]:
     """Return an entry for each change of control, mode and problems: in whose name it was, and why."""
-    entries, name = list[JournalEntry](), problems.name
-
-    def say(who: str, what: str, reason: str = "") -> None:
-        entries.append(JournalEntry(now_ns, CONTROL, who, what, None, reason))
-
+    name, entry = problems.name, partial(JournalEntry, now_ns, CONTROL)
+    entries = []
     if before.holder is not None and after.holder != before.holder:
-        say(before.holder, "no longer in control", row.cause.value if row.cause is not None else "")
+        cause = row.cause.value if row.cause is not None else ""
+        entries.append(entry(before.holder, "no longer in control", reason=cause, event=ControlEvent.CONTROL_LOST))
     for number in sorted(after.problems.keys() - before.problems.keys()):
-        say(ask.who, f"flagged {name(number)}")
+        flagged = ControlEvent.PROBLEM_FLAGGED
+        entries.append(entry(ask.who, f"flagged {name(number)}", event=flagged, problem=number))
     for number in sorted(before.problems.keys() - after.problems.keys()):
-        say(ask.who, f"cleared {name(number)}", f"it was flagged by {before.problems[number]}")
+        why, cleared = f"it was flagged by {before.problems[number]}", ControlEvent.PROBLEM_CLEARED
+        entries.append(entry(ask.who, f"cleared {name(number)}", reason=why, event=cleared, problem=number))
     if after.mode is not before.mode:
-        say(ask.who, f"mode {after.mode.name}")
+        entries.append(entry(ask.who, f"mode {after.mode.name}", event=ControlEvent.MODE_CHANGED, mode=after.mode))
     if after.holder is not None and (after.holder, after.solving) != (before.holder, before.solving):
-        say(after.holder, f"in control to solve {name(after.solving)}" if after.solving else "in control")
+        solving, gained = f" to solve {name(after.solving)}" if after.solving else "", ControlEvent.CONTROL_GAINED
+        problem = after.solving or None
+        entries.append(entry(after.holder, f"in control{solving}", event=gained, problem=problem))
     if after.ended and not before.ended:
-        say(ask.who, "ended the experiment")
+        entries.append(entry(ask.who, "ended the experiment", event=ControlEvent.EXPERIMENT_ENDED))
     return entries

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from afspm.logic.events import RequestIn
 from afspm.logic.supervisor_registry import OVER
-from afspm.model import ControlResponse, ProcessState
+from afspm.model import ControlResponse, ProcessState, ResponseDetail
 
 SHUTDOWN_GRACE_S = 3.0
 """How long (real) after the end late and restarting components still get the last scans and the end itself; and after a
@@ -70,7 +70,7 @@ class StartupBarrier:
         return self.opened_s if self.kept else None
 
 
-KeptAnswer = tuple[RequestIn, ControlResponse, str]
+KeptAnswer = tuple[RequestIn, ControlResponse, str, ResponseDetail]
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from afspm.errors import AfspmError
 from afspm.logic import control_change, safety_commands
-from afspm.logic.arbitration import ControlEvent, ControlInput
+from afspm.logic.arbitration import ArbitrationEvent, ControlInput
 from afspm.logic.control_change import TRANSLATOR
 from afspm.logic.events import PacketIn, Publish
 from afspm.logic.publishing import CONTROL_STATE
@@ -84,6 +84,6 @@ def _take_state(draft: StateDraft, state: ScopeState) -> None:
         draft.lease = draft.lease.used(draft.now_ns)
     flagged_by = draft.control.problems.get(Problem.DEVICE_MALFUNCTION)
     if draft.microscope.lost_since_s is None and flagged_by == TRANSLATOR:
-        control_change.decide(draft, ControlInput(ControlEvent.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION))
+        control_change.decide(draft, ControlInput(ArbitrationEvent.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION))
     safety_commands.send(draft)
     act_when_moved(draft)

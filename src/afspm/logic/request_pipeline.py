@@ -11,11 +11,11 @@ from dataclasses import replace
 from functools import partial
 
 from afspm.logic import answers, control_change, publishing, safety_commands
-from afspm.logic.arbitration import ControlEvent, ControlInput
+from afspm.logic.arbitration import ArbitrationEvent, ControlInput
 from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.event_log import SCHEDULER
 from afspm.logic.events import Reply, RequestIn
-from afspm.logic.forwarder import NOT_SENT, UNKNOWN, ForwardedRequest, ForwardOutcome, OwnAnswer, SettledRequest
+from afspm.logic.forwarder import ForwardedRequest, ForwardOutcome, OwnAnswer, SettledRequest
 from afspm.logic.idempotency_cache import RequestStatus
 from afspm.logic.limit_checker import is_get
 from afspm.logic.microscope_status import feedback_of
@@ -26,28 +26,27 @@ from afspm.model import (
     CLOCK_REQUEST,
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
     ControlRequest,
     ControlResponse,
     Parameter,
     Request,
     Response,
+    ResponseDetail,
     component_of,
 )
 
-LATE = "late: it had been told that there was no answer"
-"""Of an answer of the translator that came after all."""
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ANOTHER_RUN = "this scheduler is that of another run: two experiments have the same address"
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 _CONTROL_EVENTS = {
-    int(ControlRequest.REQUEST_CTRL): ControlEvent.REQUEST_CONTROL,
-    int(ControlRequest.RELEASE_CTRL): ControlEvent.RELEASE_CONTROL,
-    int(ControlRequest.ADD_EXP_PRBLM): ControlEvent.FLAG,
-    int(ControlRequest.RMV_EXP_PRBLM): ControlEvent.CLEAR,
-    int(ControlRequest.SET_CONTROL_MODE): ControlEvent.SET_MODE,
-    int(ControlRequest.END_EXPERIMENT): ControlEvent.END,
+    int(ControlRequest.REQUEST_CTRL): ArbitrationEvent.REQUEST_CONTROL,
+    int(ControlRequest.RELEASE_CTRL): ArbitrationEvent.RELEASE_CONTROL,
+    int(ControlRequest.ADD_EXP_PRBLM): ArbitrationEvent.FLAG,
+    int(ControlRequest.RMV_EXP_PRBLM): ArbitrationEvent.CLEAR,
+    int(ControlRequest.SET_CONTROL_MODE): ArbitrationEvent.SET_MODE,
+    int(ControlRequest.END_EXPERIMENT): ArbitrationEvent.END,
 }
 """The requests that may change control, by their numbers. All others are for the microscope."""
 
@@ -126,8 +125,8 @@ def _repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Resp
     may_send = draft.idempotency.ids_known or request.kind != _ACTION
     if may_send and (draft.control.holder == name or reads(request)):
         return False
-    reason = f"{UNKNOWN}it was sent once, and is not sent again"
-    answers.reply(draft, event, Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id))
+    reason, detail = "outcome unknown: it was sent once, and is not sent again", ResponseDetail.OUTCOME_UNKNOWN
+    answers.reply(draft, event, Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id, detail))
     return True
 
 
@@ -137,10 +136,12 @@ def _repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Resp
 def authorise(draft: StateDraft, event: RequestIn) -> bool:
     """Return whether a request is for the translator, and its client may ask for it; if not, it was answered."""
     kind, subject = event.request.kind, event.request.subject
-    if kind == TELL_REQUEST:  # a supervisor's last words come after the end
+    if kind == RELAY_REQUEST:  # a supervisor's last words come after the end
         publishing.publish_for_process(draft, event)
     elif draft.control.ended:
-        control_change.answer_unless_ending(draft, event, ControlResponse.FAILURE, HAS_ENDED)
+        control_change.answer_unless_ending(
+            draft, event, ControlResponse.FAILURE, HAS_ENDED, ResponseDetail.EXPERIMENT_ENDED
+        )
     elif kind == RESTART_REQUEST:
         publishing.order_restart(draft, event)
     elif kind == CLOCK_REQUEST:
@@ -151,7 +152,7 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
     elif (control_event := _CONTROL_EVENTS.get(kind)) is not None:
         return control_change.decide(draft, ControlInput(control_event, event.name, int(subject or 0)), event)
     else:
-        wanted = ControlEvent.READ if reads(event.request) else ControlEvent.COMMAND
+        wanted = ArbitrationEvent.READ if reads(event.request) else ArbitrationEvent.COMMAND
         return control_change.decide(draft, ControlInput(wanted, event.name), event)
     return False
 
@@ -403,7 +404,7 @@ def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -
     draft.idempotency = draft.idempotency.noted(job.client, job.request, status or response)
     if status is None and not response.ok:
         answers.take_back(draft, job)
-    answers.write_down(draft, job.client, job.request, response, job.heard_s, LATE)
+    answers.write_down(draft, job.client, job.request, response, job.heard_s, late=True)
     draft.log("WARNING", f"the translator answered {job.client} late; asked again, it gets that answer")
 
 
@@ -452,7 +453,7 @@ def _names_meant(job: ForwardedRequest) -> tuple[str, ...] | None:
 
 def _was_not_sent(response: Response) -> bool:
     """Return whether the translator says that it could not reach the controller, and did nothing."""
-    return response.code == ControlResponse.NO_RESPONSE and response.reason.startswith(NOT_SENT)
+    return response.code == ControlResponse.NO_RESPONSE and response.detail is ResponseDetail.NOT_SENT
 
 
 def _unknown_status(response: Response) -> RequestStatus | None:

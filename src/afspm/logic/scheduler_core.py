@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
 from afspm.logic import answers, control_change, packet_intake, publishing, request_pipeline, safety_commands
-from afspm.logic.arbitration import ArbitrationState, ControlEvent, ControlInput
+from afspm.logic.arbitration import ArbitrationEvent, ArbitrationState, ControlInput
 from afspm.logic.cache import TIME_STEP_NS, PacketCache
 from afspm.logic.control_change import TRANSLATOR
 from afspm.logic.coordinate_frame import CoordinateFrame
@@ -142,7 +143,7 @@ class SchedulerCore:
         self.state = restored_state(saved, self._env.settings)
         self._env.cache.not_before(saved.last_ns)
         if self._env.frame is not None and saved.frame is not None:
-            self._env.frame.restore(saved.frame)
+            self._env.frame.restore(json.loads(saved.frame))
 
     def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
         """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
@@ -209,7 +210,7 @@ def _on_subscriber(draft: StateDraft, event: ReplayRequested) -> None:
 
 
 def _on_problem(draft: StateDraft, event: ProblemSeen) -> None:
-    what = ControlEvent.FLAG if event.flagged else ControlEvent.CLEAR
+    what = ArbitrationEvent.FLAG if event.flagged else ArbitrationEvent.CLEAR
     control_change.decide(draft, ControlInput(what, event.name, event.problem))
 
 
@@ -271,8 +272,8 @@ def _end_when_safe(draft: StateDraft) -> None:
     draft.end = draft.end.ended(draft.now_s)
     if owes_retract:
         draft.log("CRITICAL", "the experiment ends, and the tip was left in danger: the microscope did not retract it")
-    for event, code, why in kept:
-        answers.answer(draft, event, code, why)
+    for event, code, why, detail in kept:
+        answers.answer(draft, event, code, why, detail=detail)
     draft.send_forwards()
     publishing.publish_entries(draft)
     draft.effects.append(Kill(not owes_retract, STOPS.get(draft.microscope.state, "")))
@@ -291,10 +292,10 @@ def _see_to_deadlines(draft: StateDraft) -> None:
         if see_to(draft):
             return
     if (holder := draft.control.holder) is not None and _has_come(_dead_at_s(draft), draft.now_s):
-        control_change.decide(draft, ControlInput(ControlEvent.DEAD, holder))
+        control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, holder))
     lease_ns = draft.lease.deadline_ns(is_free=draft.microscope.is_free)
     if (holder := draft.control.holder) is not None and lease_ns is not None and draft.now_ns >= lease_ns:
-        control_change.decide(draft, ControlInput(ControlEvent.IDLE, holder))
+        control_change.decide(draft, ControlInput(ArbitrationEvent.IDLE, holder))
     for name in draft.pending.still_unclear(draft.now_s):  # both connections go on: they are two
         draft.pending, waiting = draft.pending.clear_up(name)
         if waiting is not None:
@@ -322,7 +323,7 @@ def _flag_malfunction(draft: StateDraft) -> bool:
     if told_by == SCHEDULER:
         draft.watchdog = draft.watchdog.people_called()
         draft.log("WARNING", "the tip was in danger: bring it back to the surface, then clear device-malfunction")
-    control_change.decide(draft, ControlInput(ControlEvent.FLAG, told_by, _MALFUNCTION))
+    control_change.decide(draft, ControlInput(ArbitrationEvent.FLAG, told_by, _MALFUNCTION))
     return True
 
 

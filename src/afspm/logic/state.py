@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -22,10 +23,9 @@ from afspm.logic.sessions import SessionTable
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.supervisor_registry import SavedSupervisor, SupervisorRegistry
 from afspm.logic.watchdog import TipState, Watchdog
-from afspm.model.snapshot import to_plain
 
-VERSION = 1
-"""Of the layout of `SavedState`."""
+KIND, VERSION = "scheduler", 1
+"""Of snapshots of `SavedState`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class SavedState:
         sessions: the token of each session that was connected.
         last_ns: the time of the newest packet.
         recent: (translator's time, ours) of the packets published last.
-        frame: of a scheduler whose components have other coordinates, plain.
+        frame: of a scheduler whose components have other coordinates, as JSON.
     """
 
     control: ArbitrationState = field(default_factory=ArbitrationState)
@@ -50,7 +50,7 @@ class SavedState:
     supervisors: Mapping[str, SavedSupervisor] = field(default_factory=dict)
     last_ns: int = 0
     recent: tuple[tuple[int, int], ...] = ()
-    frame: dict | None = None  # type: ignore[type-arg]
+    frame: str | None = None
 
     def without_holder(self) -> SavedState:
         """Return the state with nobody in control: an older state does not know who was."""
@@ -211,7 +211,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         supervisors=state.supervisors.saved(),
         last_ns=env.cache.last_ns,
         recent=tuple(env.cache.recent()),
-        frame=None if env.frame is None else to_plain(env.frame.snapshot()),
+        frame=None if env.frame is None else json.dumps(env.frame.snapshot()),
     )
 
 

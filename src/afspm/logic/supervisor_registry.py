@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from afspm.formatting import duration_text
 from afspm.logic.events import Codec, RequestIn
 from afspm.model import (
     LogLines,
@@ -13,12 +14,11 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Progress,
-    Told,
+    RelayedMessage,
     component_of,
     is_process_name,
 )
-from afspm.model.journal import LONGEST_PROCESS_NAME, PERSON
-from afspm.model.words import lasting
+from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 
 SUPERVISOR = "supervisor"
 """Whose key it takes, where there are keys, to speak of processes; each supervisor adds ":" and what tells it apart."""
@@ -122,7 +122,7 @@ class SupervisorRegistry:
             return self, f"no supervisor has a process {process!r}; known: {', '.join(known) or 'none'}"
         name, newest = max(having.items(), key=lambda item: now_s if item[1].told_s is None else item[1].told_s)
         if newest.told_s is not None and now_s - newest.told_s > SILENT_S:
-            return self, f"the supervisor of {process} has not been heard of for {lasting(now_s - newest.told_s)}"
+            return self, f"the supervisor of {process} has not been heard of for {duration_text(now_s - newest.told_s)}"
         if process in newest.orders:
             return self, ""
         ordered = replace(newest, orders=(*newest.orders, process))
@@ -160,7 +160,7 @@ class Announcement:
 def announcement(event: RequestIn, codec: Codec) -> Announcement:
     """Check something that is to be published for a process: who may speak of what."""
     told = event.request.subject
-    if not isinstance(told, Told):
+    if not isinstance(told, RelayedMessage):
         return Announcement("", "nothing is told")
     if len(told.payload) > LONGEST:
         return Announcement("", f"{len(told.payload)} bytes are told at once, at most {LONGEST} may be")

@@ -1,9 +1,13 @@
-"""Snapshots: a tree of dataclasses as plain data (for JSON) and back, checked against the types of its fields."""
+"""Snapshots: trees of dataclasses as plain data, and back, with the kind and the version that they are of.
+
+Plain data are what JSON holds, and numpy arrays, which the caller stores beside it (or asks for as lists). Only the
+types of the fields say what is read: nothing in a snapshot names code.
+"""
 
 from __future__ import annotations
 
-import base64
 import types
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -12,116 +16,112 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from afspm.errors import InvalidValue
+
 T = TypeVar("T")
-
-Plain = dict[str, Any] | list[Any] | str | float | int | bool | None
-
-
-class SnapshotError(ValueError):
-    """Plain data that is not a snapshot of the type expected; the text names the field."""
+Plain = dict[str, Any]
 
 
-def take(thing: object, version: int) -> dict[str, Any]:
-    """Return the snapshot of a dataclass, marked with the version of its layout."""
-    return {"version": version, "state": to_plain(thing)}
+def snapshot(state: Any, kind: str, version: int, *, lists: bool = False) -> Plain:
+    """Return a dataclass as plain data.
+
+    Args:
+        kind, version: what `restored` asks for.
+        lists: arrays become lists, so that JSON can hold all of it.
+    """
+    return {"kind": kind, "version": version, **to_plain(state, lists=lists)}
 
 
-def load(expected: type[T], snapshot: object, version: int) -> T:
-    """Return the object that `take` was given.
+def restored(type_: type[T], plain: Mapping[str, Any], kind: str, version: int) -> T:
+    """Return the dataclass that `snapshot` was made of.
 
     Raises:
-        SnapshotError: another version, an unknown or missing field, a value of another type.
+        InvalidValue: of another kind or version, or damaged.
     """
-    found = snapshot.get("version") if isinstance(snapshot, dict) else None
-    if found != version or not isinstance(snapshot, dict):
-        raise SnapshotError(f"a snapshot of version {found}, this program reads version {version}")
-    return from_plain(expected, snapshot.get("state"))
-
-
-def to_plain(thing: Any) -> Any:
-    """Return dataclasses as dictionaries, enums by name, tuples as lists, bytes and arrays in base 64."""
-    if thing is None or isinstance(thing, bool | str) or type(thing) in (int, float):
-        return thing
-    if isinstance(thing, Enum):
-        return thing.name
-    if is_dataclass(thing):
-        return {one.name: to_plain(getattr(thing, one.name)) for one in fields(thing)}
-    if isinstance(thing, Mapping):
-        return {str(key): to_plain(value) for key, value in thing.items()}
-    if isinstance(thing, bytes):
-        return base64.b64encode(thing).decode()
-    if isinstance(thing, np.ndarray):
-        return {"dtype": thing.dtype.str, "shape": list(thing.shape), "data": to_plain(thing.tobytes())}
-    if isinstance(thing, Sequence):
-        return [to_plain(one) for one in thing]
-    raise SnapshotError(f"a {type(thing).__name__} can't be kept in a snapshot")
-
-
-def from_plain(expected: type[T], plain: object, where: str = "snapshot") -> T:
-    """Return the object of a type that `to_plain` wrote.
-
-    Raises:
-        SnapshotError: it is not a snapshot of that type.
-    """
+    if (plain.get("kind"), plain.get("version")) != (kind, version):
+        found = f"{plain.get('kind')!r}, version {plain.get('version')!r}"
+        raise InvalidValue(f"a snapshot of kind {found} instead of {kind!r}, version {version}")
     try:
-        return _read(expected, plain, where)  # type: ignore[no-any-return]
-    except SnapshotError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:
-        raise SnapshotError(f"{where}: {error!r}") from error
+        made: T = from_plain(type_, {key: value for key, value in plain.items() if key not in ("kind", "version")})
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InvalidValue(f"a damaged snapshot of {kind!r}: {error}") from error
+    return made
 
 
-def _read(expected: Any, plain: Any, where: str) -> Any:
-    if expected is Any:
+def to_plain(value: Any, *, lists: bool = False) -> Any:
+    """Return dataclasses, enums, collections and arrays as plain data."""
+    if isinstance(value, Enum):
+        return value.value
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_plain(getattr(value, field.name), lists=lists) for field in fields(value) if field.init}
+    if isinstance(value, np.ndarray):
+        return value.tolist() if lists else value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return [[to_plain(key, lists=lists), to_plain(one, lists=lists)] for key, one in value.items()]
+    if isinstance(value, list | tuple | deque):
+        return [to_plain(one, lists=lists) for one in value]
+    if isinstance(value, set | frozenset):
+        return sorted(to_plain(one, lists=lists) for one in value)
+    return value
+
+
+def from_plain(type_: Any, plain: Any) -> Any:
+    """Return plain data as a type says: the inverse of `to_plain`.
+
+    Raises:
+        KeyError: a field without a default is missing.
+        TypeError, ValueError: something else than the type says.
+    """
+    origin, arguments = get_origin(type_), get_args(type_)
+    if type_ is Any:
         return plain
-    origin, parameters = get_origin(expected), get_args(expected)
     if origin in (Union, types.UnionType):
-        return _one_of(parameters, plain, where)
-    if origin is tuple:
-        kinds = [parameters[0]] * len(plain) if parameters[1:] == (...,) else parameters
-        return tuple(_read(*one, f"{where}[{i}]") for i, one in enumerate(zip(kinds, plain, strict=True)))
-    if origin is not None and issubclass(origin, Mapping):
-        return {_key(parameters[0], key): _read(parameters[1], one, f"{where}.{key}") for key, one in plain.items()}
-    if isinstance(expected, type) and is_dataclass(expected):
-        return _dataclass(expected, plain, where)
-    if isinstance(expected, type) and issubclass(expected, Enum):
-        return expected[plain]
-    if expected is bytes:
-        return base64.b64decode(plain, validate=True)
+        return _from_union(arguments, plain)
     if origin is np.ndarray:
-        return np.frombuffer(base64.b64decode(plain["data"]), plain["dtype"]).reshape(plain["shape"])
-    if expected is float and type(plain) is int:
+        if not isinstance(plain, np.ndarray | list):
+            raise TypeError(f"{plain!r} is no array")
+        return np.asarray(plain, dtype=get_args(arguments[1])[0])
+    if is_dataclass(type_):
+        return _from_fields(type_, plain)
+    if isinstance(type_, type) and issubclass(type_, Enum):
+        return type_(plain)
+    if origin is not None:
+        return _from_collection(origin, arguments, plain)
+    if type_ is float:
         return float(plain)
-    if expected not in (str, int, float, bool, dict, type(None)) or type(plain) is not expected:
-        raise SnapshotError(f"{where}: {plain!r} is not a {getattr(expected, '__name__', expected)}")
+    if not isinstance(plain, type_):
+        raise TypeError(f"{plain!r} is no {type_.__name__}")
     return plain
 
 
-def _one_of(parameters: tuple[Any, ...], plain: Any, where: str) -> Any:
-    if plain is None and type(None) in parameters:
+def _from_union(arguments: Sequence[Any], plain: Any) -> Any:
+    """Of `X | None` alone: which of several a value was, plain data do not say."""
+    if plain is None and types.NoneType in arguments:
         return None
-    errors = []
-    for one in parameters:
-        try:
-            return from_plain(one, plain, where)
-        except SnapshotError as error:
-            errors.append(str(error))
-    raise SnapshotError("; ".join(errors))
+    (only,) = (one for one in arguments if one is not types.NoneType)
+    return from_plain(only, plain)
 
 
-def _dataclass(expected: type, plain: Any, where: str) -> Any:
-    hints = _hints(expected)
-    if not isinstance(plain, dict) or plain.keys() != hints.keys():
-        found = sorted(plain) if isinstance(plain, dict) else plain
-        raise SnapshotError(f"{where}: {found} are not the fields of {expected.__name__}, {sorted(hints)}")
-    return expected(**{name: _read(hint, plain[name], f"{where}.{name}") for name, hint in hints.items()})
+def _from_fields(type_: Any, plain: Mapping[str, Any]) -> Any:
+    hints = _hints(type_)
+    known = {field.name: hints[field.name] for field in fields(type_) if field.init}
+    if unknown := plain.keys() - known.keys():
+        raise ValueError(f"{type_.__name__} has no {', '.join(sorted(unknown))}")
+    return type_(**{name: from_plain(known[name], value) for name, value in plain.items()})
+
+
+def _from_collection(origin: Any, arguments: Sequence[Any], plain: Any) -> Any:
+    if issubclass(origin, Mapping):
+        key, value = arguments
+        return {from_plain(key, one): from_plain(value, other) for one, other in plain}
+    if origin is tuple and not (len(arguments) == 2 and arguments[1] is Ellipsis):
+        return tuple(from_plain(one, value) for one, value in zip(arguments, plain, strict=True))
+    made = [from_plain(arguments[0], value) for value in plain]
+    return made if origin in (list, Sequence) else origin(made)
 
 
 @cache
-def _hints(expected: type) -> dict[str, Any]:
-    hints = get_type_hints(expected)
-    return {one.name: hints[one.name] for one in fields(expected)}
-
-
-def _key(expected: Any, key: str) -> Any:
-    return int(key) if expected is int else key
+def _hints(type_: type[Any]) -> dict[str, Any]:
+    return get_type_hints(type_)

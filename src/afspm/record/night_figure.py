@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.formatting import period_text, time_of_day
 from afspm.model import names
-from afspm.model.words import from_to, time_of_day
-from afspm.record.night_record import BAD, Mark, NightRecord, Shot, Span
+from afspm.record.night_record import BAD, NightMark, NightRecord, Shot, Span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,7 +101,7 @@ def _figure(height_in: float) -> Figure:
 def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, simulated: bool) -> None:
     what = f"{title}   " if title else ""
     y = 1 - 0.17 / height_in
-    about = f"{what}{from_to(record.start_ns, record.end_ns, UTC)}, {record.scans} scans"
+    about = f"{what}{period_text(record.start_ns, record.end_ns, UTC)}, {record.scans} scans"
     figure.text(0.03, y, about, size=7, va="center")
     is_judged = any(mark.of_ns is not None for mark in record.marks)
     legend = "bar: who was in control, as in b" + ("; framed: the tip was judged bad" if is_judged else "")
@@ -190,7 +190,7 @@ def flagged_by(record: NightRecord, span: Span) -> str:
 
 def _actions(ax: Axes, record: NightRecord, lanes: Mapping[str, int], limits: tuple[int, int]) -> None:
     for action, marker in ((names.PULSE, "v"), (names.CRASH, "X")):
-        done: list[Mark] = [m for m in record.marks if m.what == action and limits[0] <= m.time_ns <= limits[1]]
+        done: list[NightMark] = [m for m in record.marks if m.what == action and limits[0] <= m.time_ns <= limits[1]]
         if done:
             at = [lanes.get(m.by, 0) for m in done]
             label = action.removeprefix("x-")

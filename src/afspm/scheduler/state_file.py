@@ -6,9 +6,10 @@ import json
 import logging
 from pathlib import Path
 
-from afspm.logic.state import VERSION, SavedState
-from afspm.model import snapshot
-from afspm.record.whole import Generations, ToldOnce, load
+from afspm.errors import InvalidValue
+from afspm.logic.state import KIND, VERSION, SavedState
+from afspm.model.snapshot import restored, snapshot
+from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint
 
 
 class StateFile:
@@ -20,9 +21,9 @@ class StateFile:
 
     def __init__(self, path: Path | None, log: logging.Logger) -> None:
         self.path = path
-        self._generations = None if path is None else Generations(path)
+        self._generations = None if path is None else CheckpointFile(path)
         self._log = log
-        self._told = ToldOnce("a restart would not know what is in force now", log)
+        self._told = OutageLog("a restart would not know what is in force now", log)
 
     def load(self) -> SavedState | None:
         """Return what was saved last; None if nothing was.
@@ -35,7 +36,7 @@ class StateFile:
         """
         if self.path is None:
             return None
-        state, damage = load(self.path, _read)
+        state, damage = load_checkpoint(self.path, _read)
         if state is None or not damage:
             return state
         self._log.critical(
@@ -51,7 +52,7 @@ class StateFile:
         if self._generations is None:
             return
         with self._told.trying():
-            self._generations.save(json.dumps(snapshot.take(state, VERSION), ensure_ascii=False).encode())
+            self._generations.save(json.dumps(snapshot(state, KIND, VERSION), ensure_ascii=False).encode())
 
     def close(self) -> None:
         """Make sure that what was saved last is on the disk."""
@@ -60,4 +61,7 @@ class StateFile:
 
 
 def _read(content: bytes) -> SavedState:
-    return snapshot.load(SavedState, json.loads(content), VERSION)
+    try:
+        return restored(SavedState, json.loads(content), KIND, VERSION)
+    except (InvalidValue, AttributeError) as error:
+        raise ValueError(str(error)) from error

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators import estimator
+from afspm.drift.overlap import too_far_off, too_little_shared
 from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan
-from afspm.drift.rescan import too_far_off, too_little_shared
 from afspm.drift.trackers import tracker
 from afspm.drift.tracking import Tracker, Update
 from afspm.model import Frame, Region
@@ -26,7 +26,7 @@ _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two co
 
 
 @dataclass(frozen=True, eq=False)
-class Night:
+class SimulatedNight:
     """What came of it. "Misplaced" is how far off its place on the sample a scan was taken.
 
     Attributes:
@@ -70,7 +70,7 @@ class Night:
         }
 
 
-def night(settings: NightSettings, seed: int) -> Night:
+def night(settings: NightSettings, seed: int) -> SimulatedNight:
     """A night of those settings. The same seed is the same sample, drift and noise for all settings.
 
     Raises:
@@ -95,7 +95,7 @@ def night(settings: NightSettings, seed: int) -> Night:
             updates.append(update)
     truth = np.array([world.drift_m(scan.mid_s)[:2] for scan in scans])
     lost = any(update.lost for update in updates)
-    return Night(DriftRecord.of(scans, updates), truth - truth[0], rescans, lost)
+    return SimulatedNight(DriftRecord.of(scans, updates), truth - truth[0], rescans, lost)
 
 
 def _taken(

@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
-from afspm.model.words import lasting
-from afspm.record.disk import DiskHangs, bounded
-from afspm.record.going_on import resume_command
+from afspm.formatting import duration_text
+from afspm.logic.supervision.run_end import EndReason
 from afspm.record.run import open_run
-from afspm.supervisor.ending import Why
+from afspm.record.run_lock import resume_command
+from afspm.storage.disk import DiskTimeout, run_bounded
 
 if TYPE_CHECKING:
-    from afspm.supervisor.supervisor import Outcome
+    from afspm.supervisor.supervisor import RunOutcome
 
 COUNTED_WITHIN_S = 20.0
 TABLE = "metadata.csv"  # of the component Metadata
 
 
-def lines(outcome: Outcome, folder: Path) -> list[str]:
+def lines(outcome: RunOutcome, folder: Path) -> list[str]:
     """The summary: why it ended, what ran, what had to be restarted or was given up, where everything is."""
-    told = [f"{outcome.text}, after {lasting(outcome.duration_s)}"]
+    told = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
     told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
         if (restarts := report.starts - 1 - report.ordered) > 0:
@@ -33,11 +33,11 @@ def lines(outcome: Outcome, folder: Path) -> list[str]:
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     try:
-        told += bounded(lambda: _recorded(folder) or _tabled(folder / TABLE), COUNTED_WITHIN_S)
-    except DiskHangs as error:
+        told += run_bounded(lambda: _recorded(folder) or _tabled(folder / TABLE), COUNTED_WITHIN_S)
+    except DiskTimeout as error:
         told.append(f"what was measured can't be counted: {error}")
     told.append(f"everything is in {folder}")
-    if outcome.why is Why.STOPPED:
+    if outcome.why is EndReason.STOPPED:
         told.append(f"{resume_command(folder)} goes on with it")
     return told
 

@@ -17,24 +17,24 @@ from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
 from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
-from afspm.logic import supervision
-from afspm.logic.liveness import LivenessPolicy
+from afspm.logic.supervision import child as supervision
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.run_end import EndReason, EndStep, RunEnd
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.supervisor import signals
-from afspm.supervisor.ending import Do, Ending, Why
+from afspm.supervisor.activity_monitor import ActivityMonitor
+from afspm.supervisor.clock_check import ClockCheck
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed, describe_exit
+from afspm.supervisor.process_status import ProcessStatus
 from afspm.supervisor.reaper import Reaper
-from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter, SchedulerThere
-from afspm.supervisor.standing import Standing
+from afspm.supervisor.reporter import Reporter, ReporterEvent, ReportFailed, RestartOrdered, SchedulerAnswered
 from afspm.supervisor.task import Task
-from afspm.supervisor.vital_signs import VitalSigns
-from afspm.supervisor.wall import Wall
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 from afspm.transport.wakeup import WakeUp
 
 # why the run ends, told at once; that it has ended as it should the summary tells in a moment
-_LEVELS = {Why.STOPPED: logging.INFO, Why.LOST: logging.CRITICAL}
+_LEVELS = {EndReason.STOPPED: logging.INFO, EndReason.LOST: logging.CRITICAL}
 
 
 LOOK_S = 0.1  # between two looks at how it is with the processes, for those who are told
@@ -43,7 +43,7 @@ START_AT_THE_END_S = 15.0  # what is started again at the end has so long to com
 
 
 @dataclass(frozen=True)
-class Report:
+class ProcessReport:
     """What became of one process: how often it was started, of that how often since it was ordered, whether it was
     given up, how it ended last."""
 
@@ -55,12 +55,12 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """How a run ended."""
 
-    why: Why
+    why: EndReason
     text: str
-    reports: tuple[Report, ...]
+    reports: tuple[ProcessReport, ...]
     duration_s: float
 
     @property
@@ -82,7 +82,7 @@ class _Child:
     up: bool = False
     beat: Heartbeat | None = None
     beat_s: float = 0.0
-    signs: VitalSigns | None = None
+    signs: ActivityMonitor | None = None
     works: bool | None = None  # though it does not beat; None: that is not known
     given_up: bool = False
     last_exit: str = ""
@@ -108,7 +108,7 @@ class _Child:
         if self.process is None or not self.up or now_s < self.beat_s + lately_s:
             self.signs = self.works = None
             return
-        self.signs = self.signs or VitalSigns(self.process.pid, lately_s)
+        self.signs = self.signs or ActivityMonitor(self.process.pid, lately_s)
         self.works = self.signs.work(now_s)
 
     def look_at_s(self, liveness: LivenessPolicy) -> float | None:
@@ -160,16 +160,16 @@ class Supervisor:
     ) -> None:
         self._log = log
         self._reporter = reporter
-        self._standing = Standing(clock, policy.liveness)
+        self._standing = ProcessStatus(clock, policy.liveness)
         self._looked_s = -math.inf
         self._clock = clock
-        self._wall = Wall(clock, lambda text: log.write(LOGGED_AS, logging.WARNING, text))
+        self._wall = ClockCheck(clock, lambda text: log.write(LOGGED_AS, logging.WARNING, text))
         self._policy = policy
-        self._wakeup: WakeUp[ChildEvent | signals.Signalled | News] = WakeUp()
+        self._wakeup: WakeUp[ChildEvent | signals.EndSignal | ReporterEvent] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
         self._reaper = Reaper()
         self._children = {task.name: self._child(task) for task in tasks}
-        self._ending: Ending | None = None
+        self._ending: RunEnd | None = None
         self._scheduler_is_there = threading.Event()
         if reporter is None or all(task.role is not Role.SCHEDULER for task in tasks):
             self._scheduler_is_there.set()  # or nobody here can tell
@@ -182,7 +182,7 @@ class Supervisor:
         launch = replace(task.launch, beat_token=token, sockets=replace(task.launch.sockets, heartbeat=address))
         return _Child(replace(task, launch=launch), watch)
 
-    def run(self) -> Outcome:
+    def run(self) -> RunOutcome:
         """Start everything; returns when nothing of it runs any more."""
         began_s = self._clock.monotonic_s()
         self._reaper.begin()
@@ -208,14 +208,14 @@ class Supervisor:
             self._wakeup.close()
             self._reaper.close()
         reports = tuple(
-            Report(child.name, child.starts, child.given_up, child.last_exit, child.ordered)
+            ProcessReport(child.name, child.starts, child.given_up, child.last_exit, child.ordered)
             for child in self._children.values()
         )
-        return Outcome(self._ending.why, self._ending.text, reports, self._clock.monotonic_s() - began_s)
+        return RunOutcome(self._ending.why, self._ending.text, reports, self._clock.monotonic_s() - began_s)
 
     def stop(self) -> None:
         """End the run as Ctrl-C does. From any thread; a second call kills at once."""
-        self._wakeup.post(signals.Signalled(signal.SIGINT))
+        self._wakeup.post(signals.EndSignal(signal.SIGINT))
 
     # --- what comes in ---
 
@@ -231,7 +231,7 @@ class Supervisor:
                 self._log.write(child.name, logging.DEBUG, "is up")
             self._carry_out(child, child.watch.beat(beat, now_s))
         # whoever wants it to end does not wait behind what the processes say
-        for event in sorted(self._wakeup.take(), key=lambda event: not isinstance(event, signals.Signalled)):
+        for event in sorted(self._wakeup.take(), key=lambda event: not isinstance(event, signals.EndSignal)):
             match event:
                 case Printed():
                     self._on_printed(self._children[event.name], event)
@@ -240,13 +240,13 @@ class Supervisor:
                     self._log.write(event.name, logging.WARNING, told)
                 case Exited():
                     self._on_exited(self._children[event.name], event)
-                case signals.Signalled():
+                case signals.EndSignal():
                     self._on_signal(event)
-                case Ordered():
+                case RestartOrdered():
                     self._on_ordered(event.name)
-                case SchedulerThere():
+                case SchedulerAnswered():
                     self._scheduler_is_there.set()
-                case Complaint():
+                case ReportFailed():
                     self._log.write(LOGGED_AS, logging.WARNING, event.text)
 
     def _timeout_s(self) -> float | None:
@@ -287,15 +287,15 @@ class Supervisor:
             return
         self._carry_out(child, child.watch.exited(exited.code, self._clock.monotonic_s(), how))
         if exited.code == ExitCode.ENDED:
-            self._end(Why.EXPERIMENT_ENDED, "the experiment has ended")
+            self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
         elif exited.code == ExitCode.CONFIG:
             self._give_up(child, child.last_error or "its settings can't work")
         elif exited.code == ExitCode.DONE and child.task.essential:
-            self._end(Why.EXPERIMENT_ENDED, f"{child.name} is done")
+            self._end(EndReason.EXPERIMENT_ENDED, f"{child.name} is done")
 
-    def _on_signal(self, signalled: signals.Signalled) -> None:
+    def _on_signal(self, signalled: signals.EndSignal) -> None:
         if self._ending is None:
-            self._end(Why.STOPPED, f"stopped by {signalled.name}")
+            self._end(EndReason.STOPPED, f"stopped by {signalled.name}")
         else:
             self._ending = self._ending.hurried(self._clock.monotonic_s())
 
@@ -331,9 +331,9 @@ class Supervisor:
             self._carry_out(child, child.watch.tick(now_s, works=child.works))
         if self._ending is None and all(child.over for child in self._children.values()):
             if all(child.given_up for child in self._children.values()):
-                self._end(Why.LOST, "everything is given up")
+                self._end(EndReason.LOST, "everything is given up")
             else:
-                self._end(Why.ALL_DONE, "all is done")
+                self._end(EndReason.ALL_DONE, "all is done")
 
     def _begin_anyway(self, now_s: float) -> None:
         """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
@@ -392,16 +392,16 @@ class Supervisor:
     def _give_up(self, child: _Child, why: str) -> None:
         child.given_up = True
         if child.task.essential:
-            self._end(Why.LOST, f"{child.name} is given up, and the experiment can't go on without it: {why}")
+            self._end(EndReason.LOST, f"{child.name} is given up, and the experiment can't go on without it: {why}")
         else:
             told = f"{child.name} is given up, the rest goes on (Ctrl-C ends it): {why}"
             self._log.write(LOGGED_AS, logging.CRITICAL, told)
 
-    def _end(self, why: Why, text: str) -> None:
+    def _end(self, why: EndReason, text: str) -> None:
         self._scheduler_is_there.set()
         if self._ending is None:
             now_s = self._clock.monotonic_s()
-            self._ending = Ending.begin(why, text, now_s)
+            self._ending = RunEnd.begin(why, text, now_s)
             for child in self._children.values():
                 is_missing = child.process is None and child.watch.phase is supervision.ChildPhase.WAITING
                 child.watch.stop(now_s)
@@ -428,7 +428,7 @@ class Supervisor:
         ending = self._ending
         return (
             ending is not None
-            and ending.why is Why.EXPERIMENT_ENDED
+            and ending.why is EndReason.EXPERIMENT_ENDED
             and ending.last is None
             and child.task.beats
             and child.task.role is Role.COMPONENT
@@ -439,10 +439,10 @@ class Supervisor:
         child.rescued = True
         self._start(child)
 
-    def _waited_for(self, ending: Ending, now_s: float) -> list[str]:
+    def _waited_for(self, ending: RunEnd, now_s: float) -> list[str]:
         """The names of those who have something to finish; a translator has after it was asked to end, too: the tip."""
         liveness = self._policy.liveness
-        is_asked, has_ended = ending.last is not None, ending.why is Why.EXPERIMENT_ENDED
+        is_asked, has_ended = ending.last is not None, ending.why is EndReason.EXPERIMENT_ENDED
         # a scheduler on another computer may be there
         can_hear = all(child.process for child in self._children.values() if child.task.role is Role.SCHEDULER)
         return [
@@ -452,8 +452,8 @@ class Supervisor:
             or (child.may_still_finish(now_s, liveness, can_hear=can_hear) and has_ended and not is_asked)
         ]
 
-    def _go_on_ending(self, ending: Ending, now_s: float) -> None:
-        if ending.last is None and ending.why is Why.EXPERIMENT_ENDED:
+    def _go_on_ending(self, ending: RunEnd, now_s: float) -> None:
+        if ending.last is None and ending.why is EndReason.EXPERIMENT_ENDED:
             self._look_after_the_last(now_s)
         busy = self._waited_for(ending, now_s)
         self._ending, do = ending.step(now_s, busy=bool(busy))
@@ -465,11 +465,11 @@ class Supervisor:
             if child.process is None:
                 continue
             match do:
-                case Do.ASK:
+                case EndStep.ASK:
                     child.process.close_stdin()
-                case Do.KILL:
+                case EndStep.KILL:
                     self._log.write(child.name, logging.WARNING, "does not end: killed")
                     child.process.kill()
-                case Do.LEAVE:
+                case EndStep.LEAVE:
                     self._log.write(child.name, logging.CRITICAL, f"can't be killed (process {child.process.pid})")
                     child.process = None

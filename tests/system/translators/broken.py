@@ -13,12 +13,12 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from afspm.errors import FileError, Refused
-from afspm.microscopes import in_force, parameters, sequence, service
-from afspm.microscopes.microscope import Action, action
-from afspm.microscopes.parameters import Value
 from afspm.microscopes.simulator import Simulator
-from afspm.microscopes.translator import Translator, run_translator
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator import parameters, requests, sequence, settings
+from afspm.translator.driver import Action, action
+from afspm.translator.parameters import Value
+from afspm.translator.process import Translator, run_translator
 
 
 class Broken(Simulator):
@@ -142,14 +142,14 @@ class SpectrumNotStopped(Broken):
         """Nothing comes of it, and nothing is said."""
 
     def spoil(self) -> None:
-        sequence.Sequence.interrupt = lambda self: []  # type: ignore[method-assign]
+        sequence.StatusSequence.interrupt = lambda self: []  # type: ignore[method-assign]
 
 
 class CancelledSpectrumUntold(Broken):
     """A spectrum that is stopped is free at once, as if it had come to its end."""
 
     def spoil(self) -> None:
-        sequence.Sequence.interrupt = lambda self: self._say(ScopeStatus(ScopeState.FREE))  # type: ignore[method-assign]
+        sequence.StatusSequence.interrupt = lambda self: self._say(ScopeStatus(ScopeState.FREE))  # type: ignore[method-assign]
 
 
 class WrongUnit(Broken):
@@ -195,11 +195,11 @@ class NeverFreeAgain(Broken):
 class FreeBeforeTheScan(Broken):
     def spoil(self) -> None:
         def after_measuring(
-            self: sequence.Sequence, seen: ScopeStatus, results: bool, now_s: float
-        ) -> list[sequence.Step]:
-            return [*self._say(seen), sequence.Deliver()] if results else []
+            self: sequence.StatusSequence, seen: ScopeStatus, results: bool, now_s: float
+        ) -> list[sequence.SequenceStep]:
+            return [*self._say(seen), sequence.PublishResults()] if results else []
 
-        sequence.Sequence._after_measuring = after_measuring  # type: ignore[method-assign]
+        sequence.StatusSequence._after_measuring = after_measuring  # type: ignore[method-assign]
 
 
 class Clamps(Broken):
@@ -214,7 +214,7 @@ class Clamps(Broken):
 
         plainly = parameters.ParameterSpec.checked
         parameters.ParameterSpec.checked = checked  # type: ignore[method-assign]
-        service.Service._apply = lambda self, values, _: self._microscope.write(values)  # type: ignore[method-assign]
+        requests.RequestHandler._apply = lambda self, values, _: self._microscope.write(values)  # type: ignore[method-assign]
 
 
 class AcceptsNaN(Broken):
@@ -241,17 +241,17 @@ class AnyUnit(Broken):
 
 class BusyNotRefused(Broken):
     def spoil(self) -> None:
-        service.Service._refuse_if_busy = lambda self, allowed: None  # type: ignore[method-assign]
+        requests.RequestHandler._refuse_if_busy = lambda self, allowed: None  # type: ignore[method-assign]
 
 
 class SuccessWithoutChange(Broken):
     def spoil(self) -> None:
-        service.Service._apply = lambda self, values, about_to_act: None  # type: ignore[method-assign]
+        requests.RequestHandler._apply = lambda self, values, about_to_act: None  # type: ignore[method-assign]
 
 
 class KnowsEveryAction(Broken):
     def spoil(self) -> None:
-        service.Service._find_action = lambda self, name: (  # type: ignore[method-assign]
+        requests.RequestHandler._find_action = lambda self, name: (  # type: ignore[method-assign]
             self.actions.get(name) or Action(name, lambda: None)
         )
 
@@ -268,7 +268,7 @@ class DiesOfNaN(Broken):
 
 
 class _Twice(Translator):
-    def _publish(self, thing: in_force.Published | ScopeStatus) -> None:
+    def _publish(self, thing: settings.Published | ScopeStatus) -> None:
         super()._publish(thing)
         if not isinstance(thing, ScopeStatus):
             super()._publish(thing)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from runtime_lab import Lab, run
+from client_lab import Lab, run
 
 from afspm import wire
 from afspm.components.feedback_analysis import MESSAGE, FeedbackAnalysis
@@ -26,7 +26,7 @@ def night(
     lab.values[names.ZCTRL_SETPOINT] = str(SETPOINT)
     lab.publish(Feedback(on=on, setpoint=SETPOINT))
     if solver:
-        lab.at(250.0, lambda: lab.does(a.ControlEvent.REQUEST_CONTROL, solver, Problem.FEEDBACK_NON_OPTIMAL))
+        lab.at(250.0, lambda: lab.does(a.ArbitrationEvent.REQUEST_CONTROL, solver, Problem.FEEDBACK_NON_OPTIMAL))
     if cleared_s is not None:
         lab.at(cleared_s, lambda: lab.clear(Problem.FEEDBACK_NON_OPTIMAL))
 

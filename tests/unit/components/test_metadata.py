@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from runtime_lab import REGION, Lab, Nothing, context_of, run
+from client_lab import REGION, Lab, Nothing, context_of, run
 
 from afspm.clock import iso_utc
+from afspm.components.line_file import LineFile
 from afspm.components.metadata import COLUMNS, Metadata
-from afspm.components.records import LineFile
 from afspm.exit_codes import ExitCode
 from afspm.logic import arbitration as a
 from afspm.model import ControlMode, ControlState, Problem, Scan, ScopeState, ScopeStatus, Spectrum
@@ -32,7 +32,7 @@ def scanned(lab: Lab, at_s: float) -> None:
 
 
 def held_by(lab: Lab, name: str, at_s: float) -> None:
-    lab.at(at_s, lambda: lab.does(a.ControlEvent.REQUEST_CONTROL, name))
+    lab.at(at_s, lambda: lab.does(a.ArbitrationEvent.REQUEST_CONTROL, name))
 
 
 def test_a_row_for_each_channel_says_where_and_who_was_in_control_when_the_scan_began(tmp_path: Path) -> None:

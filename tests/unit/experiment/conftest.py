@@ -18,8 +18,8 @@ from enum import Enum
 from pathlib import Path
 
 from afspm.addresses import ListeningAddress
-from afspm.microscopes.microscope import Microscope
-from afspm.runtime.component import Component
+from afspm.translator.driver import Driver
+from afspm.client.component import Component
 from afspm.units import Angle, Duration, Length, Voltage
 
 
@@ -90,11 +90,11 @@ class Derived(Scanner):
         super().__init__(**settings)
 
 
-class Simulated(Microscope):
+class Simulated(Driver):
     simulated = True
 
 
-class Real(Microscope):
+class Real(Driver):
     pass
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from tests.simulation.codec import TableCodec
+
 from afspm.logic.event_log import PERIOD_S
 from afspm.logic.events import (
     Connected,
@@ -24,9 +26,9 @@ from afspm.logic.events import (
 )
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.state import VERSION, SavedState
+from afspm.logic.state import KIND, VERSION, SavedState
 from afspm.model import (
-    TELL_REQUEST,
+    RELAY_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -36,14 +38,14 @@ from afspm.model import (
     ProcessCondition,
     ProcessState,
     ProcessStates,
+    RelayedMessage,
     Request,
     Response,
+    ResponseDetail,
     ScopeState,
     ScopeStatus,
-    Told,
-    snapshot,
 )
-from afspm.testing.deterministic.codec import TableCodec
+from afspm.model.snapshot import restored, snapshot
 
 NS = 10**9
 
@@ -109,8 +111,10 @@ class Lab:
         code: ControlResponse = ControlResponse.SUCCESS,
         payload: bytes = b"",
         reason: str = "",
+        detail: ResponseDetail = ResponseDetail.NONE,
     ) -> list[Effect]:
-        return self.step(TranslatorReply(forward.number, Response(int(code), payload, reason, forward.request.id)))
+        response = Response(int(code), payload, reason, forward.request.id, detail)
+        return self.step(TranslatorReply(forward.number, response))
 
     def ask(self, name: str, kind: int, subject: Any = None, id_: str = "", user: str | None = None) -> list[Effect]:
         connection = self.connections.get(name) or self.connect(name)
@@ -149,7 +153,7 @@ class Lab:
     def tell(self, *states: ProcessState, supervisor: str = "supervisor:lab") -> list[Effect]:
         """A supervisor says how it is with its processes, and whatever is due because of that is done."""
         thing = ProcessStates(self.now_ns, supervisor.partition(":")[2], states)
-        self.ask(supervisor, TELL_REQUEST, Told("ProcessStates", self.codec.encode(thing)))
+        self.ask(supervisor, RELAY_REQUEST, RelayedMessage("ProcessStates", self.codec.encode(thing)))
         return self.step(Tick())
 
     def give_up(self, name: str) -> list[Effect]:
@@ -164,7 +168,7 @@ class Lab:
 
 def as_saved(state: SavedState) -> SavedState:
     """As it comes out of a file."""
-    return snapshot.load(SavedState, json.loads(json.dumps(snapshot.take(state, VERSION))), VERSION)
+    return restored(SavedState, json.loads(json.dumps(snapshot(state, KIND, VERSION))), KIND, VERSION)
 
 
 def replies(effects: list[Effect]) -> list[Reply]:

@@ -27,7 +27,7 @@ from afspm.microscopes.gxsm.bridge_client import BridgeLink
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
 from afspm.microscopes.gxsm.hardware import Doing, Hardware, decoded, recognised
 from afspm.microscopes.gxsm.link import Address, open_link
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 VALUES: list[Any] = [
     1.5, -3, 10**30, -math.inf, "12.5 Å    ", "", (), (1, 2, "x"), [1, [2]], {"a": 1}, None, True,

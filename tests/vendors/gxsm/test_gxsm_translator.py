@@ -12,7 +12,6 @@ import pytest
 from gxsm_bench import Bench
 from vendor_bench import FLAT, SHAPE, TURNED, moved, ready, scanned, scans, states
 
-from afspm.microscopes.in_force import FRAME
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -25,6 +24,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.translator.settings import FRAME
 
 Make = Callable[..., Bench]
 

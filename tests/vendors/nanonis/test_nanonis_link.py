@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from vendor_bench import answering
 
 from afspm.emulators.nanonis import wire
-from afspm.microscopes.microscope import ControllerLost
 from afspm.microscopes.nanonis.link import Link
 from afspm.microscopes.nanonis.protocol import NanonisError
+from afspm.translator.driver import ControllerLost
 
 GOOD = wire.reply("Bias.Get", wire.body("Bias.Get", [0.5], 0))
 

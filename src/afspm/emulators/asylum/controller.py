@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from afspm.emulators.asylum import saving
-from afspm.emulators.asylum.values import Values
+from afspm.emulators.asylum import files
+from afspm.emulators.asylum.values import IgorValues
 from afspm.emulators.faults import Faults
 from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, InvalidValue
@@ -41,7 +41,7 @@ _INTEGRAL_GAIN: Final = 150.0
 """What Asylum's gain of 1 is to the simulated feedback, in 1/s."""
 
 
-class Controller:
+class AsylumController:
     """The software.
 
     Args:
@@ -55,7 +55,7 @@ class Controller:
         self,
         rig: Rig,
         faults: Faults,
-        values: Values,
+        values: IgorValues,
         folder: Path,
         *,
         start_s: float,
@@ -71,7 +71,7 @@ class Controller:
         self._file_s = file_s
         self._saves_partial = saves_partial
         self._log = log
-        self._disk = saving.Disk()
+        self._disk = files.PendingWrites()
         self._starts_at_s = math.inf
         self._bias_since_s = -math.inf
         self._curve_running = self._engages = False
@@ -93,7 +93,7 @@ class Controller:
     # --- what goes on ---
 
     def advance(self, now_s: float) -> float | None:
-        """All that happens up to now; returns when to look again."""
+        """Advance to now; return the time of the next change."""
         if self._engages and not self.rig.busy(now_s):
             self._engages = False
             self.rig.engage()
@@ -113,7 +113,7 @@ class Controller:
 
     @property
     def scanning(self) -> bool:
-        """What the panels go by."""
+        """True while the panels show a running scan."""
         return bool(self.values.get("ScanStatus"))
 
     def status(self, now_s: float) -> int:
@@ -204,14 +204,13 @@ class Controller:
         self._image = rig.region
 
     def _frame(self) -> Region:
-        """Of the next image."""
         center = (self.values.get("XOffset"), self.values.get("YOffset"))
         return Region(center, self.values.size(), 0.0 - math.radians(self.values.get("ScanAngle")))  # clockwise
 
     def _image_done(self, now_s: float) -> None:
         scan = self.rig.scan
         if scan is not None:
-            self._save("SaveImage", now_s, lambda name: saving.image(name, scan, self.values, now_s))
+            self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
         if not self.values.get("LastScan"):
             self.scan(now_s, not self.values.get("ScanDown"))
             return
@@ -226,7 +225,7 @@ class Controller:
         self.values.put("ScanStatus", 0)
         scan = self.rig.scan
         if running and self._saves_partial and scan is not None:
-            self._save("SaveImage", now_s, lambda name: saving.image(name, scan, self.values, now_s))
+            self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
 
     # --- force curves ---
 
@@ -250,7 +249,7 @@ class Controller:
             self.rig.abandon()  # the curve itself takes the time
 
     def stop_curve(self) -> None:
-        """At once."""
+        """Stop the force curve at once."""
         self._curve_running = False
         self.rig.stop_spectrum()
 
@@ -272,7 +271,7 @@ class Controller:
         self._curve_running = False
         spectrum = self.rig.spectrum
         if spectrum is not None:
-            self._save("SaveForce", now_s, lambda name: saving.curve(name, spectrum, self.values, now_s))
+            self._save("SaveForce", now_s, lambda name: files.curve(name, spectrum, self.values, now_s))
 
     # --- files ---
 
@@ -283,7 +282,7 @@ class Controller:
             suffix += 1
         self.values.put("BaseSuffix", suffix)
 
-    def _save(self, where: str, now_s: float, made: saving.Made) -> None:
+    def _save(self, where: str, now_s: float, made: files.Made) -> None:
         faults = self.faults
         if faults.strikes("other-name", now_s):
             self.values.put_text("BaseName", "Somebody")

@@ -12,8 +12,8 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class SavedScan:
-    """What goes into a scan's file.
+class SxmContent:
+    """The content of a scan's file.
 
     Attributes:
         center_m, range_m: of the frame of whole pixels; angle_deg clockwise.
@@ -37,7 +37,7 @@ class SavedScan:
     settings: Mapping[str, str]
 
 
-def sxm(scan: SavedScan) -> bytes:
+def sxm(scan: SxmContent) -> bytes:
     """The bytes of a scan's file."""
     rows, columns = scan.channels[0][3].shape
     start = _local(scan.start_s)

@@ -1,4 +1,4 @@
-"""What Nanonis' software has set and is doing, with the simulated instrument behind it, and the files that it saves."""
+"""The state of the Nanonis software: its settings, its activity on the simulated instrument, and its files."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.clock import Clock
+from afspm.emulators.activities import RETRACE, SimulatedScan, SimulatedSpectrum
 from afspm.emulators.faults import Faults
 from afspm.emulators.nanonis import files
-from afspm.emulators.nanonis.logger import Logger
+from afspm.emulators.nanonis.logger import TcpLogger
 from afspm.emulators.nanonis.registers import Registers
-from afspm.emulators.nanonis.sweeps import Sweep
+from afspm.emulators.nanonis.sweeps import SweepSettings
 from afspm.emulators.rig import Rig
-from afspm.emulators.running import RETRACE, RunningScan, RunningSpectrum
 from afspm.errors import InvalidValue
 from afspm.model import Region
 
@@ -59,16 +59,16 @@ _BASE_NAMES: Final = {"IV": "Bias-Spectroscopy", "force": "Z-Spectroscopy"}
 
 
 @dataclass
-class Scanning:
+class StartedScan:
     """A scan that was started: as the panel was then."""
 
-    scan: RunningScan
+    scan: SimulatedScan
     frame: tuple[float, float, float, float, float]
     line_s: tuple[float, float]
     channels: list[int]
 
 
-class Panel:
+class NanonisState:
     """The state of the software.
 
     Args:
@@ -80,7 +80,7 @@ class Panel:
         autosave: "all", "next" or "off".
         ends: how many scans have ended; `ended_s` when the last, `last_path` where it was saved.
         slots: the signals in the 24 slots of the Signals Manager.
-        logger: the TCP Logger.
+        logger: the TCP TcpLogger.
         client: what is remembered of the client that asks just now.
         pulse_holds: whether the z controller is on hold during a pulse.
         z_controller: "off", "on" or "safe"; `z_follows_s` is when it follows what was set.
@@ -109,16 +109,16 @@ class Panel:
         self.speed = (2e-6, 2e-6, 0.5, 0.5, 0, 1.0)
         self.continuous = self.bouncy = False
         self.autosave, self.series, self.comment, self.modules = "all", "unnamed", "", ["Z-Controller"]
-        self.scanning: Scanning | None = None
-        self.last: Scanning | None = None
-        self.curve: RunningSpectrum | None = None
+        self.scanning: StartedScan | None = None
+        self.last: StartedScan | None = None
+        self.curve: SimulatedSpectrum | None = None
         self.curve_name, self.curves_ended = "", 0
-        self.sweeps = {module: Sweep() for module in MODULES}
+        self.sweeps = {module: SweepSettings() for module in MODULES}
         self.curve_names = dict(_BASE_NAMES)
         self.ends, self.ended_s, self.last_path = 0, -math.inf, ""
         used = [*_SIGNALS.values(), _BIAS]
         self.slots = [*used, *(index for index in range(len(self.signals)) if index not in used)][:_SLOTS]
-        self.logger = Logger()
+        self.logger = TcpLogger()
         self.client: dict[str, Any] = {}
         self.opened: set[str] = set()
         self.autopaste, self.pulse_holds = 2, True
@@ -167,7 +167,7 @@ class Panel:
             self.z_controller = "safe"
 
     def begin_scan(self, upwards: bool) -> None:
-        """As somebody asks for it. Raises RigBusy."""
+        """Start a scan on request, possibly late. Raises RigBusy."""
         now_s = self.clock.now_s()
         late = self.faults.strikes("late-start", now_s)
         if late is not None:
@@ -176,7 +176,7 @@ class Panel:
             self.start_scan(upwards)
 
     def start_scan(self, upwards: bool) -> None:
-        """At once. Raises RigBusy."""
+        """Start a scan at once. Raises RigBusy."""
         x, y, width, height, clockwise_deg = self.frame
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
         self.rig.region = Region((x, y), size_m, -math.radians(clockwise_deg))
@@ -184,9 +184,9 @@ class Panel:
         forward_s, backward_s = self.speed[2:4]
         self.rig.line_s, self.rig.upwards = forward_s + backward_s, upwards
         scan = self.rig.start_scan()
-        self.scanning = self.last = Scanning(scan, self.frame, (forward_s, backward_s), list(self.channels))
+        self.scanning = self.last = StartedScan(scan, self.frame, (forward_s, backward_s), list(self.channels))
 
-    def _end_scan(self, ended: Scanning, now_s: float) -> None:
+    def _end_scan(self, ended: StartedScan, now_s: float) -> None:
         self.scanning = None
         finished = ended.scan.stopped_s is None
         path = self.save_scan(ended, now_s) if finished and self._saves(now_s) else ""
@@ -210,7 +210,7 @@ class Panel:
         curve = sweep.of(self.rig.start_spectrum(kind, sweep.sweeps))
         self.curve = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
 
-    def _recorded(self, curve: RunningSpectrum, channels: list[int]) -> RunningSpectrum:
+    def _recorded(self, curve: SimulatedSpectrum, channels: list[int]) -> SimulatedSpectrum:
         """The channels that were chosen; one that the simulated curve does not have does not change during it."""
         names, units, columns = [curve.names[0]], [curve.units[0]], [curve.values[:, 0]]
         for index in channels:
@@ -237,7 +237,7 @@ class Panel:
             self.curve = None
             self.curves_ended += 1
 
-    def _end_curve(self, curve: RunningSpectrum, now_s: float) -> None:
+    def _end_curve(self, curve: SimulatedSpectrum, now_s: float) -> None:
         self.curve = None
         self.curves_ended += 1
         module = next(name for name, kind in MODULES.items() if kind == curve.kind)
@@ -255,7 +255,7 @@ class Panel:
         self.lines = lines or max(1, round(self.pixels * ratio))
 
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> None:
-        """What does not fit into the scanner's range is made to."""
+        """Set the frame, moved into the scanner's range as the real one does."""
         width, height = min(width, self.range_m[0]), min(height, self.range_m[1])
         x, y = (
             float(np.float32(np.clip(value, (size - whole) / 2, (whole - size) / 2)))
@@ -292,7 +292,7 @@ class Panel:
         return {"off": 1, "on": 2, "safe": 5}[self.z_controller]
 
     def z_is_on(self, now_s: float) -> bool:
-        """As the real-time part has it."""
+        """True while the real-time controller has the z feedback on."""
         return self.z_status(now_s) in (2, 4)
 
     def set_session_path(self, path: str) -> None:
@@ -308,26 +308,26 @@ class Panel:
         self.folder, self.session_path = folder, path
 
     def name(self, text: str) -> str:
-        """What part of a file's name may be. Raises InvalidValue: Windows, where Nanonis runs, can't have it."""
+        """Check a part of a file's name. Raises InvalidValue: Windows, where Nanonis runs, does not allow it."""
         if not _NO_FILE_NAME.isdisjoint(text) or len(text) > _LONGEST_NAME or text.strip(". ") != text:
             raise InvalidValue(f"{text!r} can't be part of a file's name")
         return text
 
     def experiment_s(self, real_s: float) -> float:
-        """How long that is in experiment time."""
+        """Convert real to experiment seconds."""
         return real_s / self.clock.real_s(1.0)
 
     # --- what is measured ---
 
     def signal_values(self, indexes: Sequence[int], now_s: float) -> list[float]:
-        """Of signals, all of the same moment; those that nothing is connected to are zero."""
+        """Return the values of signals at one moment; unconnected ones are zero."""
         shown = self.rig.signals(now_s)
         values = {_SIGNALS[name]: value for name, value in shown.items() if name in _SIGNALS}
         values |= {_SIGNALS["Height"]: self._z_m(shown["Height"]), _BIAS: self.rig.bias_v}
         return [values.get(index, 0.0) for index in indexes]
 
     def frequency_shift_hz(self, now_s: float) -> float | None:
-        """Of the sensor; None where the feedback's mode has none."""
+        """Return the sensor's frequency shift; None if the feedback's mode has none."""
         index = _SIGNALS["Frequency Shift"]
         return self.signal_values([index], now_s)[0] if self._shifts else None
 
@@ -337,7 +337,7 @@ class Panel:
         return ("OC M1 Freq. Shift", "Hz") if self._shifts else ("log Current", "A")
 
     def z_m(self, now_s: float) -> float:
-        """Where the tip is in z."""
+        """Return the height of the tip."""
         return self._z_m(self.rig.signals(now_s)["Height"])
 
     def _z_m(self, shown_m: float) -> float:
@@ -357,7 +357,7 @@ class Panel:
         self.rig.stop("motor")
 
     def motor_at_m(self, now_s: float) -> tuple[float, float, float]:
-        """Where the motor has come to, of all the steps that it was told."""
+        """Return the position of the coarse motor."""
         axis, steps, since_s = self._motor_walks
         walked = math.copysign(min(abs(steps), (now_s - since_s) / _STEP_S), steps)
         at_m = list(self._motor_m)
@@ -366,8 +366,10 @@ class Panel:
 
     # --- pictures and files ---
 
-    def images(self, scanning: Scanning, until_s: float | None) -> dict[int, tuple[str, str, np.ndarray, np.ndarray]]:
-        """By channel: name, unit, forward and backward [y, x], lines not yet scanned NaN."""
+    def images(
+        self, scanning: StartedScan, until_s: float | None
+    ) -> dict[int, tuple[str, str, np.ndarray, np.ndarray]]:
+        """Return for each channel name, unit, forward and backward values [y, x]; lines not yet scanned are NaN."""
         drawn = scanning.scan.channels(until_s)
         found = {}
         for channel, (unit, values) in drawn.items():
@@ -380,7 +382,7 @@ class Panel:
                 found[index] = (*_name_and_unit(self.signals[index]), nothing, nothing)
         return {index: found[index] for index in scanning.channels}
 
-    def save_scan(self, ended: Scanning, now_s: float) -> str:
+    def save_scan(self, ended: StartedScan, now_s: float) -> str:
         """Save it, as well as the faults allow. Returns where it is said to be."""
         name = self._next_name(self.series, 3, ".sxm")
         path = self.told_path(name)
@@ -397,7 +399,7 @@ class Panel:
             feedback.proportional_gain or 0.0,
             integral,
         )
-        saved = files.SavedScan(
+        saved = files.SxmContent(
             path,
             scan.start_s,
             scan.end_s - scan.start_s,
@@ -415,12 +417,12 @@ class Panel:
         return path if self._save(name, files.sxm(saved), now_s) else ""
 
     def told_path(self, name: str) -> str:
-        """How a file of the session is called on the controller's computer."""
+        """Return the path of a session file on the controller's computer."""
         windows = "\\" in self.session_path
         return str(PureWindowsPath(self.session_path) / name) if windows else str(Path(self.session_path) / name)
 
     def _settings(
-        self, ended: Scanning, images: Mapping[int, tuple[str, str, np.ndarray, np.ndarray]]
+        self, ended: StartedScan, images: Mapping[int, tuple[str, str, np.ndarray, np.ndarray]]
     ) -> dict[str, str]:
         scan, number = ended.scan, files.engineering
         return {
@@ -438,7 +440,7 @@ class Panel:
             "Scan>speed backw. (m/s)": number(ended.frame[2] / ended.line_s[1]),
         }
 
-    def _curve_header(self, curve: RunningSpectrum, now_s: float) -> dict[str, str]:
+    def _curve_header(self, curve: SimulatedSpectrum, now_s: float) -> dict[str, str]:
         (x, y), number = curve.position_m, files.engineering
         return {
             "Experiment": _EXPERIMENTS[curve.kind],
@@ -479,8 +481,8 @@ class Panel:
         return True
 
 
-def curve_columns(curve: RunningSpectrum) -> list[str]:
-    """As Nanonis names them: "Current [bwd] (A)"; what is swept comes first, and has a name of its own."""
+def curve_columns(curve: SimulatedSpectrum) -> list[str]:
+    """Return a curve's column names as Nanonis writes them: "Current [bwd] (A)"; the swept signal comes first."""
     columns: list[str] = []
     for name, unit in zip(curve.names, curve.units, strict=True):
         forward = name.removesuffix(RETRACE)

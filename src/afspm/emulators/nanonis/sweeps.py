@@ -1,4 +1,4 @@
-"""What a spectrum sweeps, had from the simulated curve, which goes over a range of its own."""
+"""The sweep of a spectrum, resampled from the simulated curve, which has its own range."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from afspm.emulators.running import RunningSpectrum
+from afspm.emulators.activities import SimulatedSpectrum
 
 
 @dataclass
-class Sweep:
-    """As the panel of a module of spectra has it.
+class SweepSettings:
+    """The sweep settings of a spectroscopy module.
 
     Attributes:
         points: how many; None: as many as the simulated curve has.
@@ -32,8 +32,8 @@ class Sweep:
     saves_all: bool = False
     dialog: bool = False
 
-    def of(self, curve: RunningSpectrum) -> RunningSpectrum:
-        """The same curve, swept like this."""
+    def of(self, curve: SimulatedSpectrum) -> SimulatedSpectrum:
+        """Return the curve resampled to this sweep."""
         values = curve.values
         if self.points is not None or self.limits is not None:
             swept = values[:, 0]

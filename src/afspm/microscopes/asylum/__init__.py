@@ -11,15 +11,15 @@ from typing import Any, ClassVar, Final
 from afspm.errors import ConfigError, Refused
 from afspm.microscopes.asylum.activity import FORCE, Activity
 from afspm.microscopes.asylum.frame import GLOBALS, NAMES, asylums, from_image, generic, on_image
-from afspm.microscopes.asylum.harvest import Harvest
 from afspm.microscopes.asylum.link import Link
+from afspm.microscopes.asylum.result_files import AsylumFiles
 from afspm.microscopes.asylum.session import Session
 from afspm.microscopes.asylum.xop import XopError
-from afspm.microscopes.in_force import FRAME, POSITION, frame
-from afspm.microscopes.measurements import SCAN
-from afspm.microscopes.microscope import ControllerLost, Microscope, action
-from afspm.microscopes.parameters import FEEDBACK_ON, Value
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.result_files import SCAN
+from afspm.translator.settings import FRAME, POSITION, frame
 from afspm.units import Duration
 
 _AT_FIRST: Final[dict[str, Value]] = {
@@ -34,7 +34,7 @@ _NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
 """Of a wave of Igor's, with room for the number; it is a file's name, too."""
 
 
-class Asylum(Microscope):
+class Asylum(Driver):
     """The microscope behind Asylum Research's software.
 
     Args:
@@ -99,7 +99,7 @@ class Asylum(Microscope):
         self.prove()
         self._kept: dict[str, Any] = self.memory.setdefault("kept", {})
         self._kept |= {name: value for name, value in _AT_FIRST.items() if name not in self._kept}
-        self._harvest = Harvest(self.memory, self.log)
+        self._harvest = AsylumFiles(self.memory, self.log)
         self._activity = Activity(
             session, self._harvest, self.memory, self._folders, self._frame_in_force, self.clock, self.log
         )

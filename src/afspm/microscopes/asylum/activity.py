@@ -10,11 +10,11 @@ from typing import Any, Final
 from afspm.clock import Clock
 from afspm.errors import Refused
 from afspm.microscopes.asylum.folders import local
-from afspm.microscopes.asylum.harvest import Harvest, Target, free_suffix
+from afspm.microscopes.asylum.result_files import AsylumFiles, Target, free_suffix
 from afspm.microscopes.asylum.session import Session
 from afspm.microscopes.asylum.xop import MISSING, XopError
-from afspm.microscopes.measurements import SCAN, as_list, as_region
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.translator.result_files import SCAN, as_list, as_region
 
 FORCE: Final = "force"
 
@@ -39,7 +39,7 @@ class Activity:
     def __init__(
         self,
         session: Session,
-        harvest: Harvest,
+        harvest: AsylumFiles,
         kept: dict[str, Any],
         folders: Mapping[str, str],
         frame_in_force: Callable[[], Region],

@@ -13,9 +13,9 @@ from typing import Final
 
 from afspm.errors import InvalidValue
 from afspm.files.asylum import clockwise, counter_clockwise
-from afspm.microscopes.in_force import FRAME, frame
-from afspm.microscopes.parameters import Value
 from afspm.model import Region, names
+from afspm.translator.parameters import Value
+from afspm.translator.settings import FRAME, frame
 
 GLOBALS: Final = (
     "XOffset", "YOffset", "FastScanSize", "SlowScanSize", "ScanAngle", "ScanPoints", "ScanLines", "ScanRate",

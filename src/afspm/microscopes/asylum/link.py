@@ -12,7 +12,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from afspm.errors import ConfigError
 from afspm.microscopes.asylum import xop
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 _NEVER = -1
 _OUTCOMES = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED

@@ -10,8 +10,8 @@ from typing import Final
 from afspm.errors import Refused
 from afspm.microscopes.asylum import xop
 from afspm.microscopes.asylum.link import Link, number, text
-from afspm.microscopes.parameters import Value
 from afspm.model import ControlResponse, ScopeState
+from afspm.translator.parameters import Value
 
 SCAN_STATUS, MAP_STATUS = "ScanStatus", "FMapStatus"
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.errors import AfspmError, InvalidValue
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 LONGEST_REQUEST: Final = 1024
 """Bytes: what is longer makes the XOP drop the connection without a word."""

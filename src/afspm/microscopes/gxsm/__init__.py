@@ -21,19 +21,19 @@ from afspm.microscopes.gxsm.hardware import (
     execute,
     recognised,
 )
-from afspm.microscopes.gxsm.harvest import SOON_S, Harvest
 from afspm.microscopes.gxsm.link import Address, Asking, open_link
 from afspm.microscopes.gxsm.live import new_lines
-from afspm.microscopes.in_force import FRAME, POSITION, frame
-from afspm.microscopes.microscope import ControllerLost, Microscope, action
-from afspm.microscopes.parameters import FEEDBACK_ON, Value
+from afspm.microscopes.gxsm.result_files import SOON_S, GxsmFiles
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.settings import FRAME, POSITION, frame
 from afspm.units import Duration
 
 _SAVERS: Final = ("afspm", "gxsm")
 
 
-class Gxsm(Microscope):
+class Gxsm(Driver):
     """The microscope behind GXSM.
 
     Args:
@@ -125,7 +125,7 @@ class Gxsm(Microscope):
             self.log.info("GXSM's Auto Save of scans is off from now on, and stays off: see the setting saving")
         self._kept: dict[str, Any] = self.memory.setdefault("kept", {})
         self._kept.update({names.SPEC_KIND: "IV", "probe": None, **self.kept} | self._kept)
-        self._harvest = Harvest(
+        self._harvest = GxsmFiles(
             self.memory,
             self.patience_s(self.result_timeout_s / 2),
             self.patience_s(SOON_S),

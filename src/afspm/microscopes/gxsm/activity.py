@@ -11,11 +11,11 @@ from afspm.clock import Clock
 from afspm.microscopes.gxsm.errors import GxsmError
 from afspm.microscopes.gxsm.frame import Frame
 from afspm.microscopes.gxsm.hardware import ABORT, STATUS, Doing, Hardware, decoded, execute
-from afspm.microscopes.gxsm.harvest import Harvest, endings
 from afspm.microscopes.gxsm.link import Asking
+from afspm.microscopes.gxsm.result_files import GxsmFiles, endings
 from afspm.microscopes.gxsm.staleness import Rows, is_unfinished, looked_at
-from afspm.microscopes.measurements import SCAN, as_list
 from afspm.model import Region, ScopeState, ScopeStatus
+from afspm.translator.result_files import SCAN, as_list
 
 SETTLES_S: Final = 0.3
 """So long GXSM needs from the end of a scan until it is done with it: a file that is saved before lacks its end."""
@@ -42,7 +42,7 @@ class Activity:
         ask: Asking,
         hardware: Hardware,
         frame: Frame,
-        harvest: Harvest,
+        harvest: GxsmFiles,
         kept: dict[str, Any],
         clock: Clock,
         log: logging.Logger,

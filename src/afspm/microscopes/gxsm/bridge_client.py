@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 _LONGEST: Final = 1 << 29
 _AT_ONCE: Final = 1 << 18

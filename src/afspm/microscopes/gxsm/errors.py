@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from afspm.errors import AfspmError
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 
 class GxsmError(AfspmError):

@@ -14,9 +14,9 @@ from afspm import units
 from afspm.errors import AfspmError, Refused
 from afspm.microscopes.gxsm.errors import BadReply
 from afspm.microscopes.gxsm.link import Asking
-from afspm.microscopes.in_force import FRAME, frame
-from afspm.microscopes.parameters import Value
 from afspm.model import ControlResponse, Region, names
+from afspm.translator.parameters import Value
+from afspm.translator.settings import FRAME, frame
 
 ANGSTROM_M: Final = 1e-10
 _UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03bcm": "um", "\u00b5m": "um"}

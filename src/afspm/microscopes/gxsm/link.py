@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 BLOCK = "gxsm4_py_shm_data_block"
 PROCESS = "gxsm4"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 _PROC: Final = Path("/proc")
 _SIGUSR1_BIT: Final = 1 << 9  # signal 10, counted from 1

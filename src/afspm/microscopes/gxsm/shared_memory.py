@@ -23,7 +23,7 @@ from afspm.errors import ConfigError
 from afspm.microscopes.gxsm import pickles
 from afspm.microscopes.gxsm.errors import BadReply, GxsmError
 from afspm.microscopes.gxsm.processes import NoProcess, Process, find
-from afspm.microscopes.microscope import ControllerLost
+from afspm.translator.driver import ControllerLost
 
 _FOLDER: Final = Path("/dev/shm")
 _BYTES: Final = 16_777_344

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.errors import ConfigError, FileError, Refused
-from afspm.microscopes.in_force import FRAME, frame
-from afspm.microscopes.measurements import SCAN, region_of
-from afspm.microscopes.microscope import ControllerLost, Microscope, action
 from afspm.microscopes.nanonis import fetched, groups, protocol
 from afspm.microscopes.nanonis.activity import Activity
 from afspm.microscopes.nanonis.float32 import same_float32
-from afspm.microscopes.nanonis.harvest import Harvest
+from afspm.microscopes.nanonis.result_files import NanonisFiles
 from afspm.microscopes.nanonis.session import MODULES, Session
-from afspm.microscopes.parameters import Value
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator.driver import ControllerLost, Driver, action
+from afspm.translator.parameters import Value
+from afspm.translator.result_files import SCAN, region_of
+from afspm.translator.settings import FRAME, frame
 from afspm.units import Duration
 
 _AT_FIRST: Final[dict[str, Value]] = {
@@ -33,7 +33,7 @@ _AT_ONCE: Final = 0
 """To what could also wait until it is done."""
 
 
-class Nanonis(Microscope):
+class Nanonis(Driver):
     """The microscope behind a Nanonis controller.
 
     Args:
@@ -106,7 +106,7 @@ class Nanonis(Microscope):
             self._groups = [*groups.OTHERS, self._probe, on, kept]
             own_folder = (self.run_dir / "scans").resolve()
             patience_s = self.patience_s(self.result_timeout_s / 2)
-            self._harvest = Harvest(self.memory, self._session_dir, own_folder, patience_s, self.log)
+            self._harvest = NanonisFiles(self.memory, self._session_dir, own_folder, patience_s, self.log)
         self._activity = Activity(session, self._harvest, self._probe, self.memory, self.clock, self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
         if not folder.is_dir():

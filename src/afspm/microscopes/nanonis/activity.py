@@ -9,15 +9,15 @@ from typing import Any, Final
 
 from afspm.clock import Clock
 from afspm.errors import Refused
-from afspm.microscopes.in_force import frame
-from afspm.microscopes.measurements import SCAN, as_list
-from afspm.microscopes.microscope import ControllerLost
 from afspm.microscopes.nanonis.groups import Probe, ScanFrame
-from afspm.microscopes.nanonis.harvest import Harvest
 from afspm.microscopes.nanonis.listener import CurveEnded, Failed, Heard, ScanEnded
 from afspm.microscopes.nanonis.protocol import NanonisError
+from afspm.microscopes.nanonis.result_files import NanonisFiles
 from afspm.microscopes.nanonis.session import APPROACH, MODULES, Session
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.translator.driver import ControllerLost
+from afspm.translator.result_files import SCAN, as_list
+from afspm.translator.settings import frame
 
 _SETTLES_S: Final = 1.0
 """So long, in real time, a spectrum may take to be seen running."""
@@ -40,7 +40,13 @@ class Activity:
     """
 
     def __init__(
-        self, session: Session, harvest: Harvest, probe: Probe, kept: dict[str, Any], clock: Clock, log: logging.Logger
+        self,
+        session: Session,
+        harvest: NanonisFiles,
+        probe: Probe,
+        kept: dict[str, Any],
+        clock: Clock,
+        log: logging.Logger,
     ) -> None:
         self._ask = session.ask
         self._listener = session.listener

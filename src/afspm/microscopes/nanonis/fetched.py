@@ -16,7 +16,7 @@ from afspm.errors import ConfigError, FileError
 from afspm.microscopes.nanonis.groups import Ask
 from afspm.microscopes.nanonis.listener import CurveEnded
 from afspm.model import Region, Scan, ScanLines, Spectrum
-from afspm.record.whole import write_whole
+from afspm.storage.atomic import write_atomic
 
 SUFFIX: Final = ".npz"
 ROWS: Final = ("top-first", "recorded")
@@ -126,7 +126,7 @@ def write(path: Path, content: Sequence[Scan | Spectrum]) -> None:
     file = io.BytesIO()
     np.savez(file, about=np.array(json.dumps(about)), **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, [file.getvalue()])
+    write_atomic(path, [file.getvalue()])
 
 
 def read(path: Path) -> list[Scan | Spectrum]:

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from afspm.microscopes.in_force import FRAME
-from afspm.microscopes.parameters import Value
 from afspm.model import names
+from afspm.translator.parameters import Value
+from afspm.translator.settings import FRAME
 
 _DIGITS: Final = 1e-6
 _ADDED_UP: Final = frozenset(FRAME) - {names.SCAN_ANGLE, names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}

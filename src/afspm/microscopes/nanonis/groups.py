@@ -11,10 +11,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
 
-from afspm.microscopes.in_force import FRAME, POSITION, frame
 from afspm.microscopes.nanonis.protocol import BadReply
-from afspm.microscopes.parameters import FEEDBACK_ON, Value, refuse_value
 from afspm.model import names
+from afspm.translator.parameters import FEEDBACK_ON, Value, refuse_value
+from afspm.translator.settings import FRAME, POSITION, frame
 
 Ask = Callable[..., tuple[Any, ...]]
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
-from afspm.microscopes.microscope import ControllerLost
 from afspm.microscopes.nanonis import protocol
+from afspm.translator.driver import ControllerLost
 
 _SLOWEST_BYTES_PER_S: Final = 1e6
 _AT_ONCE: Final = 1 << 20

@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 
 from afspm.errors import AfspmError
-from afspm.microscopes.microscope import ControllerLost
 from afspm.microscopes.nanonis.link import Link
 from afspm.microscopes.nanonis.protocol import BadReply
+from afspm.translator.driver import ControllerLost
 
 _WAIT_MS: Final = 1000
 _LONGEST_CURVE_S: Final = 24 * 3600.0

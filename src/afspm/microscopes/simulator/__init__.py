@@ -11,9 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
-from afspm.errors import AfspmError, ConfigError, Gathered, Refused
-from afspm.microscopes.microscope import Action, Microscope, action
-from afspm.microscopes.parameters import FEEDBACK_ON, Value
+from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused
 from afspm.microscopes.simulator import files
 from afspm.microscopes.simulator.faults import Fault, Faults
 from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
@@ -23,10 +21,12 @@ from afspm.simulation import World
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.settings import build
 from afspm.simulation.world_settings import read_settings
+from afspm.translator.driver import Action, Driver, action
+from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.units import Duration
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 T = TypeVar("T")
 
@@ -62,7 +62,7 @@ _AT_FIRST: dict[str, Any] = {
 }
 
 
-class Simulator(Microscope):
+class Simulator(Driver):
     """The simulated microscope.
 
     Args:
@@ -125,7 +125,7 @@ class Simulator(Microscope):
         }
         self._world_settings = {name: settings for name, settings in world.items() if settings is not None}
         self._seed = seed
-        errors = Gathered()
+        errors = ErrorCollector()
         with errors:
             World.from_settings(self._world_settings, seed, 0.0)
         self._faults_settings = _made(Fault, faults or [], "faults", errors)
@@ -146,7 +146,7 @@ class Simulator(Microscope):
                 self._check_values(loop, initial or {}, errors)
         errors.raise_all()
 
-    def _check_values(self, loop: FeedbackSettings, initial: Mapping[str, Any], errors: Gathered) -> None:
+    def _check_values(self, loop: FeedbackSettings, initial: Mapping[str, Any], errors: ErrorCollector) -> None:
         """Values of parameters that are set by themselves: at the start, and by a person at the panel."""
         in_force = {
             FEEDBACK_ON: loop.on,
@@ -290,10 +290,10 @@ class Simulator(Microscope):
         found = super().own_actions()
         return found if self._fault_action else {name: a for name, a in found.items() if name != _FAULT}
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         """Be the translator, with the faults that are not the controller's."""
         from afspm.microscopes.simulator.faulty import FaultyTranslator
-        from afspm.microscopes.translator import run_translator
+        from afspm.translator.process import run_translator
 
         return run_translator(self, context, FaultyTranslator)
 
@@ -328,7 +328,7 @@ def _loop_of(settings: Mapping[str, Any]) -> FeedbackSettings | None:
         return None
 
 
-def _made(kind: type[T], tables: Sequence[Mapping[str, Any]], where: str, errors: Gathered) -> list[T]:
+def _made(kind: type[T], tables: Sequence[Mapping[str, Any]], where: str, errors: ErrorCollector) -> list[T]:
     made = []
     for i, table in enumerate(tables):
         with errors:

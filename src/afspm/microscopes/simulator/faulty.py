@@ -8,8 +8,8 @@ import threading
 
 from afspm.exit_codes import ExitCode
 from afspm.microscopes.simulator.faults import Fault, Faults
-from afspm.microscopes.translator import Translator
 from afspm.model import Response
+from afspm.translator.process import Translator
 
 
 class FaultyTranslator(Translator):

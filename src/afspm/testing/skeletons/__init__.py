@@ -11,8 +11,8 @@ _MODULE, _CLASS = "my_scope", "MyScope"
 _SKIPPED = {"__pycache__", "__init__.pyc"}
 
 
-def write_translator(name: str, into: Path) -> Path:
-    """Write the package of a translator.
+def write_driver(name: str, into: Path) -> Path:
+    """Write the package of a driver.
 
     Args:
         name: of the package; "my-scope" becomes my_scope, with the class MyScope.
@@ -29,7 +29,7 @@ def write_translator(name: str, into: Path) -> Path:
         raise ConfigError(f"{name!r} can't be the name of a package", hint="letters, digits and _, e.g. my_scope")
     class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
     target = into / module
-    source = Path(__file__).with_name("translator")
+    source = Path(__file__).with_name("driver")
     try:
         target.mkdir(parents=True)
         for file in sorted(source.rglob("*")):

@@ -13,28 +13,28 @@ from datetime import datetime
 from pathlib import Path
 
 from afspm.addresses import connectable
+from afspm.client.component import Component
+from afspm.client.link import ExperimentLink
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
-from afspm.experiment import Experiment, Role, Start, load
+from afspm.experiment import Experiment, ProcessStart, Role, load
+from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.microscopes import Microscope
 from afspm.model import Frame
-from afspm.record.facts import STATE_DIR
-from afspm.runtime.component import Component
-from afspm.runtime.launch import Launch, Sockets
-from afspm.runtime.link import Link
-from afspm.runtime.process import new_session
-from afspm.supervisor import common_clock, run_folder
-from afspm.supervisor.common_clock import Common
+from afspm.process.context import new_session
+from afspm.record.run_json import STATE_DIR
+from afspm.supervisor import run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
 from afspm.supervisor.run import addresses_of
-from afspm.testing.translators.bench import Bench
+from afspm.supervisor.run_identity import RunIdentity
+from afspm.testing.translators.client import CheckClient
 from afspm.testing.translators.processes import Processes
+from afspm.testing.translators.registry import Lost
 from afspm.testing.translators.support import Support, find_out
-from afspm.testing.translators.verdicts import Lost
-from afspm.transport.launching import open_port
+from afspm.translator import Driver
 from afspm.transport.port import ParentGone, Port
+from afspm.transport.zmq_port import open_port
 
 NAME = "translator_test"
 SPEED = 20.0
@@ -56,7 +56,7 @@ class Tester(Component):
 
 
 @dataclass(frozen=True)
-class Options:
+class CheckOptions:
     """How to check.
 
     Attributes:
@@ -78,7 +78,7 @@ class Options:
 
 
 @dataclass
-class Session:
+class CheckSession:
     """What is there to check.
 
     Attributes:
@@ -89,17 +89,17 @@ class Session:
         complaints: the warnings and errors that were logged; it grows.
     """
 
-    bench: Bench
+    client: CheckClient
     support: Support
     translator: str
     simulated: bool
     folder: Path
-    options: Options
+    options: CheckOptions
     excused: Mapping[str, str]
     complaints: Sequence[str]
 
 
-def prepare(options: Options) -> Experiment:
+def prepare(options: CheckOptions) -> Experiment:
     """The experiment with the tester in it, and a scheduler if it had none.
 
     Raises:
@@ -123,8 +123,8 @@ def prepare(options: Options) -> Experiment:
 
 
 @contextmanager
-def opened(options: Options) -> Iterator[Session]:
-    """Start, or join, what is to be checked; in control of the microscope while in the block.
+def opened(options: CheckOptions) -> Iterator[CheckSession]:
+    """ProcessStart, or join, what is to be checked; in control of the microscope while in the block.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
@@ -135,36 +135,36 @@ def opened(options: Options) -> Iterator[Session]:
     (translator,) = resolved.with_role(Role.TRANSLATOR)
     with ExitStack() as stack:
         complaints: list[str] = []
-        bench, folder, simulated = _bench(experiment, options, stack, complaints)
-        stack.callback(bench.end)
-        stack.enter_context(_interrupting(bench))
+        client, folder, simulated = _client(experiment, options, stack, complaints)
+        stack.callback(client.end)
+        stack.enter_context(_interrupting(client))
         abilities = resolved.abilities(translator)
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
-        support = find_out(bench, sorted(actions), sorted(parameters))
+        support = find_out(client, sorted(actions), sorted(parameters))
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
         class_ = resolved.classes.get(translator.name)
         excused: Mapping[str, str] = {}
-        if isinstance(class_, type) and issubclass(class_, Microscope):
+        if isinstance(class_, type) and issubclass(class_, Driver):
             excused = class_.excused(support.controller)
-        yield Session(bench, support, named, simulated, folder, options, excused, complaints)
+        yield CheckSession(client, support, named, simulated, folder, options, excused, complaints)
 
 
 @contextmanager
-def _interrupting(bench: Bench) -> Iterator[None]:
-    """Ctrl-C interrupts the bench, where signals come to this thread at all."""
+def _interrupting(client: CheckClient) -> Iterator[None]:
+    """Ctrl-C interrupts the client, where signals come to this thread at all."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, lambda number, frame: bench.interrupt())
+    before = signal.signal(signal.SIGINT, lambda number, frame: client.interrupt())
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def _bench(
-    experiment: Experiment, options: Options, stack: ExitStack, complaints: list[str]
-) -> tuple[Bench, Path, bool]:
+def _client(
+    experiment: Experiment, options: CheckOptions, stack: ExitStack, complaints: list[str]
+) -> tuple[CheckClient, Path, bool]:
     """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
     common = _common(experiment, options)
     clock = common.clock
@@ -190,18 +190,20 @@ def _bench(
         stack.callback(port.close)
     processes.start(starts)
     links = [_link(port, own, _logger(log)) for port in ports]
-    bench = Bench(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
+    client = CheckClient(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
     try:
-        bench.begin()
+        client.begin()
     except Lost as lost:
         raise Lost("; ".join(filter(None, (str(lost), processes.errors)))) from lost
-    return bench, folder, common.simulated
+    return client, folder, common.simulated
 
 
 _NOTHING = logging.CRITICAL + 1
 
 
-def _starts(experiment: Experiment, options: Options, common: Common, folder: Path) -> tuple[Launch, list[Start]]:
+def _starts(
+    experiment: Experiment, options: CheckOptions, common: RunIdentity, folder: Path
+) -> tuple[Launch, list[ProcessStart]]:
     """The tester's own launch line, and what is to be started."""
     starts = experiment.launches(
         take_address=FreePorts().address,
@@ -217,7 +219,7 @@ def _starts(experiment: Experiment, options: Options, common: Common, folder: Pa
     return own, [start for start in starts if start.launch.name != NAME]
 
 
-def _left_out(experiment: Experiment, options: Options) -> list[str]:
+def _left_out(experiment: Experiment, options: CheckOptions) -> list[str]:
     """What is not started: all but translator, scheduler and emulated controller, and what runs already."""
     resolved = experiment.resolved
     wanted = {part.name for role in (Role.TRANSLATOR, Role.SCHEDULER) for part in resolved.with_role(role)}
@@ -225,7 +227,7 @@ def _left_out(experiment: Experiment, options: Options) -> list[str]:
     return [name for name in experiment.component_names if name not in wanted or name in options.without]
 
 
-def _translator_address(experiment: Experiment, starts: Sequence[Start]) -> str | None:
+def _translator_address(experiment: Experiment, starts: Sequence[ProcessStart]) -> str | None:
     """Where the scheduler asks the translator; None: nobody says."""
     for start in starts:
         if start.role is Role.SCHEDULER:
@@ -241,8 +243,8 @@ def _translator_address(experiment: Experiment, starts: Sequence[Start]) -> str 
     return None
 
 
-def _link(port: Port, own: Launch, log: logging.Logger) -> Link:
-    return Link(
+def _link(port: Port, own: Launch, log: logging.Logger) -> ExperimentLink:
+    return ExperimentLink(
         port,
         NAME,
         source=own.sockets.subscribe[0],
@@ -253,21 +255,21 @@ def _link(port: Port, own: Launch, log: logging.Logger) -> Link:
     )
 
 
-def is_simulated(experiment: Experiment, options: Options) -> bool:
+def is_simulated(experiment: Experiment, options: CheckOptions) -> bool:
     """True if what is started here is simulated for certain."""
     return experiment.simulated(without=_left_out(experiment, options))
 
 
-def _common(experiment: Experiment, options: Options) -> Common:
+def _common(experiment: Experiment, options: CheckOptions) -> RunIdentity:
     """The scheduler's, where that runs already; else our own."""
     simulated = is_simulated(experiment, options)
     schedulers = {part.name for part in experiment.resolved.with_role(Role.SCHEDULER)}
     launch = experiment.asking([NAME]) if schedulers <= set(options.without) else None
     if launch is not None:
-        common = common_clock.of_scheduler(launch, logging.getLogger(__name__).warning)
+        common = run_identity.ask_scheduler(launch, logging.getLogger(__name__).warning)
         return replace(common, simulated=simulated or common.simulated)
     clock = replace(experiment.clock(), speed=options.speed) if simulated else ExperimentClock.real()
-    return Common(clock, common_clock.new_identity(), simulated)
+    return RunIdentity(clock, run_identity.new_identity(), simulated)
 
 
 def _now() -> datetime:

@@ -1,0 +1,64 @@
+"""Packets that wait to be handled: in order, none lost, in bounded memory however long a handler takes."""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+from collections import deque
+from typing import IO
+
+from afspm.model import Packet
+
+MEMORY_LIMIT_BYTES = 256 << 20
+
+
+class Backlog:
+    """A queue of packets. Those beyond `limit_bytes` wait in a temporary file, which goes when it is empty."""
+
+    def __init__(self, limit_bytes: int = MEMORY_LIMIT_BYTES) -> None:
+        self._limit_bytes = limit_bytes
+        self._memory: deque[Packet] = deque()
+        self._memory_bytes = 0
+        self._file: IO[bytes] | None = None
+        self._read_at = 0
+        self._on_disk = 0
+
+    def __len__(self) -> int:
+        return len(self._memory) + self._on_disk
+
+    def put(self, packet: Packet) -> None:
+        size = len(packet.payload)
+        # once some wait on disk all later ones must too, or they would overtake
+        if self._file is None and (not self._memory or self._memory_bytes + size <= self._limit_bytes):
+            self._memory.append(packet)
+            self._memory_bytes += size
+            return
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="afspm-")  # noqa: SIM115 - open for as long as it is needed
+        self._file.seek(0, 2)
+        pickle.dump((packet.envelope, bytes(packet.payload), packet.time_ns), self._file)
+        self._on_disk += 1
+
+    def take(self) -> Packet | None:
+        """Return the oldest packet; None if there is none."""
+        if self._memory:
+            packet = self._memory.popleft()
+            self._memory_bytes -= len(packet.payload)
+            return packet
+        if self._file is None:
+            return None
+        self._file.seek(self._read_at)
+        packet = Packet(*pickle.load(self._file))
+        self._read_at = self._file.tell()
+        self._on_disk -= 1
+        if self._on_disk == 0:
+            self.close()
+        return packet
+
+    def close(self) -> None:
+        """Drop everything."""
+        self._memory.clear()
+        self._memory_bytes = self._on_disk = self._read_at = 0
+        if self._file is not None:
+            self._file.close()
+            self._file = None

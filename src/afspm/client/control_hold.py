@@ -1,0 +1,202 @@
+"""Having control: asking for it, waiting for it, noticing that it is gone, giving it back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from afspm.client.link import ExperimentLink
+from afspm.errors import ControlLost, ExperimentEnded, NoResponse, Refused
+from afspm.model import ControlMode, ControlRequest, ControlResponse, Packet, Problem, ProblemNames
+from afspm.process.parent import StopRequested
+
+ASK_AGAIN_S = 10.0  # should a published control state ever not reach us
+_WAIT_FOR = {
+    ControlResponse.ALREADY_UNDER_CONTROL,
+    ControlResponse.WRONG_CONTROL_MODE,
+    ControlResponse.WRONG_EXP_PROBLEM,
+}
+
+
+class ControlHold:
+    """The component's hold on control, and the problem that it wants it for.
+
+    Answers of the scheduler grant control; its published state takes it away, once that has named us. (A state from
+    before the grant may still be under way: it must not be taken for a loss.)
+
+    Attributes:
+        held: we are in control.
+        why_lost: for a person, why we no longer are.
+        gives_back_inherited: give back whatever control an earlier life of this component died with.
+        is_unbroken: in this block control that is lost is not waited for: nothing is asked for in a second tenure.
+    """
+
+    def __init__(self, link: ExperimentLink, problems: ProblemNames) -> None:
+        self._link = link
+        self._problems = problems
+        self._wanted: list[int] = []
+        self._was_named = False
+        self.held = False
+        self.why_lost = ""
+        self.gives_back_inherited = False
+        self.is_unbroken = False
+        link.listen(self._on_packet)
+
+    @property
+    def was_lost(self) -> bool:
+        """True while control is wanted and not there."""
+        return bool(self._wanted) and not self.held
+
+    @contextmanager
+    def hold(
+        self, *, solving: int = Problem.NONE, until_s: float | None = None, unbroken: bool = False
+    ) -> Iterator[None]:
+        """Have control in the block; within another such block it is that one's.
+
+        Raises:
+            ControlLost: it was not given until `until_s`; or, in the block, if `unbroken`, is no longer there.
+            Refused: the problem to be solved is not flagged.
+        """
+        if self._wanted and solving not in (Problem.NONE, self._wanted[0]):
+            raise ControlLost(
+                f"control is held to solve {self._name(self._wanted[0])}, not {self._name(solving)}",
+                where=self._link.name,
+                hint="leave the one `with scope.control(...)` before the other begins",
+            )
+        self._wanted.append(self._wanted[0] if self._wanted else solving)
+        was_unbroken = self.is_unbroken
+        try:
+            self.regain(until_s)
+            self.is_unbroken = was_unbroken or unbroken
+            yield
+        except (ExperimentEnded, StopRequested):
+            self._wanted.pop()
+            if not self._wanted:
+                self.leave()
+            raise
+        except BaseException:
+            self._end_block(quietly=True)
+            raise
+        else:
+            self._end_block(quietly=False)
+        finally:
+            self.is_unbroken = was_unbroken
+
+    def regain(self, until_s: float | None = None) -> None:
+        """Be in control: at once if we are, else ask, wait for the control state to change, and ask again.
+
+        Raises:
+            ControlLost: not until `until_s`, or what we wanted control for has been solved, or not without a break.
+        """
+        link, solving = self._link, self._solving
+        if self.is_unbroken and not self.held:
+            raise ControlLost(
+                f"control was lost: {self.why_lost}",
+                where=link.name,
+                hint="others may have moved the probe or set something: begin the block again",
+            )
+        reported = ""
+        while not self.held:
+            may_ask = link.or_reconnected(self._when_changed(solving))
+            obstacle = self._ask(solving, until_s)
+            if obstacle is None:
+                break
+            if obstacle != reported:
+                link.log.info("waiting for control: %s", obstacle)
+            reported = obstacle
+            link.wait(may_ask, link.earlier(ASK_AGAIN_S, until_s))
+            if until_s is not None and link.clock.monotonic_s() >= until_s:
+                raise ControlLost(f"control was not given in time: {obstacle}", where=link.name)
+        if reported:
+            link.log.info("in control")
+
+    def release_inherited(self) -> None:
+        """Give back control that an earlier life had and nobody wants now: others wait for it."""
+        state = self._link.view.control
+        if state is not None and state.holder == self._link.name and not self._wanted and not self.held:
+            self._link.send_only(ControlRequest.RELEASE_CTRL)
+
+    def leave(self) -> None:
+        """Give back control, if we have it, without waiting for the answer."""
+        if self.held and not self._link.ended:
+            self._link.send_only(ControlRequest.RELEASE_CTRL)
+        self.held = False
+
+    def lost(self, why: str) -> None:
+        """Note that the scheduler says that we are not in control."""
+        self.held = False
+        self.why_lost = why
+
+    def obstacle(self, solving: int = Problem.NONE) -> str:
+        """Return what stands between us and control, for a person; empty if nothing does."""
+        state = self._link.view.control
+        if state is None:
+            return ""
+        if state.mode is ControlMode.MANUAL:
+            return "the mode is MANUAL"
+        if solving not in state.problems and (solving or state.problems):
+            return ", ".join(map(self._name, state.problems)) + " flagged" if state.problems else "nothing to solve"
+        if state.holder not in (None, self._link.name):
+            return f"{state.holder} is in control"
+        return ""
+
+    @property
+    def _solving(self) -> int:
+        return self._wanted[-1] if self._wanted else Problem.NONE
+
+    def _ask(self, solving: int, until_s: float | None) -> str | None:
+        """Ask for control once. Returns why it has to be waited for; None: it is ours."""
+        link = self._link
+        response = link.request(ControlRequest.REQUEST_CTRL, int(solving), until_s=until_s)
+        if response.ok:
+            # the state that names us may have come before the answer
+            self.held, self._was_named = True, link.view.control is not None and link.view.control.holder == link.name
+            return None
+        if response.code not in _WAIT_FOR:
+            raise Refused(response.code, response.reason or "control was refused", where=link.name)
+        if solving and response.code == ControlResponse.WRONG_EXP_PROBLEM and not self._is_flagged(solving):
+            raise ControlLost(f"{self._name(solving)} is not flagged: there is nothing to solve", where=link.name)
+        return response.reason or self.obstacle(solving)
+
+    def _when_changed(self, solving: int) -> Callable[[], bool]:
+        """Return a condition that holds when another control state than now lets us ask again."""
+        view, version = self._link.view, self._link.view.count("ControlState")
+
+        def may_ask() -> bool:
+            is_solved = bool(solving) and not self._is_flagged(solving)  # asking says so, for certain
+            return view.count("ControlState") != version and (is_solved or not self.obstacle(solving))
+
+        return may_ask
+
+    def _is_flagged(self, problem: int) -> bool:
+        state = self._link.view.control
+        return state is not None and problem in state.problems
+
+    def _name(self, problem: int) -> str:
+        return self._problems.name(problem) if problem else "no problem"
+
+    def _on_packet(self, packet: Packet, ours: bool) -> None:
+        state = self._link.view.control  # it is up to date before its listeners are called
+        if not ours or not packet.envelope.startswith("ControlState") or state is None:
+            return
+        if not self.held:
+            if self.gives_back_inherited:
+                self.release_inherited()
+        elif state.holder == self._link.name:
+            self._was_named = True
+        elif self._was_named:
+            self.lost(self.obstacle(self._solving) or "it was taken away")
+
+    def _end_block(self, *, quietly: bool) -> None:
+        """Give control back at the end of the outermost block; `quietly`: another exception is on its way."""
+        self._wanted.pop()
+        if self._wanted or not self.held:
+            return
+        self.held = False
+        link = self._link
+        try:
+            # that we were not in control any more is fine; on the way out of a failure nothing is waited for long
+            link.request(ControlRequest.RELEASE_CTRL, until_s=link.until(link.request_timeout_s if quietly else None))
+        except (NoResponse, ExperimentEnded, StopRequested):
+            if not quietly:
+                raise

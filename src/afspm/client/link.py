@@ -1,0 +1,314 @@
+"""The one place that waits: takes what the port brings to its handlers, and asks the scheduler."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from afspm import wire
+from afspm.client.published_state import PublishedState
+from afspm.client.request_tracker import RequestTracker
+from afspm.clock import Clock
+from afspm.errors import ConfigError, ExperimentEnded, NoResponse, WireError
+from afspm.launch import Launch
+from afspm.model import (
+    HAS_ENDED,
+    OTHER_RUN_RESPONSE,
+    ControlRequest,
+    Packet,
+    Request,
+    Response,
+    ResponseDetail,
+    request_name,
+)
+from afspm.process.context import STATE_MESSAGES, ProcessActivity
+from afspm.process.parent import StopRequested
+from afspm.transport.port import (
+    CaughtUp,
+    ControlConnected,
+    ControlDisconnected,
+    Incoming,
+    Killed,
+    PacketReceived,
+    ParentGone,
+    Port,
+    ReplyReceived,
+)
+
+LONGER_THAN_THE_SCHEDULER = 1.2
+"""Factor on the time that the scheduler waits for the microscope: what it says then is an answer, and a component that
+asks again instead makes the connection anew, as if the scheduler were gone."""
+CAUGHT_UP_WITHIN_S = 2.0  # a scheduler of version 1 replays without saying when it is done
+Listener = Callable[[Packet, bool], None]
+
+
+class ExperimentLink:
+    """A component's connection to its experiment, for use from one thread.
+
+    Args:
+        source: the address of the scheduler's publisher, whose packets tell the state; None: all do.
+        session: differs between two lives of a component of the same name.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        name: str,
+        *,
+        source: str | None = None,
+        session: str = "0",
+        request_timeout_s: float = 5.0,
+        request_retries: int = 3,
+        activity: ProcessActivity | None = None,
+        log: logging.Logger | None = None,
+    ) -> None:
+        self.port = port
+        self.name = name
+        self.clock: Clock = port.clock
+        self.view = PublishedState()
+        self.activity = activity or ProcessActivity(self.clock)
+        self.log = log or logging.getLogger(f"afspm.{name}")
+        self.ended = False
+        self.request_timeout_s = request_timeout_s
+        self.requests = RequestTracker(port.send, name, session)
+        self.next_id = self.requests.next_id
+        self._retries = request_retries
+        self._source = source
+        self._over: BaseException | None = None
+        self._caught_up: set[str] = set()
+        self._listeners: dict[object, Listener] = {}
+
+    @classmethod
+    def of_launch(cls, launch: Launch, port: Port, session: str, **given: Any) -> ExperimentLink:
+        """Return the link of a process that was launched with a line.
+
+        Args:
+            given: name, activity or log, as to the constructor.
+        """
+        return cls(
+            port,
+            given.pop("name", launch.name),
+            source=launch.sockets.subscribe[0] if launch.sockets.subscribe else None,
+            session=session,
+            request_timeout_s=launch.request_timeout_s,
+            request_retries=launch.request_retries,
+            **given,
+        )
+
+    # --- waiting ---
+
+    def wait(self, done: Callable[[], bool], until_s: float | None = None) -> bool:
+        """Wait until `done()`, which is tried after whatever arrives; False if `until_s` (monotonic) comes first.
+
+        Raises:
+            ExperimentEnded, StopRequested: there is nothing more to wait for.
+        """
+        with self.activity.waiting():
+            while not done():
+                left_s = None if until_s is None else until_s - self.clock.monotonic_s()
+                if left_s is not None and left_s <= 0.0:
+                    return False
+                self.pump(left_s)
+        return True
+
+    def wait_connected(self, done: Callable[[], bool], within_s: float, until_s: float | None = None) -> bool:
+        """Wait until `done()`: while the scheduler is away for as long as that lasts, else for `within_s` at most."""
+        while not done():
+            if not self.wait(lambda: self.connected or done(), until_s):
+                return False
+            is_settled = self.or_reconnected(lambda: done() or not self.connected)
+            if not self.wait(is_settled, self.earlier(within_s, until_s)):
+                return False
+        return True
+
+    def pump(self, timeout_s: float | None) -> None:
+        """Wait for what arrives, once, and bring it to its handlers."""
+        self.check()
+        for incoming in self.port.poll(timeout_s):
+            self._take(incoming)
+        self.check()
+
+    def check(self) -> None:
+        """Raise the reason why there is nothing more to wait for, if there is one.
+
+        Raises:
+            ExperimentEnded, StopRequested: it is over, or we are to stop.
+            NoResponse: we have left.
+            ConfigError: the scheduler is that of another run.
+        """
+        if self._over is not None:
+            raise self._over
+        if self.ended:
+            raise ExperimentEnded(HAS_ENDED, where=self.name)
+
+    def leave(self) -> None:
+        """Close the port: nothing is heard any more, and nobody can be asked."""
+        hint = "afspm.connect() joins it again"
+        self._over = NoResponse("the experiment was left, by close()", where=self.name, hint=hint)
+        self.port.close()
+
+    def wait_caught_up(self, until_s: float | None = None) -> None:
+        """Wait until everything the scheduler has cached is here; once that is so, returns at once.
+
+        A scheduler that is away is waited for: its cache may show that we have been measured already.
+        """
+        if not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s) and self.connected:
+            self._caught_up.add(self._source or "")  # it is of version 1, and does not say
+
+    def is_caught_up(self) -> bool:
+        return self._source in self._caught_up if self._source else bool(self._caught_up)
+
+    def until(self, timeout_s: float | None) -> float | None:
+        """Return the moment, in monotonic time, when a timeout is over."""
+        return None if timeout_s is None else self.clock.monotonic_s() + timeout_s
+
+    def earlier(self, timeout_s: float, until_s: float | None) -> float:
+        """Return the moment when a timeout is over, or `until_s` if that comes first."""
+        soon_s = self.clock.monotonic_s() + timeout_s
+        return soon_s if until_s is None else min(soon_s, until_s)
+
+    def or_reconnected(self, done: Callable[[], bool]) -> Callable[[], bool]:
+        """Return a condition that holds when `done()` does, or the scheduler was connected anew."""
+        connections = self.connections
+        return lambda: done() or self.connections != connections
+
+    # --- listening ---
+
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        """Call `listener(packet, ours)` with every packet from now on; `ours`: it is the scheduler's.
+
+        Returns what ends that.
+        """
+        key = object()
+        self._listeners[key] = listener
+        return lambda: self._listeners.pop(key, None) and None
+
+    @contextmanager
+    def listening(self, listener: Listener) -> Iterator[None]:
+        """`listen` while in the block."""
+        forget = self.listen(listener)
+        try:
+            yield
+        finally:
+            forget()
+
+    # --- asking ---
+
+    @property
+    def connected(self) -> bool:
+        return self.requests.connected
+
+    @property
+    def connections(self) -> int:
+        return self.requests.connections
+
+    @property
+    def version(self) -> wire.Version:
+        return self.requests.version
+
+    def request(
+        self, kind: int, subject: Any = None, *, request_id: str = "", until_s: float | None = None
+    ) -> Response:
+        """Ask the scheduler and wait for its answer, whatever it is.
+
+        A request that stays unanswered is repeated with its id, which has it executed once. While the scheduler is
+        gone it is waited for.
+
+        Raises:
+            ExperimentEnded: that was the answer.
+            NoResponse: no answer to any repetition, or none until `until_s` (monotonic).
+        """
+        request = Request(kind, subject, id=request_id or self.next_id())
+        frames, requests, sent = wire.encode_request(request), self.requests, 0
+        requests.expect(request.id)
+        try:
+            while sent < self._tries(kind):
+                self._wait_for_scheduler(until_s)
+                connections = self.connections
+                self.port.send(frames)
+                self.wait(
+                    self.or_reconnected(lambda: requests.answer is not None),
+                    self.earlier(self.request_timeout_s * LONGER_THAN_THE_SCHEDULER, until_s),
+                )
+                if requests.answer is not None:
+                    return self._checked(requests.answer)
+                if until_s is not None and self.clock.monotonic_s() >= until_s:
+                    break
+                # a connection that was lost is the scheduler's restart, not its silence; one of version 1 may have
+                # ended over just this request
+                sent += connections == self.connections or self.version is wire.Version.ONE
+                self.log.debug("%s (%s) is asked again", request_name(kind), request.id)
+        finally:
+            requests.expect("")
+        raise NoResponse(
+            f"{request_name(kind)} was not answered, asked {max(sent, 1)} times",
+            where=self.name,
+            hint="whether it was carried out is not known",
+        )
+
+    def send_only(self, kind: ControlRequest, subject: Any = None) -> None:
+        """Ask without waiting for the answer, for what is done on the way out."""
+        self.requests.send_only(kind, subject)
+
+    def tell(self, thing: Any) -> None:
+        """Have the scheduler publish something of ours, and don't wait for it."""
+        self.requests.tell(thing, self.clock.monotonic_s(), self.request_timeout_s)
+
+    def _checked(self, answer: Response) -> Response:
+        if answer.detail is ResponseDetail.EXPERIMENT_ENDED:
+            self.ended = True  # this may come before the signal itself
+        self.check()
+        return answer
+
+    def _wait_for_scheduler(self, until_s: float | None) -> None:
+        if self.wait(lambda: self.connected, self.earlier(self.request_timeout_s, until_s)):
+            return
+        self.log.warning("the scheduler is not there; waiting for it")
+        if not self.wait(lambda: self.connected, until_s):
+            raise NoResponse("the scheduler is not there", where=self.name, hint="is the experiment running?")
+
+    def _tries(self, kind: int) -> int:
+        # a scheduler of version 1 does not know ids: what it may have done must not be asked for twice
+        if kind == ControlRequest.ACTION and self.version is wire.Version.ONE:
+            return 1
+        return 1 + self._retries
+
+    # --- what arrives ---
+
+    def _take(self, incoming: Incoming) -> None:
+        match incoming:
+            case PacketReceived(packet, source):
+                self._take_packet(packet, source)
+            case ReplyReceived(response):
+                if response.code == OTHER_RUN_RESPONSE and self._over is None:
+                    hint = "end the other experiment, or give this one other addresses"
+                    self._over = ConfigError(response.reason, where=self.name, hint=hint)
+                self.requests.on_reply(response, self.clock.monotonic_s())
+            case CaughtUp(source):
+                self._caught_up.add(source)
+            case ControlConnected():
+                self.requests.on_connected()
+            case ControlDisconnected():
+                self.requests.connected = False
+            case Killed():
+                self.ended = True
+            case ParentGone():
+                self._over = StopRequested()
+
+    def _take_packet(self, packet: Packet, source: str) -> None:
+        ours = self._source is None or source == self._source
+        if ours:
+            self.view.take_time(packet.time_ns)
+            self._look_at(packet)
+        for listener in tuple(self._listeners.values()):
+            listener(packet, ours)
+
+    def _look_at(self, packet: Packet) -> None:
+        try:
+            message = wire.message_of(packet.envelope)
+            if message in STATE_MESSAGES:
+                self.view.take(message, wire.decode(message, packet.payload))
+        except WireError as error:
+            self.log.debug("a packet can't be read: %s", error)

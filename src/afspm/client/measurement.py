@@ -1,0 +1,291 @@
+"""Taking one scan or spectrum, whatever gets in between, exactly once."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import UTC
+from typing import Any
+
+from afspm import wire
+from afspm.client.command_retry import NOT_IN_CONTROL, CommandRetry
+from afspm.client.control_hold import ControlHold
+from afspm.client.cycle import Cycle, CycleOutcome
+from afspm.client.keyed_results import KeyedResults, MeasurementResult, check_key
+from afspm.client.link import ExperimentLink
+from afspm.client.setup import MeasurementSetup
+from afspm.client.targets import Target, target_from
+from afspm.errors import MeasurementFailed, NoResponse, Refused, WireError
+from afspm.formatting import day_and_time
+from afspm.logic.sessions import KEYED
+from afspm.model import ControlRequest, ControlResponse, Packet, Response
+
+BEGUN_WITHIN_S = 5.0  # from the success of the action to the state that says so
+MOST_FAILURES = 5  # in a row, that nothing explains: then a person should look
+
+
+class _Watch:
+    """A cycle that takes in what the scheduler publishes, until it is closed."""
+
+    def __init__(self, link: ExperimentLink, target: Target, cycle: Cycle) -> None:
+        self._link = link
+        self._message = target.message
+        self.cycle = cycle
+        self.close = link.listen(self._take)
+
+    def is_over(self) -> bool:
+        return self.cycle.outcome is not None
+
+    def wait_if_begun(self, until_s: float | None) -> None:
+        if self.cycle.begun:
+            self._link.wait(self.is_over, until_s)
+
+    def _take(self, packet: Packet, ours: bool) -> None:
+        if not ours:
+            return
+        try:
+            name = wire.message_of(packet.envelope)
+            if name == "ScopeStateMsg":
+                self.cycle.on_state(self._link.view.state, packet.time_ns)
+            elif name == self._message:
+                self.cycle.on_result(wire.decode(name, packet.payload), packet.time_ns)
+        except WireError as error:
+            self._link.log.warning("a %s can't be read: %s", packet.envelope, error)
+
+
+@dataclass
+class _Task:
+    """How far a measurement has come."""
+
+    target: Target
+    key: str | None
+    stem: str
+    until_s: float | None
+    attempt: int = 0
+    failures: int = 0
+    interruptions: list[str] = field(default_factory=list)
+    watch: _Watch | None = None
+
+    @property
+    def request_id(self) -> str:
+        """The id of the action that begins it: another in every attempt, the same in every life."""
+        return f"{self.stem}/{self.attempt}"
+
+    def drop_watch(self) -> None:
+        if self.watch is not None:
+            self.watch.close()
+        self.watch = None
+
+
+class MeasurementRunner:
+    """Takes measurements over one link, one at a time."""
+
+    def __init__(
+        self,
+        link: ExperimentLink,
+        control: ControlHold,
+        commands: CommandRetry,
+        setup: MeasurementSetup,
+        results: KeyedResults,
+    ) -> None:
+        self._link = link
+        self._control = control
+        self._commands = commands
+        self._setup = setup
+        self._results = results
+        self._channels: dict[str, frozenset[str]] = {}
+        self._unfinished = self._of_earlier_life()
+
+    def take(self, target: Target, key: str | None, until_s: float | None) -> MeasurementResult:
+        """Measure until there is a complete result; with a key, once in all lives of the component.
+
+        Raises:
+            Refused: the microscope, or a limit, says no.
+            NoResponse: not until `until_s`.
+            MeasurementFailed: the microscope fails again and again.
+            ControlLost: control was not given until `until_s`.
+        """
+        if key is not None and (found := self._results.find(check_key(key), target.facts())) is not None:
+            return found
+        self._link.wait_caught_up(until_s)  # what is cached must not be taken for ours
+        task = _Task(target, key, f"{self._link.name}/{KEYED}/{key}" if key else self._link.next_id(), until_s)
+        try:
+            self._take_up(task)
+            things = self._finish(task)
+        except BaseException:
+            if task.key is not None and task.watch is not None and not task.watch.is_over():
+                self._unfinished, task.watch = task.watch, None  # what becomes of it is taken up by its key
+            raise
+        finally:
+            task.drop_watch()
+        result = MeasurementResult(things, task.interruptions)
+        self._channels[target.what] = frozenset(map(target.name_of, things))
+        if key is not None:
+            with self._link.clock.late():
+                self._results.fulfil(key, target.facts(), result)
+        return result
+
+    def _of_earlier_life(self) -> _Watch | None:
+        """Watch, from the first packet on, for what an earlier life asked for and did not get."""
+        intent = self._results.pending
+        if intent is None:
+            return None
+        target = target_from(intent["plan"])
+        since_ns = -1 if intent["since_ns"] is None else intent["since_ns"]
+        return _Watch(self._link, target, Cycle(target.busy, target.fits, since_ns=since_ns, resumed=True))
+
+    def _take_up(self, task: _Task) -> None:
+        """Continue what an earlier life, or an earlier call, was at, if it was this."""
+        intent, watch = self._results.pending, self._unfinished
+        if task.key is None and watch is not None:
+            # what comes now is not of it; what has come is kept for the call with its key
+            watch.wait_if_begun(task.until_s)
+            watch.close()
+            self._unfinished = watch if watch.is_over() else None
+            return
+        self._unfinished = None
+        if intent is None or intent["key"] != task.key or intent["plan"] != task.target.facts():
+            if watch is not None:
+                watch.close()
+            return
+        task.attempt = intent["attempt"]  # ids of attempts before are answered, not executed
+        task.interruptions = intent["interruptions"]
+        task.watch = watch
+        if watch is not None:
+            self._link.log.info("%s %s: taken up where it was", task.target.what, task.key)
+
+    def _finish(self, task: _Task) -> list[Any]:
+        """Return the newest result of each name: a restarted translator may have published one twice."""
+        if task.watch is not None:
+            task.watch.wait_if_begun(task.until_s)
+        if task.watch is not None and task.watch.cycle.outcome is CycleOutcome.COMPLETED:
+            self._control.release_inherited()
+            results = task.watch.cycle.results
+        else:
+            with ExitStack() as control:
+                with self._link.clock.late():
+                    control.enter_context(self._control.hold(until_s=task.until_s))
+                results = self._measure(task).results
+        return list({task.target.name_of(thing): thing for thing in results}.values())
+
+    def _measure(self, task: _Task) -> Cycle:
+        """Attempt after attempt, until one is complete."""
+        watch = task.watch
+        if watch is not None and watch.is_over() and watch.cycle.outcome is not CycleOutcome.COMPLETED:
+            task.drop_watch()
+        elif watch is not None and watch.is_over() and self._is_done(task, watch.cycle):
+            return watch.cycle  # what was begun in an earlier life ended while control was waited for
+        while True:
+            if task.watch is not None and task.watch.is_over():
+                task.drop_watch()
+            self._attempt(task)
+            if task.watch is not None and task.watch.is_over() and self._is_done(task, task.watch.cycle):
+                return task.watch.cycle
+
+    def _attempt(self, task: _Task) -> None:
+        """Prepare and begin once, and follow to the end.
+
+        What was asked for in an earlier life is asked for with the same id, so that it is not executed twice; so is
+        what was left without an answer when control was lost. Leaves no watch where nothing was begun.
+        """
+        link, target, until_s = self._link, task.target, task.until_s
+        self._control.regain(until_s)
+        is_new = task.watch is None
+        if task.watch is not None and task.watch.is_over():
+            return  # it had begun, and ended while control was waited for
+        if is_new:
+            task.attempt += 1
+            self._write_down(task)
+        with link.clock.late():
+            self._setup.prepare(target, until_s)
+        states = link.view.count("ScopeStateMsg")
+        watch = task.watch = task.watch or _Watch(
+            link, target, Cycle(target.busy, target.fits, since_ns=link.view.newest_ns)
+        )
+        cycle = watch.cycle
+        with link.clock.late():
+            response = self._commands.send(
+                ControlRequest.ACTION,
+                target.action,
+                request_id=task.request_id,
+                until_s=until_s,
+                is_seen=lambda: cycle.begun,
+            )
+        if response.ok or cycle.begun:
+            self._follow(task, watch)
+            return
+        if _may_have_begun(response, is_new=is_new):
+            cycle.control_was_lost()
+        else:
+            task.drop_watch()
+        self._get_over(response, states, until_s, is_new=is_new)
+
+    def _get_over(self, response: Response, states: int, until_s: float | None, *, is_new: bool) -> None:
+        """Wait for what stands in the way of an action, or raise Refused."""
+        try:
+            self._commands.get_over(ControlRequest.ACTION, response, states, until_s)
+        except Refused:
+            # What was asked for before is answered from memory: it was refused then, and nothing was done. What is
+            # answered now, another id tells.
+            if is_new:
+                raise
+
+    def _write_down(self, task: _Task) -> None:
+        if task.key is not None:
+            self._results.intend(
+                {
+                    "key": task.key,
+                    "plan": task.target.facts(),
+                    "attempt": task.attempt,
+                    "since_ns": self._link.view.newest_ns,
+                    "interruptions": task.interruptions,
+                }
+            )
+
+    def _follow(self, task: _Task, watch: _Watch) -> None:
+        """From the success of the action to the end of it."""
+        link, cycle = self._link, watch.cycle
+        with link.clock.late():
+            begun = link.wait_connected(lambda: cycle.begun or watch.is_over(), BEGUN_WITHIN_S, task.until_s)
+        if not begun:
+            cycle.outcome = CycleOutcome.VANISHED
+        elif not link.wait(watch.is_over, task.until_s):
+            raise NoResponse(
+                f"the {task.target.what} was not finished in time",
+                where=link.name,
+                hint="it goes on; stop it with scope.action('stop-scan') if it should not",
+            )
+
+    def _is_done(self, task: _Task, cycle: Cycle) -> bool:
+        """Return whether the result is complete; else note why not, before the next attempt."""
+        target = task.target
+        missing = self._channels.get(target.what, frozenset()) - frozenset(map(target.name_of, cycle.results))
+        if cycle.outcome is CycleOutcome.COMPLETED and not missing:
+            return True
+        if cycle.outcome is CycleOutcome.COMPLETED:
+            del self._channels[target.what]  # the same again: then these channels are not recorded any more
+            why = f"without {', '.join(sorted(missing))}, which it had before"
+        else:
+            why = self._why_failed(target, cycle)
+        task.interruptions.append(f"{day_and_time(self._link.clock.now_ns(), UTC)}: {why}")
+        self._link.log.warning("%s interrupted: %s; it will be taken again", target.what, why)
+        # losing control explains itself and is waited for; all else must not go on for a night
+        task.failures = task.failures + 1 if self._control.held else 0
+        if task.failures >= MOST_FAILURES:
+            raise MeasurementFailed(f"the {target.what} failed {task.failures} times: {why}", where=self._link.name)
+        return False
+
+    def _why_failed(self, target: Target, cycle: Cycle) -> str:
+        if not self._control.held:
+            return f"control was lost: {self._control.why_lost}"
+        if cycle.outcome is CycleOutcome.INTERRUPTED:
+            return "it was stopped, not by us"
+        if cycle.outcome is CycleOutcome.ANOTHER:
+            other = target.describe(cycle.other)
+            return f"not what was asked for was measured, but {other}; who else sets the microscope?"
+        return "the microscope is free again without a result; was it started anew?"
+
+
+def _may_have_begun(response: Response, *, is_new: bool) -> bool:
+    """Return whether control was lost before the microscope had answered, now or in the life before."""
+    return response.code == ControlResponse.NO_RESPONSE or (not is_new and response.code in NOT_IN_CONTROL)

@@ -1,0 +1,99 @@
+"""Files that grow line by line and survive a kill: a line is there as a whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import os
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from afspm.errors import FileError
+from afspm.storage.atomic import OutageLog
+
+_log = logging.getLogger("afspm.records")
+
+
+class LineFile:
+    """Appends lines to a text file. A last line that a kill cut in two is taken away before the next is written.
+
+    Args:
+        path: made when the first line is written.
+        header: the first line of a new file.
+    """
+
+    def __init__(self, path: Path, header: str = "") -> None:
+        self.path = path
+        self._header = header
+        self._is_open = False
+        self._waiting = ""
+        self._told = OutageLog("lines wait to be written", _log)
+
+    def lines(self) -> list[str]:
+        """What is there, the header not counted; without a last line that is not whole.
+
+        Raises:
+            FileError: it can't be read.
+        """
+        try:
+            text = self.path.read_bytes().decode("utf-8", errors="replace")
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise FileError(f"can't be read: {error}", where=str(self.path)) from error
+        whole = text.split("\n")[:-1]  # splitlines would cut names that hold other ends of lines
+        return whole[1:] if self._header else whole
+
+    def append(self, lines: Iterable[str]) -> None:
+        """Write lines at the end, the header first if the file is new.
+
+        Where that can't be, on a full disk or while somebody has the file open in a program that locks it, it is said,
+        and they wait until more come.
+        """
+        self._waiting += "".join(f"{line}\n" for line in lines)
+        with self._told.trying():
+            self._write()
+
+    def _write(self) -> None:
+        try:
+            if not self._is_open:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                header = self._mended()
+                _append(self.path, header)
+                self._is_open = True
+            _append(self.path, self._waiting)
+        except OSError as error:
+            raise FileError(f"can't be written: {error}", where=str(self.path)) from error
+        self._waiting = ""
+
+    def _mended(self) -> str:
+        """Cut off half a line at the end; returns the header that has to come before what is written."""
+        if not self.path.exists():
+            return f"{self._header}\n" if self._header else ""
+        data = self.path.read_bytes()
+        whole = data.rfind(b"\n") + 1
+        if whole < len(data):
+            with self.path.open("r+b") as file:
+                file.truncate(whole)
+        return f"{self._header}\n" if self._header and whole == 0 else ""
+
+
+def csv_line(row: Iterable[str]) -> str:
+    """A row of a table as one line."""
+    line = io.StringIO()
+    csv.writer(line, lineterminator="").writerow(row)
+    return line.getvalue().replace("\n", " ")
+
+
+def _append(path: Path, text: str) -> None:
+    """All of it or nothing. Raises OSError."""
+    size = path.stat().st_size if path.exists() else 0
+    try:
+        with path.open("ab") as file:
+            file.write(text.encode())
+    except OSError:
+        with suppress(OSError):
+            os.truncate(path, size)
+        raise

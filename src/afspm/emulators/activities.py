@@ -1,0 +1,224 @@
+"""Activities of a simulated instrument: a scan, a spectrum, or anything else that keeps it busy for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from afspm.model import Feedback, Region
+from afspm.simulation.fields import Array
+from afspm.simulation.scanning import Course
+
+Channels = dict[str, tuple[str, Array]]
+"""Channel -> (unit, values [y, x], both ascending)."""
+RETRACE = " Retrace"
+"""What the name of a channel ends with that is recorded on the way back."""
+
+
+class ScanValues(Protocol):
+    """The values of a scan, the same all along, and which of its rows are there at a time."""
+
+    def channels(self, until_s: float | None = None) -> Channels: ...
+
+
+@dataclass(frozen=True)
+class Occupied:
+    """The instrument is busy with `what` until `end_s` (a move, an approach …)."""
+
+    what: str
+    start_s: float
+    end_s: float
+
+    def running(self, now_s: float) -> bool:
+        """True until it has ended."""
+        return now_s < self.end_s
+
+
+@dataclass
+class SimulatedScan:
+    """A scan that was started: with the values that were in force then, whatever is changed later.
+
+    Attributes:
+        number: from 1 on.
+        region, shape: of the frame; (rows, columns).
+        line_s: of trace and retrace together.
+        upwards: whether its first line is the one with the smallest y.
+        feedback, bias_v: in force at its start.
+        stopped_s: when it was broken off; None unless it was.
+    """
+
+    number: int
+    region: Region
+    shape: tuple[int, int]
+    start_s: float
+    line_s: float
+    upwards: bool
+    feedback: Feedback
+    bias_v: float
+    stopped_s: float | None = None
+    _drawn: Future[ScanValues] = field(default_factory=Future, repr=False)
+    _whole: Channels | None = field(default=None, repr=False)
+    _paused_since_s: float | None = None
+    _paused_s: float = 0.0
+
+    what = "scan"
+
+    @property
+    def end_s(self) -> float:
+        """End of the last line as far as known: later after a pause, earlier if stopped."""
+        if self.stopped_s is not None:
+            return self.stopped_s
+        return self.start_s + self.shape[0] * self.line_s + self._paused_s
+
+    @property
+    def paused(self) -> bool:
+        return self._paused_since_s is not None
+
+    @property
+    def drawing(self) -> bool:
+        """True while its values are being computed; the scan lasts until then, however fast time passes."""
+        return not self._drawn.done()
+
+    def running(self, now_s: float) -> bool:
+        """True until it has ended, also while paused."""
+        if self.stopped_s is not None:
+            return False
+        return self.paused or now_s < self.end_s or self.drawing
+
+    def lines_done(self, now_s: float) -> int:
+        """Count the complete lines."""
+        done = int((self._scanned_until_s(now_s) - self.start_s) / self.line_s + 1e-9)
+        rows = self.shape[0]
+        return max(0, min(done, rows - 1 if self.drawing and done >= rows else rows))
+
+    def passes(self, now_s: float) -> int:
+        """Count the complete passes, forward and backward separately."""
+        return int((self._scanned_until_s(now_s) - self.start_s) / (self.line_s / 2) + 1e-9)
+
+    def tip_m(self, now_s: float) -> tuple[float, float]:
+        """Return the position of the tip along the line and back."""
+        lines = (self._scanned_until_s(now_s) - self.start_s) / self.line_s
+        row = min(int(lines), self.shape[0] - 1)
+        there = 1.0 - abs(1.0 - 2.0 * min(lines - row, 1.0))
+        up = row / max(self.shape[0] - 1, 1)
+        along = np.array([there - 0.5, (up if self.upwards else 1.0 - up) - 0.5]) * self.region.size_m
+        cos, sin = np.cos(self.region.angle_rad), np.sin(self.region.angle_rad)
+        (x, y), (cx, cy) = along, self.region.center_m
+        return float(cx + cos * x - sin * y), float(cy + sin * x + cos * y)
+
+    def channels(self, until_s: float | None = None) -> Channels:
+        """Channel -> (unit, values [y, x]), both ascending; lines not complete at `until_s` are NaN.
+
+        None for the whole, also of what was stopped. Waits for values that are still being worked out.
+        """
+        drawn = self._drawn.result()
+        return drawn.channels(None if until_s is None else self._scanned_until_s(until_s))
+
+    def signals(self, now_s: float) -> dict[str, float]:
+        """Return the present value of each channel; on the way back, the retrace where it is recorded."""
+        if self._whole is None:
+            self._whole = self._drawn.result().channels()
+        rows, columns = self.shape
+        lines = (self._scanned_until_s(now_s) - self.start_s) / self.line_s
+        line = min(max(int(lines), 0), rows - 1)
+        along = 2.0 * min(max(lines - line, 0.0), 1.0)
+        column = min(int(columns * min(along, 2.0 - along)), columns - 1)
+        row = line if self.upwards else rows - 1 - line
+        forward = {name: data for name, data in self._whole.items() if not name.endswith(RETRACE)}
+        shown = {
+            name: self._whole.get(f"{name}{RETRACE}", data) if along > 1.0 else data for name, data in forward.items()
+        }
+        return {name: float(values[row, column]) for name, (_, values) in shown.items()}
+
+    def pause(self, now_s: float) -> None:
+        """Stay on the line until `resume`."""
+        if not self.paused and self.running(now_s):
+            self._paused_since_s = now_s
+
+    def resume(self, now_s: float) -> None:
+        """Go on."""
+        if self._paused_since_s is not None:
+            self._paused_s += now_s - self._paused_since_s
+            self._paused_since_s = None
+
+    def stop(self, now_s: float) -> None:
+        """Break it off."""
+        if self.running(now_s):
+            self.resume(now_s)
+            self.stopped_s = now_s
+
+    def _scanned_until_s(self, now_s: float) -> float:
+        """The time at which an undisturbed scan would have got as far."""
+        until_s = now_s if self.stopped_s is None else min(now_s, self.stopped_s)
+        if self._paused_since_s is not None:
+            until_s = min(until_s, self._paused_since_s)
+        return until_s - self._paused_s
+
+
+@dataclass(frozen=True)
+class SimulatedSpectrum:
+    """A curve that was started.
+
+    Attributes:
+        values: [n_points, n_variables], all of them from the start on: hand them out after `end_s`.
+    """
+
+    number: int
+    kind: str
+    position_m: tuple[float, float]
+    start_s: float
+    end_s: float
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+
+    what = "spectrum"
+
+    def running(self, now_s: float) -> bool:
+        """True until it has ended."""
+        return now_s < self.end_s
+
+
+@dataclass(frozen=True)
+class ValuesInAir:
+    """A scan without a sample: noise on every channel.
+
+    Attributes:
+        units: of each channel.
+    """
+
+    units: Mapping[str, str]
+    course: Course
+    seed: tuple[int, ...]
+
+    def channels(self, until_s: float | None = None) -> Channels:
+        """Return noise in the form of a scan's channels."""
+        random = np.random.default_rng(self.seed)
+        missing = ~self.course.rows_taken(until_s)
+        found: Channels = {}
+        for name, unit in self.units.items():
+            values = noise_in_air(random, self.course.shape, unit)
+            values[missing] = np.nan
+            found[name] = (unit, values)
+        return found
+
+
+@dataclass(frozen=True)
+class NoValues:
+    """A scan that could not be simulated: not one line."""
+
+    units: Mapping[str, str]
+    shape: tuple[int, int]
+
+    def channels(self, until_s: float | None = None) -> Channels:
+        """NaN."""
+        return {name: (unit, np.full(self.shape, np.nan)) for name, unit in self.units.items()}
+
+
+def noise_in_air(random: np.random.Generator, shape: tuple[int, ...], unit: str) -> Array:
+    """Return detector noise without a sample: a few pm, fA, or thousandths of the unit."""
+    return np.asarray(random.normal(0.0, {"m": 5e-12, "A": 5e-15}.get(unit, 1e-3), shape))

@@ -1,0 +1,74 @@
+"""GXSM's files: written late, one after the other, in parts, and numbered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from afspm.emulators.faults import Faults
+
+FAULT_KINDS: Final[Mapping[str, str]] = {
+    "file-late": "a file appears only after the duration",
+    "half-file": "a file is half written, and whole only after the duration",
+    "file-missing": "a file is never written",
+}
+_FIRST_S, _APART_S, _HALF_S = 0.1, 0.05, 0.02
+
+
+@dataclass(frozen=True)
+class _Write:
+    at_s: float
+    path: Path
+    content: bytes
+
+
+class GxsmFileWriter:
+    """The files of one folder.
+
+    Attributes:
+        folder: of scans and spectra; somebody at the panel may choose another.
+    """
+
+    def __init__(self, folder: Path, faults: Faults) -> None:
+        self.folder = folder
+        self._faults = faults
+        self._writes: list[_Write] = []
+        self.counter = 1
+        """Of the next scan: it begins anew with each start of GXSM, whatever files there are."""
+
+    def named(self, ending: str, counter: int) -> Path:
+        """A scan's file."""
+        return self.folder / f"scan{counter:03d}-{ending}"
+
+    def free(self, ending: str) -> Path:
+        """The first file, from the counter on, that is not there yet: each channel counts by itself."""
+        counter = self.counter
+        while (path := self.named(ending, counter)).exists() or any(write.path == path for write in self._writes):
+            counter += 1
+        return path
+
+    def counted(self, files: list[Path]) -> None:
+        """A scan was saved: the next has the next number."""
+        numbers = (int(file.name.removeprefix("scan").partition("-")[0]) for file in files)
+        self.counter = max(numbers, default=self.counter) + 1
+
+    def write(self, contents: list[tuple[Path, bytes]], now_s: float) -> None:
+        """Begin to write files, the last one first."""
+        for k, (path, content) in enumerate(reversed(contents)):
+            at_s = now_s + _FIRST_S + k * _APART_S
+            if self._faults.strikes("file-missing", now_s):
+                continue
+            late, half = self._faults.strikes("file-late", now_s), self._faults.strikes("half-file", now_s)
+            at_s += late.duration_s if late else 0.0
+            self._writes.append(_Write(at_s, path, content[: len(content) // 2]))
+            self._writes.append(_Write(at_s + (half.duration_s if half else _HALF_S), path, content))
+
+    def advance(self, now_s: float) -> float | None:
+        """Up to now; returns when there is more to write."""
+        due = sorted((write for write in self._writes if write.at_s <= now_s), key=lambda write: write.at_s)
+        self._writes = [write for write in self._writes if write.at_s > now_s]
+        for write in due:
+            write.path.write_bytes(write.content)
+        return min((write.at_s for write in self._writes), default=None)

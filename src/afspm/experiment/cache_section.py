@@ -1,0 +1,143 @@
+"""[cache], and its form in the paper (PBCScanLogic): under which envelopes packets are kept, and how many.
+
+[cache]
+history = { Scan2d = 10 }
+
+[[cache.rules]]
+message = "Scan2d"
+above = "5 um"
+envelope = "Scan2d_wide_{channel}"
+history = 3
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from afspm.errors import AfspmError
+from afspm.experiment import class_loader
+from afspm.experiment.document import Document
+from afspm.experiment.findings import Findings
+from afspm.experiment.known import WiringClass
+from afspm.experiment.published import length_m, wire_of
+from afspm.experiment.sections import Section, parse
+from afspm.logic.envelopes import CacheRule, Envelopes
+from afspm.model import PacketHeader
+from afspm.units import Length
+
+Count = Annotated[int, Field(ge=1)]
+
+_EXAMPLES = (
+    PacketHeader("Scan2d", "Height", (1e-6, 1e-6)),
+    PacketHeader("Spec1d", kind="IV"),
+    *map(PacketHeader, ("ScopeStateMsg", "ScanParameters2d", "ZCtrlParameters", "ProbePosition")),
+)
+
+
+class CacheRuleSection(Section):
+    """[[cache.rules]]: the first that fits a packet says under which envelope it is kept, and how many are."""
+
+    message: str | None = None
+    channel: str | None = None
+    kind: str | None = None
+    above: Length | None = None
+    up_to: Length | None = None
+    envelope: str | None = None
+    history: Count | None = None
+
+
+class CacheSection(Section):
+    """[cache]. `mapping` names a function of the user's, from a packet's header to its envelope."""
+
+    history: dict[str, Count] = Field(default_factory=dict)
+    mapping: str | None = None
+    rules: tuple[CacheRuleSection, ...] = ()
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """What the scheduler is told of the cache."""
+
+    rules: tuple[CacheRule, ...] = ()
+    mapping: str | None = None
+    history: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def envelopes(self) -> tuple[str, ...]:
+        """How the envelopes of the rules begin, as far as that is fixed."""
+        return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
+
+    def to_settings(self) -> dict[str, Any]:
+        """In JSON's types; `CacheRule` by its fields."""
+        rules = [{k: v for k, v in vars(rule).items() if v is not None} for rule in self.rules]
+        return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
+
+
+def read(
+    table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Document, findings: Findings
+) -> CacheSettings:
+    """The section, with what the paper's form says of the cache where the section says nothing.
+
+    Args:
+        logic: the table that the scheduler's cache refers to in the paper's form.
+    """
+    section = parse(CacheSection, "cache", dict(table), document, findings)
+    rules = []
+    for i, rule in enumerate(section.rules):
+        try:
+            rules.append(
+                CacheRule(rule.message, rule.channel, rule.kind, rule.above, rule.up_to, rule.envelope, rule.history)
+            )
+        except AfspmError as error:
+            findings.error(f"[cache] rules[{i}]: {error.what}", document.place("cache", "rules", i), error.hint)
+    if section.mapping is not None:
+        _check_mapping(section.mapping, document, findings)
+    history = dict(section.history)
+    if logic is not None and wire_of(logic) is WiringClass.CACHE_LOGIC:
+        history = _published_history(logic) | history
+        rules += _published_rules(logic)
+    return CacheSettings(tuple(rules), section.mapping, history)
+
+
+def _check_mapping(name: str, document: Document, findings: Findings) -> None:
+    place = document.place("cache", "mapping")
+    try:
+        function = class_loader.load(name)
+    except class_loader.Unloadable as error:
+        findings.error(f"[cache] mapping: {error.what}", place, error.hint)
+        return
+    if not callable(function):
+        findings.error(f"[cache] mapping: {name} is no function", place)
+        return
+    for header in _EXAMPLES:  # else its packets would be missing, in the middle of the night
+        try:
+            Envelopes(mapping=function).of(header)
+        except AfspmError as error:
+            findings.error(f"[cache] mapping: {error.what}", place, error.hint)
+            return
+
+
+def _published_history(logic: Mapping[str, Any]) -> dict[str, int]:
+    count = logic.get("default_scan_history")
+    return {"Scan2d": count} if isinstance(count, int) and count > 0 else {}
+
+
+def _published_rules(logic: Mapping[str, Any]) -> list[CacheRule]:
+    """Histories by size, [[width, height], count]; a number is in nm, as in the envelopes' names."""
+    histories = logic.get("proto_with_history_list")
+    if wire_of(histories) is not WiringClass.HISTORIES or not isinstance(histories, Mapping):
+        return []
+    rules = []
+    channels = histories.get("channels_list") or []
+    for number, entry in enumerate(histories.get("sizes_with_hist_list", ())):
+        match entry:
+            case [[width, *_], int(count)] if count > 0:
+                channel = channels[number] if number < len(channels) else None
+                wide = length_m(width)
+                rules.append(CacheRule("Scan2d", channel, None, wide * 0.999, wide * 1.001, None, count))
+    return rules

@@ -1,0 +1,62 @@
+"""What a microscope can do, as far as its class tells before it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from afspm.errors import AfspmError
+from afspm.model import Parameter, names
+
+if TYPE_CHECKING:
+    from afspm.translator.parameters import ParameterTable
+
+
+@dataclass(frozen=True)
+class MicroscopeCapabilities:
+    """The generic names of actions, and of parameters with their SI unit (None: it depends).
+
+    Attributes:
+        sets: by name of an action that the experiment file adds, the parameters that it sets.
+    """
+
+    actions: frozenset[str]
+    parameters: Mapping[str, str | None]
+    sets: Mapping[str, tuple[Parameter, ...]]
+
+
+def of_class(microscope: type, settings: Mapping[str, Any]) -> MicroscopeCapabilities | None:
+    """The abilities of a `Driver` class with these settings; None where the class does not tell."""
+    from afspm.translator.driver import Driver
+
+    if not issubclass(microscope, Driver):
+        return None
+    marks = (getattr(getattr(microscope, name), "_afspm_action", None) for name in dir(microscope))
+    added = settings.get("actions") or {}
+    actions = {mark.name for mark in marks if mark is not None} | set(added)
+    try:
+        table = microscope.parameter_table(microscope.rows(settings))
+        sets = {name: _set_by(what, table) for name, what in added.items()}
+    except (AfspmError, AttributeError):
+        return None  # the microscope itself will say what is wrong with its table
+    return MicroscopeCapabilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets)
+
+
+def _set_by(action: Any, table: ParameterTable) -> tuple[Parameter, ...]:
+    """What an action of the experiment file sets, in SI."""
+    given = action.get("set") if isinstance(action, Mapping) else None
+    values = table.written(given, where="actions") if isinstance(given, Mapping) else {}
+    return tuple(Parameter(name, str(value), table[name].si_unit or None) for name, value in values.items())
+
+
+def base() -> dict[str, str | None]:
+    """The base parameters and the extensions of ours with their SI units, where nothing better is known."""
+    ours = {
+        names.PULSE_VOLTAGE: "V",
+        names.PULSE_DURATION: "s",
+        names.CRASH_SPEED: "m/s",
+        names.CRASH_DEPTH: "m",
+        names.SPEC_KIND: None,
+    }
+    return {**names.BASE_PARAMETERS, **ours}

@@ -1,0 +1,231 @@
+"""From `class = "module.Name"` to the class itself: imported late, since only checking and starting need it."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import inspect
+import sys
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from afspm.experiment.findings import closest, nearest
+from afspm.experiment.known import SHORT_NAME_PACKAGES
+from afspm.experiment.parts import DECLARED_KEYS, Role
+from afspm.experiment.published import GUIDE
+
+# By where they come from: a class of the user is recognised by what it is derived from.
+_ROLE_BY_BASE = (
+    ("afspm.scheduler", Role.SCHEDULER),
+    ("afspm.translator", Role.TRANSLATOR),
+    ("afspm.client.component", Role.COMPONENT),
+)
+
+
+@dataclass(frozen=True)
+class ComponentDeclaration:
+    """What a component says about itself in attributes of its class (a command: in its table)."""
+
+    solves: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()
+    publishes: tuple[str, ...] = ()
+    listens: tuple[str, ...] | None = None
+    needs_actions: tuple[str, ...] = ()
+    needs_parameters: tuple[str, ...] = ()
+
+    @classmethod
+    def of_class(cls, component: type) -> ComponentDeclaration:
+        return cls(
+            **{key: names for key in DECLARED_KEYS if (names := _names(getattr(component, key, None))) is not None}
+        )
+
+    @classmethod
+    def of_table(cls, table: Mapping[str, Any]) -> ComponentDeclaration:
+        return cls(**{key: names for key in DECLARED_KEYS if (names := _names(table.get(key))) is not None})
+
+
+class Unloadable(Exception):
+    """A class that can't be had; the message and the hint are for the user."""
+
+    def __init__(self, what: str, hint: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.hint = hint
+
+
+@contextlib.contextmanager
+def importing_from(folders: Sequence[Path]) -> Iterator[None]:
+    """Modules beside the experiment file can be imported within this block.
+
+    Two experiments may both have a `component.py`: what was imported from the folders is forgotten afterwards.
+    """
+    before = set(sys.modules)
+    added = [str(folder) for folder in folders]
+    sys.path[:0] = added
+    try:
+        yield
+    finally:
+        for entry in added:
+            with contextlib.suppress(ValueError):
+                sys.path.remove(entry)
+        for name in set(sys.modules) - before:
+            if any(_is_from(folder, name) for folder in folders):
+                del sys.modules[name]
+
+
+def _is_from(folder: Path, name: str) -> bool:
+    """Whether a module was imported from a folder, and not from an environment (.venv) that lies in it."""
+    file = getattr(sys.modules[name], "__file__", None)
+    if not file:
+        return False
+    found, place = Path(file), folder.absolute().joinpath(*name.split("."))
+    return found.parent / found.name.partition(".")[0] in (place, place / "__init__")
+
+
+def full_path(name: str) -> str:
+    """A name without a module as the full path of our class of that name; a path with a module as it is.
+
+    Raises:
+        Unloadable: none of ours is called that.
+    """
+    if "." in name:
+        return name
+    known: list[str] = []
+    for package in SHORT_NAME_PACKAGES:
+        module = _import(package)
+        if module is None:
+            continue
+        offered = getattr(module, "__all__", None) or _own_classes(module)
+        if name in offered:
+            found = _attribute(module, name)
+            return f"{found.__module__}.{found.__qualname__}"
+        known += [n for n in offered if n[:1].isupper()]
+    raise Unloadable(f"there is no ready-made class {name!r}", nearest(name, known) or 'write it as "module.Name"')
+
+
+def load(path: str) -> Any:
+    """The object `module.Name`.
+
+    Raises:
+        Unloadable: no such module or name, or the module fails when it is imported.
+    """
+    module_name, _, name = path.rpartition(".")
+    if not module_name or not name:
+        raise Unloadable(f"{path!r} is not of the form module.Name")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise _no_module(module_name, error) from error
+    except (Exception, SystemExit) as error:
+        raise Unloadable(f"importing {module_name} fails: {_where(error)}") from error
+    return _attribute(module, name)
+
+
+def find_module(name: str, folders: Sequence[Path]) -> Any:
+    """The spec of a module that can be imported, also from beside the file; None: there is none."""
+    with importing_from(folders):
+        try:
+            return importlib.util.find_spec(name)
+        except (ImportError, ValueError):
+            return None
+
+
+def role_of(component: type) -> Role | None:
+    """Scheduler, translator or component, by what the class is derived from; None: it is none of them."""
+    for base in component.__mro__:
+        for package, role in _ROLE_BY_BASE:
+            if base.__module__ == package or base.__module__.startswith(package + "."):
+                return role
+    return Role.COMPONENT if hasattr(component, "run_process") else None
+
+
+def _attribute(module: Any, name: str) -> Any:
+    """A name of a module, which a package may only import when it is asked for."""
+    try:
+        return getattr(module, name)
+    except AttributeError:
+        hint = _hidden(module) or nearest(name, getattr(module, "__all__", None) or _public_classes(module))
+        raise Unloadable(f"{module.__name__} has no {name!r}", hint) from None
+    except ModuleNotFoundError as error:
+        raise _no_module(f"{module.__name__}.{name}", error) from error
+    except (Exception, SystemExit) as error:
+        raise Unloadable(f"importing {name} fails: {_where(error)}") from error
+
+
+def _hidden(module: Any) -> str:
+    """What to do where a file of the user's has the name of a module that Python has already; "" where none has."""
+    for folder in sys.path:
+        file = Path(folder, f"{module.__name__}.py")
+        if file.exists():
+            own = getattr(module, "__file__", None)
+            return "" if own and file.samefile(own) else f"another module is called so: give {file.name} another name"
+    return ""
+
+
+def _import(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError:
+        return None
+
+
+def _no_module(module: str, error: ModuleNotFoundError) -> Unloadable:
+    missing = error.name or module
+    if module != missing and not module.startswith(missing + "."):
+        package = missing.partition(".")[0]
+        if package == "afspm":
+            return Unloadable(f"{module} is written for the published implementation: it needs {missing!r}", GUIDE)
+        hint = "" if package == module.partition(".")[0] else f"if it is spelt right: pip install {missing}"
+        return Unloadable(f"importing {module} fails: it needs {missing!r}, which is not installed", hint)
+    parent, _, last = missing.rpartition(".")
+    siblings: list[str] = []
+    for folder in _search_paths(parent):
+        with contextlib.suppress(OSError):
+            siblings += [p.stem for p in Path(folder).iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()]
+    near = closest(last, siblings, 0.7)
+    beside = f"write {last}.py beside the experiment file" if not parent else ""
+    hint = f"did you mean {(parent + '.' if parent else '') + near!r}?" if near else beside
+    return Unloadable(f"there is no module {missing!r}", hint)
+
+
+def _search_paths(parent: str) -> list[str]:
+    if not parent:
+        return sys.path
+    try:
+        spec = importlib.util.find_spec(parent)
+    except (ImportError, ValueError):
+        return []
+    return list(spec.submodule_search_locations or ()) if spec else []
+
+
+def _where(error: BaseException) -> str:
+    """The last line of a traceback with file and line, in one line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    said = str(error)
+    if isinstance(error, SyntaxError) and error.filename:
+        place, said = f" ({Path(error.filename).name}:{error.lineno})", error.msg
+    return f"{type(error).__name__}: {said}{place}"
+
+
+def _public_classes(module: Any) -> list[str]:
+    return [n for n, v in vars(module).items() if inspect.isclass(v) and not n.startswith("_")]
+
+
+def _own_classes(module: Any) -> list[str]:
+    return [name for name in _public_classes(module) if getattr(module, name).__module__ == module.__name__]
+
+
+def _names(value: Any) -> tuple[str, ...] | None:
+    """A text or texts as a tuple of texts; enum members by their name. None for what is not declared."""
+    if value is None or isinstance(value, property):
+        return None
+    if isinstance(value, str):
+        return (value,)
+    if isinstance(value, list | tuple | set | frozenset):
+        return tuple(item if isinstance(item, str) else getattr(item, "name", str(item)) for item in value)
+    return None

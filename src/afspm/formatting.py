@@ -1,0 +1,101 @@
+"""Durations, lengths, times and quantities as text: in logs, terminals, on pages and in reports alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime, tzinfo
+
+from afspm.clock import NS_PER_S
+
+_LENGTHS = ((1e-3, "mm"), (1e-6, "um"), (1e-9, "nm"), (1e-12, "pm"))
+
+
+def duration_text(seconds: float) -> str:
+    """A duration, as exactly as it matters.
+
+    >>> [lasting(s) for s in (8.2, 200, 725, 7500, 300_000)]
+    ['8 s', '3 min 20 s', '12 min', '2 h 05 min', '3 d 11 h']
+    """
+    whole = max(0, round(seconds))
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 600:
+        return f"{whole // 60} min {whole % 60:02} s"
+    minutes = round(whole / 60)
+    if minutes < 60:
+        return f"{minutes} min"
+    if minutes < 48 * 60:
+        return f"{minutes // 60} h {minutes % 60:02} min"
+    hours = round(whole / 3600)
+    return f"{hours // 24} d {hours % 24} h"
+
+
+def lengths_text(values_m: Sequence[float], joined: str = ", ") -> str:
+    """Lengths in the unit that suits the largest of them, as they may be written in an experiment file, too.
+
+    >>> lengths([5e-7, 2.5e-7], " x ")
+    '500 x 250 nm'
+    """
+    largest_m = max(map(abs, values_m))
+    unit_m, unit = next(((size, name) for size, name in _LENGTHS if largest_m >= 0.99 * size), (1e-9, "nm"))
+    return joined.join(f"{value_m / unit_m:.5g}" for value_m in values_m) + f" {unit}"
+
+
+def area_text(size_m: Sequence[float]) -> str:
+    """(width, height) of a region.
+
+    >>> area((2e-6, 1e-6))
+    '2 x 1 um'
+    """
+    return lengths_text(size_m, " x ")
+
+
+def position_text(xy_m: tuple[float, float]) -> str:
+    """(x, y).
+
+    >>> place((1.2e-6, -5e-7))
+    '(1.2, -0.5) um'
+    """
+    numbers, unit = lengths_text(xy_m).rsplit(" ", 1)
+    return f"({numbers}) {unit}"
+
+
+def typeset(told: str) -> str:
+    """What `lengths`, `area` and `place` give, for pages.
+
+    >>> typeset("2 x 1 um at (1.2, -0.5) um")
+    '2 × 1 µm at (1.2, −0.5) µm'
+    """
+    return told.replace(" x ", " × ").replace(" um", " µm").replace("-", "−")
+
+
+def time_of_day(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
+    """ "22:04:31". Where no zone is given, that of this computer."""
+    return f"{_moment(time_ns, zone):{'%H:%M:%S' if seconds else '%H:%M'}}"
+
+
+def day_and_time(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
+    """ "2026-11-20 22:04:31", in UTC "2026-11-20 22:04:31 UTC"."""
+    return f"{_moment(time_ns, zone):{'%Y-%m-%d %H:%M:%S' if seconds else '%Y-%m-%d %H:%M'}}{_zone(zone)}"
+
+
+def day(time_ns: int, zone: tzinfo | None = None) -> str:
+    """ "2026-11-20"."""
+    return f"{_moment(time_ns, zone):%Y-%m-%d}"
+
+
+def period_text(begin_ns: int, end_ns: int, zone: tzinfo | None = None) -> str:
+    """ "2026-11-20 22:04 to 23:10 UTC"; the day of the end where it is another."""
+    same = day(begin_ns, zone) == day(end_ns, zone)
+    until = (
+        time_of_day(end_ns, zone, seconds=False) + _zone(zone) if same else day_and_time(end_ns, zone, seconds=False)
+    )
+    return f"{_moment(begin_ns, zone):%Y-%m-%d %H:%M} to {until}"
+
+
+def _zone(zone: tzinfo | None) -> str:
+    return " UTC" if zone is UTC else ""
+
+
+def _moment(time_ns: int, zone: tzinfo | None) -> datetime:
+    return datetime.fromtimestamp(time_ns / NS_PER_S, UTC).astimezone(zone)

@@ -1,0 +1,275 @@
+"""What comes of a measurement: GXSM's files, which come late, one for each channel, one after the other."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.clock import NS_PER_S
+from afspm.errors import AfspmError
+from afspm.files import read
+from afspm.files.content import FileContent
+from afspm.microscopes.gxsm.staleness import Rows
+from afspm.model import Region, Scan, Spectrum
+from afspm.translator.result_files import SCAN, ResultFiles, as_set, lines_missing, region_of
+
+_NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
+_STORED: Final = 1e-5
+"""Relative: what is lost of a length in a file."""
+_TURNED_RAD: Final = 1e-6
+_CLOCK_NS: Final = 2 * NS_PER_S
+"""Files tell the second in which a scan began."""
+_LATE_NS: Final = 20 * NS_PER_S
+"""One scan may begin so much later after it was asked for than another."""
+SOON_S: Final = 1.0
+"""After so long a channel that did not come before will not come; 0.3 s were measured."""
+
+
+class GxsmFiles(ResultFiles):
+    """The measurement that is running or has just ended, and the results.
+
+    Args:
+        patience_s: how long all files may take, in experiment time.
+        soon_s: how long those of channels may that did not come before.
+        rewritten: files may be there before the scan is over, and be written again.
+    """
+
+    def __init__(
+        self, kept: dict[str, Any], patience_s: float, soon_s: float, log: logging.Logger, *, rewritten: bool
+    ) -> None:
+        super().__init__(kept, log)
+        self._patience_s = patience_s
+        self._soon_s = soon_s
+        self._rewritten = rewritten
+        self._sizes: dict[Path, tuple[int, int]] = {}
+        self._before: set[int] = set()
+        self._whole: dict[Path, FileContent] = {}
+        self.upwards = False
+        kept.setdefault("absent", [])
+        kept.setdefault("channels", {})
+        kept.setdefault("program", "")
+        kept.setdefault("starts", [])  # of the last scan's files
+        kept.setdefault("behind_ns", 0)  # how much their clock was
+
+    @property
+    def scanning(self) -> tuple[Region, tuple[int, int]]:
+        """The frame of the running scan, and (rows, columns). Only while one runs."""
+        rows, columns = self._kept["running"]["shape"]
+        return region_of(self._kept["running"]), (rows, columns)
+
+    @property
+    def before(self) -> Rows | None:
+        """What was in GXSM's memory before the running scan; None: nobody has looked."""
+        found: Rows | None = self._kept["running"]["before"]
+        return found
+
+    @before.setter
+    def before(self, rows: Rows | None) -> None:
+        self._kept["running"]["before"] = rows
+
+    @property
+    def channels(self) -> dict[str, list[str]]:
+        """Name and unit of each channel of the last scans, by the ending of its files."""
+        found: dict[str, list[str]] = self._kept["channels"]
+        return found
+
+    @property
+    def program(self) -> str:
+        """Its name and version, which only its files tell; empty before the first of them."""
+        found: str = self._kept["program"]
+        return found
+
+    def begin(self, what: str, folder: Path | None, begun_ns: int, taken: Mapping[str, Any]) -> None:
+        """A measurement begins.
+
+        Args:
+            folder: where its files will be; None: GXSM does not say yet.
+            begun_ns: not before this; 0: it was found running, and nobody knows since when.
+            taken: "frame" and "shape" of a scan, "position" of a spectrum.
+        """
+        newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
+        place = None if folder is None else str(folder)
+        facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
+        self._begins(what, {**facts, **taken})
+
+    def end(
+        self,
+        end_ns: int,
+        now_ns: int,
+        channels: Iterable[str] = (),
+        folder: Path | None = None,
+        *,
+        is_whole: bool = True,
+    ) -> None:
+        """It has ended, and its files are awaited from now on.
+
+        Args:
+            channels: where GXSM says that it saves each channel of a scan.
+            folder: of them, which may be another than at the beginning.
+            is_whole: a scan came to its last row.
+        """
+        paths = [Path(path) for path in channels]
+        now_s = now_ns / NS_PER_S
+        awaited = {"soon_s": now_s + self._soon_s, "until_s": now_s + self._patience_s}
+        self._ends({"end_ns": end_ns, **awaited, "channels": sorted(endings(paths))})
+        ended = self._kept["ended"]
+        if folder is not None and str(folder) != ended["folder"]:  # old scans in there are told by when they began
+            ended["folder"] = str(folder)
+            ended["begun_ns"] = ended["begun_ns"] or end_ns
+        self._sizes, self._whole, self._before = {}, {}, set()
+        if not is_whole:
+            self._give_up("it was stopped, or never began: GXSM still has the scan before in its first or last row")
+
+    def next_s(self) -> float | None:
+        """When to look again at the latest."""
+        ended = self._kept["ended"]
+        return None if ended is None else float(ended["until_s"])
+
+    def results(self, now_s: float) -> list[str]:
+        """The last results, oldest first: each by one of its files and when it ended."""
+        self.broken_off = False
+        ended = self._kept["ended"]
+        if ended is not None:
+            files = self._new(ended)
+            over = now_s >= ended["until_s"]
+            gaps = [file for file, content in files.items() if _gaps(content)]
+            if not any(scan.values.any() for content in files.values() for scan in content.scans):
+                gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
+            if gaps and (over or not self._rewritten):
+                self._give_up(f"was stopped: {gaps[0]} lacks lines")
+            elif files and not gaps and (over or self._all(ended, files, now_s)):
+                self._add(ended, files)
+            elif over:
+                self._give_up(self._missing(ended))
+        return self._listed()
+
+    def load(self, result: str) -> list[Scan | Spectrum]:
+        """Read one of the results, with the parameters that it was taken with.
+
+        Raises:
+            FileError: it is no result any more, or a file has gone.
+        """
+        entry = self._found(result)
+        contents = [self._whole.get(Path(file)) or read(file) for file in entry["files"]]
+        return [_as_taken(one, entry) for content in contents for one in content]
+
+    def _new(self, ended: Mapping[str, Any]) -> dict[Path, FileContent]:
+        """The files of what has ended that are whole: they have stopped growing, and can be read."""
+        found = {}
+        for file in sorted(_files(_folder(ended), ended["what"])):
+            stat = file.stat()
+            if stat.st_mtime_ns <= ended["newest_ns"]:
+                continue
+            size = (stat.st_size, stat.st_mtime_ns)
+            if self._sizes.get(file) != size:
+                self._sizes[file] = size
+                self._whole.pop(file, None)
+            elif file not in self._whole:
+                try:
+                    self._whole[file] = read(file)
+                except (AfspmError, OSError):
+                    continue  # not yet
+            content = self._whole.get(file)
+            if content is not None and not self._is_of_before(content, ended["begun_ns"]):
+                found[file] = content
+        if ended["what"] == SCAN:  # one for each channel, should somebody have it saved again
+            return {file: found[file] for file in endings(found).values()}
+        return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
+
+    def _is_of_before(self, content: FileContent, begun_ns: int) -> bool:
+        """Whether it is a scan of before: the last one, saved again, or one that was stopped, saved late. When it began
+        is told by the clock of GXSM's computer, which may be another than ours, and be set meanwhile: what began before
+        the last scan did, by that clock, is new."""
+        start_ns, known = content.start_ns, self._kept["starts"]
+        if start_ns is None:
+            return False
+        if start_ns in known:
+            is_of_before = True
+        elif known and start_ns < max(known):
+            is_of_before = False  # the clock was set back
+        else:
+            is_of_before = start_ns < begun_ns - self._kept["behind_ns"] - (_LATE_NS if known else _CLOCK_NS)
+        if is_of_before:
+            self._before.add(start_ns)
+        return is_of_before
+
+    def _saw(self, ended: Mapping[str, Any], starts: set[int]) -> None:
+        """Files that began then, after what was begun."""
+        self._kept["starts"] = sorted(starts)
+        self._kept["behind_ns"] = ended["begun_ns"] - max(starts) if starts and ended["begun_ns"] else 0
+
+    def _all(self, ended: Mapping[str, Any], files: Iterable[Path], now_s: float) -> bool:
+        """Whether no file is missing; those that did not come with the scan before are not waited for as long."""
+        missing = set(ended["channels"]) - endings(files).keys()
+        return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
+
+    def _missing(self, ended: Mapping[str, Any]) -> str:
+        folder = _folder(ended)
+        if folder is None:
+            return "GXSM does not say where it saves: did it begin at all, is a channel set?"
+        if not folder.is_absolute():
+            return f"its folder {folder} depends on where GXSM was started: choose another, or set scan_dir, probe_dir"
+        if not folder.is_dir():
+            return f"its folder {folder} can't be seen from here (scan_dir, probe_dir)"
+        if self._before:
+            return f"what GXSM saved in {folder} is a scan of before: did it begin at all?"
+        if ended["what"] == SCAN:
+            return f"no new file in {folder} is of it: did it begin at all, is a channel set, and saved (AS)?"
+        return f"no new .vpdata in {folder}: is probe Auto Save on at GXSM's panel, and this its folder (probe_dir)?"
+
+    def _give_up(self, why: str) -> None:
+        ended, self._kept["ended"] = self._kept["ended"], None
+        self._log.error("nothing comes of the %s: %s", ended["what"], why)
+        if self._before:
+            self._saw(ended, self._before)
+        self.broken_off = True
+
+    def _add(self, ended: Mapping[str, Any], files: Mapping[Path, FileContent]) -> None:
+        if ended["what"] == SCAN:
+            absent = sorted(set(ended["channels"]) - endings(files).keys())
+            if set(absent) - set(self._kept["absent"]):
+                self._log.warning("GXSM did not save %s: it is not waited for as long from now on", ", ".join(absent))
+            self._kept["absent"] = absent
+            self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
+            self.upwards = any(content.upwards for content in files.values())
+            for ending, file in endings(files).items():
+                scan, header = files[file].scans[0], files[file].header
+                self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()
+                self._kept["channels"][ending] = [scan.channel, scan.unit]
+        names = [str(file) for file in files]
+        # numbered by its end: files of spectra may be overwritten
+        self._comes(f"{names[0]} ({ended['end_ns']})", ended, {"files": names})
+        self._kept["ended"] = None
+
+
+def endings(files: Iterable[Path]) -> dict[str, Path]:
+    """What tells the channels of a scan from each other: what follows the number in a file's name; the last of each."""
+    named = ((_NUMBERED.search(file.name), file) for file in files)
+    return {match[1]: file for match, file in named if match}
+
+
+def _folder(ended: Mapping[str, Any]) -> Path | None:
+    return None if ended["folder"] is None else Path(ended["folder"])
+
+
+def _files(folder: Path | None, what: str) -> list[Path]:
+    if folder is None or not folder.is_dir():
+        return []
+    return list(folder.glob("*.nc" if what == SCAN else "*.vpdata"))
+
+
+def _gaps(content: FileContent) -> bool:
+    """Whether lines were not scanned."""
+    return any(map(lines_missing, content.scans))
+
+
+def _as_taken(one: Scan | Spectrum, entry: Mapping[str, Any]) -> Scan | Spectrum:
+    """With the frame that was set, where the file has the same, or the position that the tip was sent to; our time."""
+    if isinstance(one, Scan):
+        return as_set(one, entry, part=_STORED, angle_rad=_TURNED_RAD)
+    x, y = entry["position"]
+    return replace(one, kind=entry["what"], position_m=(x, y), time_ns=entry["end_ns"])

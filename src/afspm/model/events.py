@@ -1,0 +1,179 @@
+"""What happens beside what is measured: who asked for what, who runs, what was said."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import IntEnum
+
+from afspm.model.enums import ControlMode
+
+PERSON = ":"
+"""Between a component and the person that it acts for: "dashboard:Ada"."""
+LONGEST_PROCESS_NAME = 100
+"""In bytes: it is also the name of files, on every system."""
+_PROCESS_NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
+
+
+def is_process_name(name: str) -> bool:
+    """Return whether a process may be called so: letters, digits, _, -, +, dots and spaces between them."""
+    return _PROCESS_NAME.fullmatch(name) is not None and len(name.encode()) <= LONGEST_PROCESS_NAME
+
+
+def component_of(who: str) -> str:
+    """The component in whose name something was asked; the same without a person."""
+    return who.partition(PERSON)[0]
+
+
+class ProcessCondition(IntEnum):
+    """How it is with a process; the numbers of the wire."""
+
+    UNDEFINED = 0
+    STARTING = 1
+    ALIVE = 2
+    BUSY = 3
+    """It works on a step."""
+    SILENT = 4
+    """It should have been heard of."""
+    RESTARTING = 5
+    ENDED = 6
+    GIVEN_UP = 7
+
+
+class ControlEvent(IntEnum):
+    """A change of control, mode or problems; the numbers of the wire."""
+
+    UNDEFINED = 0
+    STARTED = 1
+    RESTARTED = 2
+    CONTROL_GAINED = 3
+    CONTROL_LOST = 4
+    PROBLEM_FLAGGED = 5
+    PROBLEM_CLEARED = 6
+    MODE_CHANGED = 7
+    EXPERIMENT_ENDED = 8
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntry:
+    """Something that happened. Programs go by the codes; `what` and `reason` are for people.
+
+    Attributes:
+        time_ns: experiment time, ns since the Unix epoch.
+        kind: "request", "control" (holder, mode or problems changed) or "order" (of a person, to start anew …).
+        who: the component; "component:person" where it acts for one.
+        what: in words, with units.
+        response: the number of a ControlResponse; None where nothing was asked.
+        reason: why it was refused, or why it happened.
+        took_s: real, from the question to the answer; None where nothing was asked.
+        event: what changed, of the kind "control".
+        request: the number of the ControlRequest that was asked; None where nothing was, or it could not be read.
+        problem: the number of the problem that was flagged, cleared or is to be solved.
+        mode: the new mode, of a MODE_CHANGED.
+        late: the answer came after the client had been told that there was none.
+    """
+
+    time_ns: int
+    kind: str
+    who: str
+    what: str
+    response: int | None = None
+    reason: str = ""
+    took_s: float | None = None
+    event: ControlEvent = ControlEvent.UNDEFINED
+    request: int | None = None
+    problem: int | None = None
+    mode: ControlMode | None = None
+    late: bool = False
+
+    @property
+    def refused(self) -> bool:
+        """Whether it was asked for and not done."""
+        return bool(self.response)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessState:
+    """How it is with one process.
+
+    Attributes:
+        role: "scheduler", "translator", "component" …
+        since_ns: since when it is in this condition, experiment time.
+        step_age_s: real, for how long it has been working on its step.
+        starts: how often it was started.
+        pid: of the operating system; 0 if there is none.
+        last_exit: how it ended last, in words.
+    """
+
+    name: str
+    role: str
+    condition: ProcessCondition
+    since_ns: int
+    step_age_s: float = 0.0
+    starts: int = 1
+    pid: int = 0
+    last_exit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStates:
+    """All processes of one supervisor, of which there is one on each computer."""
+
+    time_ns: int
+    supervisor: str
+    processes: tuple[ProcessState, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LogLine:
+    """Something that a process said; `level` is a name of the logging module."""
+
+    time_ns: int
+    name: str
+    level: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntries:
+    """Some that happened, oldest first; what a scheduler publishes at a time."""
+
+    entries: tuple[JournalEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LogLines:
+    """Some that were said, oldest first; what a supervisor tells at a time."""
+
+    lines: tuple[LogLine, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far the component `name` is with what it set out to do.
+
+    Attributes:
+        done, of: how many of how many, of whatever it counts.
+        left_s: experiment time that the rest will take, if it goes on as it does; None if it does not say.
+    """
+
+    time_ns: int
+    name: str
+    done: int
+    of: int
+    left_s: float | None = None
+
+    def remaining_ns(self, now_ns: int) -> int | None:
+        """How long it will still take, told now; None if it does not say."""
+        return None if self.left_s is None else max(0, round(self.left_s * 1e9) - max(0, now_ns - self.time_ns))
+
+
+@dataclass(frozen=True, slots=True)
+class RelayedMessage:
+    """What the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress of a component.
+
+    Its envelope is the message's name, for ProcessStates and Progress followed by "_" and whose it is.
+    """
+
+    message: str
+    payload: bytes

@@ -1,0 +1,242 @@
+"""Scans and spectra of a run as files, and their rows in the journal."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from afspm import wire
+from afspm.clock import iso_utc
+from afspm.model import Packet, ProblemNames, Scan, ScopeState
+from afspm.record import nexus, provenance
+from afspm.record.journal import SCHEDULER
+from afspm.record.nexus import FileProvenance
+from afspm.record.provenance import ControlAtStart
+from afspm.record.scan_assembler import Assembled, AssembledScan, AssembledSpectrum
+from afspm.storage import atomic
+from afspm.wire.values import without_values
+
+SCANS, SPECTRA = "scans", "spectra"
+SUFFIX = ".h5"
+_log = logging.getLogger("afspm.record")
+PART = ".part"
+
+
+class MeasuredFiles:
+    """Writes what was measured, in the transaction that is open.
+
+    Args:
+        folder: of the run.
+        facts: of the run, written into every file.
+    """
+
+    def __init__(
+        self, folder: Path, journal: sqlite3.Connection, facts: Mapping[str, Any], problems: ProblemNames
+    ) -> None:
+        self._folder = folder
+        self._journal = journal
+        self._facts = facts
+        self._problems = problems
+        for kind in (SCANS, SPECTRA):
+            for half in (folder / kind).glob(f"*{SUFFIX}{PART}"):  # of a process that was killed
+                half.unlink(missing_ok=True)
+
+    def write(self, taken: Assembled) -> None:
+        """Write the file, and the rows of the journal. Raises OSError, sqlite3.OperationalError: the disk is full …"""
+        if isinstance(taken, AssembledSpectrum):
+            self._write_spectrum(taken)
+        elif taken.interrupted_ns is None:
+            self._write_scan(taken)
+        else:
+            self._write_interrupted(taken, taken.interrupted_ns)
+
+    # --- scans ---
+
+    def _write_scan(self, taken: AssembledScan) -> None:
+        packet, first = taken.channels[0]
+        published_ns = packet.time_ns or 0
+        measured_ns = published_ns if first.time_ns is None else first.time_ns
+        new: dict[str, Scan] = {}
+        for _, scan in taken.channels:
+            new.setdefault(scan.channel, scan)
+        known = self._known(new, measured_ns)
+        if known is None:
+            stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SCANNING, measured_ns)
+            number = self._add_scan(list(new.values()), measured_ns, stood, published_ns, interrupted=False)
+        else:
+            number = known[0]
+            self._add_channels(number, self._folder / known[1], new)
+        self._insert_scan_packets(taken, number)
+
+    def _known(self, new: Mapping[str, Scan], measured_ns: int) -> tuple[int, str] | None:
+        """The number and file of the scan that these are channels of, if it is there: none came out of another file."""
+        rows = self._journal.execute(
+            "SELECT number, file FROM scans WHERE time_ns = ? AND NOT interrupted ORDER BY number", (measured_ns,)
+        )
+        for number, file in rows.fetchall():
+            there = dict(self._channels(number))
+            if all(there.get(channel, scan.filename) == scan.filename for channel, scan in new.items()):
+                return number, file
+        return None
+
+    def _channels(self, number: int) -> Iterator[tuple[str, str]]:
+        """Channels of a scan that is there, and the controller's files that they came out of."""
+        rows = self._journal.execute("SELECT payload FROM packets WHERE scan = ? AND message = 'Scan2d'", (number,))
+        for (payload,) in rows:
+            message: Any = wire.message_type("Scan2d").FromString(payload)
+            yield message.channel, message.filename
+
+    def _write_interrupted(self, taken: AssembledScan, time_ns: int) -> None:
+        scans = taken.as_seen()
+        stood = provenance.control_at_start(self._journal, time_ns, ScopeState.SCANNING)
+        number = self._add_scan(scans, time_ns, stood, time_ns, interrupted=True)
+        self._insert_scan_packets(taken, number)
+
+    def _add_scan(
+        self, scans: Sequence[Scan], time_ns: int, stood: ControlAtStart, published_ns: int, *, interrupted: bool
+    ) -> int:
+        filename = scans[0].filename if scans else ""
+        number, name = self._next(SCANS, time_ns)
+        facts = {**self._facts, **stood.facts(self._problems), "number": number, "interrupted": interrupted}
+        filenames = {scan.filename for scan in scans}  # some controllers write one for each channel
+        mapping = provenance.drift(self._journal, published_ns, stood.began_ns, filenames)
+        if mapping is not None:
+            facts["drift"] = mapping
+        at = FileProvenance(time_ns, stood.began_ns, facts, header_of(filename, self._folder))
+        if scans:
+            write_synced(self._folder / name, nexus.encode_scan(scans, at))
+        region, shape = (scans[0].region, scans[0].shape) if scans else (None, (None, None))
+        place = (None,) * 5 if region is None else (*region.center_m, *region.size_m, region.angle_rad)
+        frame = None if region is None else region.frame.value
+        channels = json.dumps([[scan.channel, scan.unit] for scan in scans], ensure_ascii=False)
+        self._journal.execute(
+            f"INSERT INTO scans VALUES ({', '.join('?' * 18)})",
+            (number, time_ns, stood.began_ns, filename, name if scans else "", interrupted, *place, frame, *shape,
+             channels, *self._control(stood)),
+        )  # fmt: skip
+        return number
+
+    def _add_channels(self, number: int, path: Path, new: Mapping[str, Scan]) -> None:
+        """Channels that came after the file was written: the recorder was killed in between."""
+        from afspm.files import read
+
+        content = read(path)
+        there = {scan.channel for scan in content.scans}
+        if new.keys() <= there:
+            return
+        scans = [*content.scans, *(scan for channel, scan in new.items() if channel not in there)]
+        about = nexus.facts_of(path)
+        at = FileProvenance(about["time_ns"], about["began_ns"], about, header_of(scans[0].filename, self._folder))
+        write_synced(path, nexus.encode_scan(scans, at))
+        channels = json.dumps([[scan.channel, scan.unit] for scan in scans], ensure_ascii=False)
+        self._journal.execute("UPDATE scans SET channels = ? WHERE number = ?", (channels, number))
+
+    def _insert_scan_packets(self, taken: AssembledScan, number: int) -> None:
+        (channels,) = self._journal.execute("SELECT channels FROM scans WHERE number = ?", (number,)).fetchone()
+        in_file = {channel for channel, _ in json.loads(channels)}
+        for packet, lines in taken.lines:
+            if lines.channel not in in_file:  # it ended before this channel was published
+                insert_packet(self._journal, packet, "ScanLines", bytes(packet.payload))
+                continue
+            head = without_values("ScanLines", packet.payload)
+            rows = (lines.channel, lines.first_row, len(lines.values))
+            insert_packet(self._journal, packet, "ScanLines", head, scan=number, rows=rows)
+        for packet, scan in taken.channels:
+            head = without_values("Scan2d", packet.payload)
+            insert_packet(self._journal, packet, "Scan2d", head, scan=number, rows=(scan.channel, None, None))
+
+    # --- spectra ---
+
+    def _write_spectrum(self, taken: AssembledSpectrum) -> None:
+        packet, spectrum = taken.packet, taken.spectrum
+        published_ns = packet.time_ns or 0
+        time_ns = published_ns if spectrum.time_ns is None else spectrum.time_ns
+        known = self._journal.execute(
+            "SELECT number FROM spectra WHERE time_ns = ? AND filename = ? AND kind = ?",
+            (time_ns, spectrum.filename, spectrum.kind),
+        ).fetchone()
+        if known is None:
+            stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SPEC, time_ns)
+            number, name = self._next(SPECTRA, time_ns)
+            facts = {**self._facts, **stood.facts(self._problems), "number": number}
+            at = FileProvenance(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))
+            write_synced(self._folder / name, nexus.encode_spectrum(spectrum, at))
+            place = (None, None) if spectrum.position_m is None else spectrum.position_m
+            names, units = (json.dumps(texts, ensure_ascii=False) for texts in (spectrum.names, spectrum.units))
+            self._journal.execute(
+                f"INSERT INTO spectra VALUES ({', '.join('?' * 15)})",
+                (number, time_ns, stood.began_ns, spectrum.filename, name, spectrum.kind, *place, spectrum.frame.value,
+                 spectrum.values.shape[0], names, units, *self._control(stood)),
+            )  # fmt: skip
+        else:
+            number = known[0]
+        insert_packet(self._journal, packet, "Spec1d", without_values("Spec1d", packet.payload), spectrum=number)
+
+    # --- both ---
+
+    def _next(self, kind: str, time_ns: int) -> tuple[int, str]:
+        """The next number, and the file of that number, from the run folder."""
+        number = int(self._journal.execute(f"SELECT coalesce(max(number), 0) + 1 FROM {kind}").fetchone()[0])
+        name = f"{kind}/{_stamp(time_ns)}-{number:05d}{SUFFIX}"
+        for orphan in (self._folder / kind).glob(f"{_stamp(time_ns)}-*{SUFFIX}"):
+            if self._journal.execute(f"SELECT 1 FROM {kind} WHERE file = ?", (f"{kind}/{orphan.name}",)).fetchone():
+                continue
+            orphan.unlink()  # written right before a kill, under a number that it did not get
+        return number, name
+
+    def _control(self, stood: ControlAtStart) -> tuple[str | None, str | None, str]:
+        facts = stood.facts(self._problems)
+        problems = json.dumps(facts.get("problems", []), ensure_ascii=False)
+        return facts.get("in_control"), facts.get("mode"), problems
+
+
+def insert_packet(
+    journal: sqlite3.Connection,
+    packet: Packet,
+    message: str,
+    payload: bytes,
+    *,
+    source: str = SCHEDULER,
+    scan: int | None = None,
+    spectrum: int | None = None,
+    rows: tuple[str | None, int | None, int | None] = (None, None, None),
+) -> None:
+    """A row for a packet.
+
+    Args:
+        payload: what of it is kept here; its values are in the file of `scan` or `spectrum`.
+        rows: (channel, first row, number of rows) of a scan's values.
+    """
+    journal.execute(
+        "INSERT INTO packets VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (packet.time_ns or 0, packet.envelope, message, source, payload, scan, spectrum, *rows),
+    )
+
+
+def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
+    """What the controller's own file says of a measurement; empty if it is on another computer, or can't be read."""
+    from afspm.files import read
+
+    path = folder / filename if filename else folder
+    try:
+        if not path.is_file():
+            return {}
+        content = read(path)
+    except Exception as error:  # a folder that can't be reached, a file that a reader errs at: the scan is recorded
+        _log.debug("the header of %s is left out: %s", filename, error)
+        return {}
+    return {"controller": content.controller, **content.header}
+
+
+def write_synced(path: Path, data: bytes) -> None:
+    """Write a file so that it is there as a whole or not at all, after a power cut too. Raises OSError."""
+    atomic.replace_file(path, [data], aside=path.with_name(path.name + PART))
+
+
+def _stamp(time_ns: int) -> str:
+    """As it may stand in the name of a file."""
+    return iso_utc(time_ns).replace("-", "").replace(":", "")

@@ -1,0 +1,123 @@
+"""How things stood when something was measured, found in the journal: what was published before says it."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from afspm import wire
+from afspm.errors import WireError
+from afspm.model import ControlState, Feedback, ProblemNames, ScopeState, ScopeStatus
+
+_BACK = 20
+"""So many states are looked back through for the one in which a measurement began."""
+
+
+@dataclass(frozen=True)
+class ControlAtStart:
+    """How things stood when a measurement began; None: not known."""
+
+    began_ns: int | None
+    control: ControlState | None
+    feedback: Feedback | None
+
+    def facts(self, problems: ProblemNames) -> dict[str, Any]:
+        """In JSON's types, by names that people know."""
+        facts: dict[str, Any] = {}
+        if self.control is not None:
+            facts |= {
+                "in_control": self.control.holder,
+                "mode": self.control.mode.name.lower(),
+                "problems": [problems.name(number) for number in self.control.problems],
+            }
+        if self.feedback is not None:
+            facts["feedback"] = {
+                "on": self.feedback.on,
+                "proportional_gain": self.feedback.proportional_gain,
+                "integral_gain": self.feedback.integral_gain,
+                "setpoint": self.feedback.setpoint,
+            }
+        return facts
+
+
+def control_at_start(
+    journal: sqlite3.Connection, time_ns: int, doing: ScopeState, measured_ns: int | None = None
+) -> ControlAtStart:
+    """How things stood when that began which was published at `time_ns`, and finished at `measured_ns`."""
+    began_ns = _began(journal, time_ns, doing)
+    if began_ns is not None and measured_ns is not None and began_ns > measured_ns:
+        began_ns = None  # its beginning was not seen: this is when a microscope that was started anew told of it
+    at_ns = time_ns if began_ns is None else began_ns
+    control, feedback = _last(journal, "ControlState", at_ns), _last(journal, "ZCtrlParameters", at_ns)
+    return ControlAtStart(
+        began_ns,
+        control if isinstance(control, ControlState) else None,
+        feedback if isinstance(feedback, Feedback) else None,
+    )
+
+
+def drift(
+    journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str]
+) -> dict[str, Any] | None:
+    """The mapping between tip and sample coordinates that a scan gave, which is published before it; None: none.
+
+    Args:
+        filenames: of the channels of the scan.
+    """
+    row = journal.execute(
+        "SELECT payload FROM packets WHERE message = 'DriftMapping' AND time_ns <= ? AND time_ns > ?"
+        " ORDER BY time_ns DESC LIMIT 1",
+        (time_ns, -1 if since_ns is None else since_ns),
+    ).fetchone()
+    mapping = None if row is None else _decoded("DriftMapping", row[0])
+    if mapping is None or (mapping.filename and any(filenames) and mapping.filename not in filenames):
+        return None
+    return {
+        "time_ns": mapping.timestamp.ToNanoseconds(),
+        "matrix": list(mapping.matrix),
+        "rate_m_s": list(mapping.rate),
+        "center_m": list(mapping.center),
+        "matched": mapping.matched,
+        "lost": mapping.lost,
+        "correcting": mapping.correcting,
+        "reason": mapping.reason,
+    }
+
+
+def last_state(journal: sqlite3.Connection) -> ScopeState:
+    """What the microscope was doing by the last packet of the journal."""
+    status = _last(journal, "ScopeStateMsg", 2**63 - 1)
+    return status.state if isinstance(status, ScopeStatus) else ScopeState.UNDEFINED
+
+
+def _began(journal: sqlite3.Connection, time_ns: int, doing: ScopeState) -> int | None:
+    rows = journal.execute(
+        "SELECT time_ns, payload FROM packets WHERE message = 'ScopeStateMsg' AND time_ns <= ?"
+        f" ORDER BY time_ns DESC LIMIT {_BACK}",
+        (time_ns,),
+    )
+    began_ns: int | None = None
+    for at_ns, payload in rows:
+        status = _decoded("ScopeStateMsg", payload)
+        if isinstance(status, ScopeStatus) and status.state is doing:
+            began_ns = at_ns  # a scan that was paused, or told again to a scheduler started anew, began before
+        elif began_ns is not None or (isinstance(status, ScopeStatus) and status.state is ScopeState.FREE):
+            break
+    return began_ns
+
+
+def _last(journal: sqlite3.Connection, message: str, time_ns: int) -> Any:
+    row = journal.execute(
+        "SELECT payload FROM packets WHERE message = ? AND time_ns <= ? ORDER BY time_ns DESC LIMIT 1",
+        (message, time_ns),
+    ).fetchone()
+    return None if row is None else _decoded(message, row[0])
+
+
+def _decoded(message: str, payload: bytes) -> Any:
+    try:
+        return wire.decode(message, payload)
+    except WireError:
+        return None

@@ -1,0 +1,50 @@
+"""run.json: what a run says of itself, to whoever joins it, resumes it or looks at it afterwards."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.errors import FileError
+
+RUN_FILE: Final = "run.json"
+STATE_DIR: Final = "state"
+"""Beside it: what the processes remember."""
+ENDED: Final = "ended"
+"""In run.json once a run is over: how it ended, in words."""
+REPLAY_OF: Final = "replay_of"
+"""In run.json of a replay: the folder of the run that it publishes again."""
+EXPERIMENT_FILE: Final = "experiment.toml"
+"""Beside it: the experiment as it was expanded."""
+LATEST_FILE: Final = "latest"
+"""In the folder of all runs: the name of the newest."""
+
+
+def read_run_json(folder: Path) -> dict[str, Any]:
+    """What run.json in the folder of a run says.
+
+    Raises:
+        FileError: it is not there, can't be read, or is something else.
+    """
+    file = folder / RUN_FILE
+    try:
+        facts = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileError(f"can't be read: {error}", where=str(file)) from error
+    if not isinstance(facts, dict):
+        raise FileError("is not what a run leaves", where=str(file))
+    return facts
+
+
+def run_json_or_empty(folder: Path) -> dict[str, Any]:
+    """The same; empty where nothing can be read."""
+    try:
+        return read_run_json(folder)
+    except FileError:
+        return {}
+
+
+def experiment_name(folder: Path, otherwise: str = "") -> str:
+    """The name of the experiment that left a folder; `otherwise` if it is not known."""
+    return str(run_json_or_empty(folder).get("name") or otherwise)

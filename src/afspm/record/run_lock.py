@@ -1,0 +1,75 @@
+"""Whether a run goes on, has ended, or was cut off: who runs it holds a lock, which nobody leaves behind."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from afspm.errors import FileError
+from afspm.file_lock import lock
+from afspm.record.run_json import ENDED, REPLAY_OF, STATE_DIR, run_json_or_empty
+
+LOCK_FILE = "running"
+
+
+@contextlib.contextmanager
+def lock_run(folder: Path) -> Iterator[None]:
+    """The run in this folder goes on while in the block; the system takes the lock back from whoever is killed.
+
+    Raises:
+        FileError: it goes on already, in another process.
+    """
+    with (folder / STATE_DIR / LOCK_FILE).open("a+b") as file:
+        try:
+            lock(file)
+        except OSError as error:
+            raise FileError("this run is still going on", where=str(folder), hint="`afspm status` shows it") from error
+        yield
+
+
+def cut_off_message(folder: Path) -> str:
+    """What to say of a run whose supervisor was killed, or its computer; empty: it goes on, or has ended.
+
+    Only who can read the disk of the computer that it ran on can know.
+    """
+    facts = run_json_or_empty(folder)
+    if not facts or facts.get(ENDED) or not _is_left(folder):
+        return ""
+    if REPLAY_OF in facts:
+        return "this replay was cut off"
+    return f"it was cut off; {resume_command(folder)} goes on with it"
+
+
+def describe_state(folder: Path) -> str:
+    """How it is with a run, in words: how it ended, that it was cut off, that it goes on."""
+    if ended := run_json_or_empty(folder).get(ENDED):
+        return str(ended)
+    known = (folder / STATE_DIR / LOCK_FILE).exists()
+    return cut_off_message(folder) or ("it goes on" if known else "it goes on, or was cut off")
+
+
+def resume_command(folder: Path) -> str:
+    """The command that goes on with a run."""
+    return f"`afspm run --resume {quoted(folder)}`"
+
+
+def quoted(path: Path) -> str:
+    """As it may be typed into a shell: that of Windows knows no single quotes, and takes a backslash as it is."""
+    if sys.platform != "win32":
+        return shlex.quote(str(path))
+    from subprocess import list2cmdline
+
+    return list2cmdline([str(path)])
+
+
+def _is_left(folder: Path) -> bool:
+    """Whether somebody had the lock, and nobody has it."""
+    try:
+        with (folder / STATE_DIR / LOCK_FILE).open("rb") as file:
+            lock(file, shared=True)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,147 @@
+"""Which packets belong to one measurement: the channels of a scan, its lines, how it ended. Knows no files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.model import Packet, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum
+
+
+@dataclass
+class AssembledScan:
+    """A scan that is over.
+
+    Attributes:
+        channels: its packets, with what is in them; of an interrupted one none.
+        lines: packets with lines of it that came before.
+        interrupted_ns: when it was broken off; None: it is whole.
+    """
+
+    channels: list[tuple[Packet, Scan]] = field(default_factory=list)
+    lines: list[tuple[Packet, ScanLines]] = field(default_factory=list)
+    interrupted_ns: int | None = None
+
+    def packets(self) -> Iterator[Packet]:
+        """All that are kept with it."""
+        yield from (packet for packet, _ in self.lines)
+        yield from (packet for packet, _ in self.channels)
+
+    def as_seen(self) -> list[Scan]:
+        """Of an interrupted one: what its lines show, one for each channel; rows that were not seen are NaN."""
+        pictures: dict[str, NDArray[np.float64]] = {}
+        newest: dict[str, ScanLines] = {}
+        for _, lines in self.lines:
+            before = pictures.get(lines.channel)
+            pictures[lines.channel] = lines.into(before if before is not None and before.shape == lines.shape else None)
+            newest[lines.channel] = lines
+        shape = next((lines.shape for lines in newest.values()), None)
+        return [
+            Scan(lines.region, channel, lines.unit, pictures[channel], self.interrupted_ns)
+            for channel, lines in newest.items()
+            if lines.shape == shape
+        ]
+
+
+@dataclass(frozen=True)
+class AssembledSpectrum:
+    """A spectrum with its packet."""
+
+    packet: Packet
+    spectrum: Spectrum
+
+    def packets(self) -> Iterator[Packet]:
+        """That one."""
+        yield self.packet
+
+
+Assembled = AssembledScan | AssembledSpectrum
+
+
+class ScanAssembler:
+    """Gathers what belongs together, from packets in the order in which they were published.
+
+    Args:
+        state: the microscope's, as it was told last.
+    """
+
+    def __init__(self, state: ScopeState = ScopeState.UNDEFINED) -> None:
+        self._state = state
+        self._open = AssembledScan()
+
+    def copy(self) -> ScanAssembler:
+        """As it is now, to go back to."""
+        other = ScanAssembler(self._state)
+        other._open = AssembledScan(list(self._open.channels), list(self._open.lines), self._open.interrupted_ns)
+        return other
+
+    def waiting(self) -> Iterator[Packet]:
+        """Packets that were given and not given back yet."""
+        return self._open.packets()
+
+    def scan(self, packet: Packet, scan: Scan) -> list[Assembled]:
+        """A channel of a scan."""
+        over: list[Assembled] = []
+        if self._open.channels and not _same(self._open, scan):
+            over = self.flush()
+        self._open.channels.append((packet, scan))
+        return over
+
+    def lines(self, packet: Packet, lines: ScanLines) -> list[Assembled]:
+        """Lines of a running scan. A translator that is started anew publishes them from the first row on again."""
+        before = self._open.lines[-1][1] if self._open.lines else None
+        over: list[Assembled] = []
+        if self._open.channels or (before is not None and (before.region, before.shape) != (lines.region, lines.shape)):
+            over = self.finish(packet.time_ns or 0)
+        self._open.lines.append((packet, lines))
+        return over
+
+    def spectrum(self, packet: Packet, spectrum: Spectrum) -> list[Assembled]:
+        """A spectrum, which is whole."""
+        return [*self.flush(), AssembledSpectrum(packet, spectrum)]
+
+    def status(self, status: ScopeStatus, time_ns: int) -> list[Assembled]:
+        """The microscope does something else."""
+        before, self._state = self._state, status.state
+        if status.state is ScopeState.INTERRUPTED and before is ScopeState.SCANNING and not self._open.channels:
+            interrupted, self._open = self._open, AssembledScan()
+            interrupted.interrupted_ns = time_ns
+            return [interrupted]
+        if status.state is ScopeState.SCANNING and before is not ScopeState.SCANNING:
+            return self.finish(time_ns)
+        # lines alone wait on: there are translators that are free before they publish what they have measured
+        return self.flush() if status.state is ScopeState.FREE else []
+
+    def flush(self) -> list[Assembled]:
+        """No more channels come to the scan that is being gathered."""
+        if not self._open.channels:
+            return []
+        taken, self._open = self._open, AssembledScan()
+        return [taken]
+
+    def finish(self, time_ns: int) -> list[Assembled]:
+        """What was seen of a scan is all that there will be: without its channels, it vanished on the way."""
+        if not self._open.channels and not self._open.lines:
+            return []
+        taken, self._open = self._open, AssembledScan()
+        if not taken.channels:
+            taken.interrupted_ns = time_ns
+        return [taken]
+
+
+def _same(taken: AssembledScan, scan: Scan) -> bool:
+    """Whether this is another channel of the scan. One that comes again, from a translator started anew, is too.
+
+    Some controllers write a file for each channel: then it is the time that says so, and a channel that is there
+    already out of another file is that of another scan.
+    """
+    first = taken.channels[0][1]
+    if (scan.region, scan.shape, scan.time_ns) != (first.region, first.shape, first.time_ns):
+        return False
+    for _, other in taken.channels:
+        if other.channel == scan.channel:
+            return scan.filename == other.filename and (scan.filename != "" or scan.time_ns is not None)
+    return scan.time_ns is not None or scan.filename == first.filename

@@ -1,0 +1,75 @@
+"""What was so from when to when, as lanes of a time line."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+MOST_SPANS = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Something that was so for a while.
+
+    Attributes:
+        label: what.
+        start_ns, end_ns: experiment time; an end of None: it still is.
+        by: who brought it about; empty if nobody is known to.
+    """
+
+    label: str
+    start_ns: int
+    end_ns: int | None = None
+    by: str = ""
+
+    def lasted_ns(self, now_ns: int) -> int:
+        """How long it was so until `now_ns`."""
+        end_ns = now_ns if self.end_ns is None else min(self.end_ns, now_ns)
+        return max(0, end_ns - self.start_ns)
+
+
+class Timeline:
+    """One thing after the other, with gaps where nothing was. Where there are too many, the oldest are forgotten."""
+
+    def __init__(self, most: int = MOST_SPANS) -> None:
+        self.spans: deque[Span] = deque(maxlen=most)
+        self.changed_ns: int | None = None
+        """When it changed last, to something or to nothing."""
+
+    @property
+    def now(self) -> Span | None:
+        """What is so at last."""
+        return self.spans[-1] if self.spans and self.spans[-1].end_ns is None else None
+
+    def change(self, label: str | None, time_ns: int, by: str = "") -> None:
+        """From `time_ns` on it is `label`; None: nothing. What is older than the last change is left out."""
+        if self.changed_ns is not None and time_ns < self.changed_ns:
+            return
+        now = self.now
+        if self.changed_ns is not None and label == (now.label if now else None):
+            return
+        self.changed_ns = time_ns
+        if now is not None:
+            self.spans[-1] = replace(now, end_ns=time_ns)
+        if label is not None:
+            self.spans.append(Span(label, time_ns, by=by))
+
+    def name_last(self, by: str) -> None:
+        """Tell who brought the last span about, where that was not known yet."""
+        if self.spans and not self.spans[-1].by:
+            self.spans[-1] = replace(self.spans[-1], by=by)
+
+    def at(self, time_ns: int) -> Span | None:
+        """What was so at a time."""
+        for span in reversed(self.spans):
+            if span.start_ns <= time_ns:
+                return span if span.end_ns is None or time_ns < span.end_ns else None
+        return None
+
+    def lasted_ns(self, now_ns: int) -> dict[str, int]:
+        """For how long altogether each label was so, in the order in which they came."""
+        total: dict[str, int] = {}
+        for span in self.spans:
+            total[span.label] = total.get(span.label, 0) + span.lasted_ns(now_ns)
+        return total

@@ -1,0 +1,243 @@
+"""Files that are replaced as a whole: whoever reads finds what was there before or what is there now."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import logging
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from afspm.errors import FileError
+from afspm.storage.disk import SYNCER, sync_file, sync_folder
+
+T = TypeVar("T")
+
+PERIOD_S = 1.0
+"""Real time between two generations that are made sure to be on the disk."""
+_DAMAGED = (ValueError, KeyError, TypeError)
+LONGEST = 1 << 20
+"""Bytes of a file with its generations, before it is begun anew."""
+_TRIES, _AGAIN_S = 50, 0.01
+_ANYONE = 0o666
+
+
+def replace_file(
+    path: Path,
+    parts: Iterable[bytes | memoryview],
+    *,
+    synced: bool = True,
+    aside: Path | None = None,
+    mode: int = _ANYONE,
+) -> None:
+    """Write a file so that it is there completely or as it was before, whenever the process is killed.
+
+    Args:
+        synced: the same of a power cut; that waits for the disk.
+        aside: where it is written before it has its name; None: under a hidden name of this process beside it.
+        mode: of the file, before the umask; 0o600 for secrets: it never has another, not even for a moment.
+
+    Raises:
+        OSError: it can't be written.
+    """
+    aside = aside or path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(exist_ok=True)  # and no more: under a drive that is away there may be an empty folder
+        if mode != _ANYONE:
+            aside.unlink(missing_ok=True)  # one that was left there has a mode of its own
+        with open(aside, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            file.writelines(parts)
+            if synced:
+                file.flush()
+                sync_file(file.fileno())
+        _rename(aside, path)
+        if synced:
+            sync_folder(path.parent)
+    except OSError:
+        with contextlib.suppress(OSError):
+            aside.unlink()
+        raise
+
+
+def _rename(aside: Path, path: Path) -> None:
+    """Give a file its name. Windows refuses that while somebody, a virus scanner say, reads what has the name now."""
+    for left in reversed(range(_TRIES)):
+        try:
+            aside.replace(path)
+            return
+        except PermissionError:
+            if sys.platform != "win32" or not left:
+                raise
+        threading.Event().wait(_AGAIN_S)  # nobody tells when the reader has closed it
+
+
+def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:
+    """`replace`, for whoever tells people of it. Raises FileError: it can't be written."""
+    try:
+        replace_file(path, parts, synced=synced)
+    except OSError as error:
+        raise FileError(f"can't be written: {error}", where=str(path)) from error
+
+
+class OutageLog:
+    """A disk that is full, or away for a while, must not end an experiment: what can't be written is told once, until
+    it can be again.
+
+    Args:
+        loss: what it means, for people.
+    """
+
+    def __init__(self, loss: str, log: logging.Logger) -> None:
+        self._loss = loss
+        self._log = log
+        self._is_failing = False
+
+    @contextlib.contextmanager
+    def trying(self) -> Iterator[None]:
+        """Around what writes, and raises FileError or OSError."""
+        try:
+            yield
+        except (FileError, OSError) as error:
+            if not self._is_failing:
+                self._log.critical("%s: %s", self._loss, error)
+            self._is_failing = True
+        else:
+            if self._is_failing:
+                self._log.info("it can be written again, no longer so: %s", self._loss)
+            self._is_failing = False
+
+
+def previous_generation(path: Path) -> Path:
+    """The generation before, of a file that `CheckpointFile` keeps."""
+    return path.with_name(f"{path.name}.old")
+
+
+class CheckpointFile:
+    """A small text that is saved too often to wait for the disk each time, and is to outlive a power cut all the same.
+
+    Each generation is a line that is appended: that takes ten microseconds, twenty times less than to replace the file,
+    which is done when it has grown to `longest` bytes. What was saved last outlives a kill of any process, and a
+    moment later a power cut (see `disk`). One that comes while the file is begun anew may leave it empty; then there is
+    the generation before, some `period_s` older, which a thread has made sure of.
+    """
+
+    def __init__(self, path: Path, period_s: float = PERIOD_S, longest: int = LONGEST) -> None:
+        self.path = path
+        self._period_s = period_s
+        self._longest = longest
+        self._file: io.FileIO | None = None
+        self._size = 0
+        self._newest: bytes | None = None
+        self._changed = threading.Condition()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def save(self, content: bytes) -> None:
+        """Add a generation, a text without line breaks that is told from a part of itself. Raises FileError."""
+        line = content + b"\n"
+        try:
+            self._append(line)
+        except OSError as error:
+            raise FileError(f"can't be written: {error}", where=str(self.path)) from error
+        with self._changed:
+            self._newest = line
+            self._changed.notify()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="generations", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Make sure of what was saved last. Safe to repeat."""
+        self._closing.set()
+        with self._changed:
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join()
+        self._let_go()
+
+    def _append(self, line: bytes) -> None:
+        if self._file is None or self._size + len(line) > self._longest or not _is_there(self._file):
+            self._let_go()
+            replace_file(self.path, [line], synced=False)
+            self._file, self._size = io.FileIO(self.path, "ab"), len(line)
+            SYNCER.soon(self._file.fileno())
+            SYNCER.folder_soon(self.path.parent)
+            return
+        written = 0
+        try:
+            written = self._file.write(line)
+            if written < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError:
+            with contextlib.suppress(OSError):
+                if written:
+                    self._file.truncate(self._size)  # what was saved before is the last again
+            self._let_go()  # a drive that was away is not found again by a file that was open on it
+            raise
+        self._size += written
+        SYNCER.soon(self._file.fileno())
+
+    def _let_go(self) -> None:
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._file = None
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._newest is not None or self._closing.is_set())
+                newest, self._newest = self._newest, None
+            if newest is None:
+                return
+            with contextlib.suppress(FileError):  # a full disk is told of by who saves
+                write_atomic(previous_generation(self.path), [newest])
+            self._closing.wait(self._period_s)
+
+
+def _is_there(file: io.FileIO) -> bool:
+    """Whether a file that is open still has a name: somebody may have removed it."""
+    return os.fstat(file.fileno()).st_nlink > 0
+
+
+def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
+    """What `CheckpointFile` saved last; None if there is no such file.
+
+    Args:
+        read: makes something of a generation; raises ValueError, KeyError or TypeError if it is damaged.
+
+    Returns:
+        What was read, and what was wrong with the last generation, if it is one before: "" else.
+
+    Raises:
+        FileError: the file can't be read, and there is no generation before that can; or its folder is away.
+    """
+    try:
+        generations = path.read_bytes().splitlines() or [b""]
+    except FileNotFoundError as error:
+        if not any(folder.is_dir() for folder in (path.parent, path.parent.parent)):
+            # a drive of another computer: what is on it must not be begun anew
+            raise FileError(f"the folder of the run is not there: {error}", where=str(path)) from error
+        return None, ""
+    except OSError as error:
+        generations, damage = [], f"{error!r}"
+    else:
+        try:
+            return read(generations.pop()), ""
+        except _DAMAGED as error:
+            damage = f"{error!r}"
+    with contextlib.suppress(OSError):
+        generations.insert(0, previous_generation(path).read_bytes())
+    for before in reversed(generations):
+        with contextlib.suppress(*_DAMAGED):
+            return read(before), damage
+    raise FileError(
+        f"can't be read, and there is no generation before it: {damage}",
+        where=str(path),
+        hint="remove it to start anew",
+    )

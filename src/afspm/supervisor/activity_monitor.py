@@ -1,0 +1,150 @@
+"""Whether a process that does not beat stands still: a look from outside, by what its operating system says of it.
+
+Beats come from a thread of Python. Code that holds Python's lock for long, such as a call into a library, or the
+loading of a large one off a slow disk, lets none through, and yet it works.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+LEAST_SHARE = 0.05
+"""Of a processor's time, to count as work. Threads that wait for Python's lock look for it 200 times a second, which
+takes some thousandths each, and those of a socket library live on while all else hangs."""
+LOOKS = 10
+"""So many looks are made in the time that is judged by, at most: a wait for a disk is seen only while it lasts."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActivitySample:
+    """What is seen of a process at one time.
+
+    Attributes:
+        processor_s: the processor time that it has used in its life.
+        waits_for_disk: one of its threads does.
+        stopped: somebody has stopped it: it does nothing now, whatever it did a moment before.
+        runs: its main thread does, or would if the processor were free.
+    """
+
+    processor_s: float
+    waits_for_disk: bool = False
+    stopped: bool = False
+    runs: bool = False
+
+
+Look = Callable[[int], ActivitySample | None]
+
+
+class ActivityMonitor:
+    """Looks at one process again and again, and judges by what it has done lately.
+
+    Args:
+        pid: of the process.
+        lately_s: how long ago that may be, real time.
+        look: sees what there is to be seen, for tests.
+
+    Attributes:
+        again_s: when to look next, in real monotonic time.
+    """
+
+    def __init__(self, pid: int, lately_s: float, look: Look | None = None) -> None:
+        self._pid = pid
+        self._lately_s = lately_s
+        self._look = look or of_process
+        self._seen: deque[tuple[float, ActivitySample]] = deque()
+        self._works: bool | None = None
+        self.again_s = -math.inf
+
+    def work(self, now_s: float) -> bool | None:
+        """Whether it works, in real monotonic time; None: that can't be told, or not yet."""
+        if now_s >= self.again_s:
+            self.again_s = now_s + self._lately_s / LOOKS
+            self._works = self._judge(self._look(self._pid), now_s)
+        return self._works
+
+    def _judge(self, signs: ActivitySample | None, now_s: float) -> bool | None:
+        if signs is None:
+            return None
+        self._seen.append((now_s, signs))
+        while len(self._seen) > 2 and now_s - self._seen[1][0] >= self._lately_s:
+            self._seen.popleft()
+        if signs.stopped:
+            return False
+        # on a busy computer the share of one that works may be less than any; and one that has just done so has yet to
+        # beat
+        if any(seen.waits_for_disk or seen.runs for _, seen in self._seen):
+            return True
+        since_s, first = self._seen[0]
+        if now_s - since_s < self._lately_s / 2.0:
+            return None
+        return signs.processor_s - first.processor_s >= LEAST_SHARE * (now_s - since_s)
+
+
+def of_process(pid: int) -> ActivitySample | None:
+    """What can be seen of a process here; None: nothing, or there is none."""
+    if sys.platform == "linux":
+        return _on_linux(pid)
+    if sys.platform == "win32":
+        return _on_windows(pid)
+    return None
+
+
+if sys.platform == "linux":
+    _WAITS_FOR_DISK = "D"
+    _STOPPED = "Tt"
+    _RUNS = "R"
+
+    def _on_linux(pid: int) -> ActivitySample | None:
+        folder = Path("/proc") / str(pid)
+        try:
+            state, processor_s = _stat(folder)
+            threads = list((folder / "task").iterdir())
+        except (OSError, ValueError, IndexError):  # it ends at this moment
+            return None
+        return ActivitySample(processor_s, any(map(_waits_for_disk, threads)), state in _STOPPED, state == _RUNS)
+
+    def _waits_for_disk(thread: Path) -> bool:
+        try:
+            return _stat(thread)[0] == _WAITS_FOR_DISK
+        except (OSError, ValueError, IndexError):  # threads come and go
+            return False
+
+    def _stat(folder: Path) -> tuple[str, float]:
+        """The state of a process or a thread, as a letter, and the processor time that it has used."""
+        text = (folder / "stat").read_text(encoding="utf-8", errors="replace")
+        fields = text[text.rindex(")") + 1 :].split()  # the name, in brackets, may have anything in it
+        return fields[0], (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+elif sys.platform == "win32":
+    import ctypes
+    from ctypes import wintypes
+
+    _MAY_ASK = 0x1000  # PROCESS_QUERY_LIMITED_INFORMATION
+    _TICK_S = 1e-7
+
+    def _on_windows(pid: int) -> ActivitySample | None:
+        """Windows says of no thread of another process what it waits for; whoever has stopped it, it uses no time."""
+        system = ctypes.WinDLL("kernel32", use_last_error=True)
+        system.OpenProcess.restype = wintypes.HANDLE
+        system.OpenProcess.argtypes = (wintypes.DWORD, wintypes.BOOL, wintypes.DWORD)
+        system.GetProcessTimes.argtypes = (wintypes.HANDLE, *[ctypes.POINTER(wintypes.FILETIME)] * 4)
+        system.CloseHandle.argtypes = (wintypes.HANDLE,)
+        process = system.OpenProcess(_MAY_ASK, False, pid)  # noqa: FBT003
+        if not process:
+            return None
+        try:
+            begun, ended, kernel, user = (wintypes.FILETIME() for _ in range(4))
+            times = (ctypes.byref(time) for time in (begun, ended, kernel, user))
+            if not system.GetProcessTimes(process, *times):
+                return None
+        finally:
+            system.CloseHandle(process)
+        return ActivitySample(
+            sum((time.dwHighDateTime << 32) + time.dwLowDateTime for time in (kernel, user)) * _TICK_S
+        )

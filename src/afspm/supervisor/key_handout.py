@@ -1,0 +1,126 @@
+"""Hands each process its own keys alone: those of the file, or a pair that is made for this run."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from afspm.addresses import connectable, reaches
+from afspm.client.connect import GUEST_KEYS
+from afspm.experiment import Experiment, ProcessStart, Role
+from afspm.logic.supervisor_registry import SUPERVISOR
+from afspm.record.run_json import STATE_DIR
+from afspm.storage.atomic import replace_file
+from afspm.storage.disk import run_bounded
+from afspm.transport import keys
+from afspm.transport.keys import GUEST, Keys
+
+WRITTEN_WITHIN_S = 5.0
+
+
+@dataclass(frozen=True)
+class KeyHandout:
+    """What is started, with its keys.
+
+    Attributes:
+        guest, supervisor: the keys of those who join the run, and of who reports to its scheduler, as launch lines
+            have them; None: the file says where keys are, or that there are none.
+    """
+
+    starts: Sequence[ProcessStart]
+    guest: Mapping[str, Any] | None = None
+    supervisor: Mapping[str, Any] | None = None
+
+    @contextmanager
+    def laid_down(self, folder: Path) -> Iterator[None]:
+        """While in the block, who may read the run's folder finds the guests' key in it, unless its disk fails."""
+        file = folder / STATE_DIR / GUEST_KEYS
+        if self.guest is not None:
+            text = json.dumps(self.guest).encode()
+            with contextlib.suppress(OSError):
+                run_bounded(lambda: replace_file(file, [text], mode=0o600), WRITTEN_WITHIN_S)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                run_bounded(lambda: file.unlink(missing_ok=True), WRITTEN_WITHIN_S)
+
+
+def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHandout:
+    """Give each process that is to be started its keys.
+
+    Raises:
+        ConfigError: a key of the file is missing, or others may read it.
+    """
+    if experiment.keys_folder is not None:
+        return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
+    security = experiment.resolved.security
+    guarded = {} if security.plain or security.insecure else _guarded(experiment, starts)
+    return _made(starts, guarded, _scheduler(experiment)) if guarded else KeyHandout(starts)
+
+
+def _scheduler(experiment: Experiment) -> str:
+    return next((part.name for part in experiment.resolved.with_role(Role.SCHEDULER)), "")
+
+
+def _with(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
+    """A start with its keys; `scheduler`: whom alone a translator obeys."""
+    if own is None:
+        return start
+    return replace(start, launch=replace(start.launch, keys={**own.as_launch(), "scheduler": scheduler}))
+
+
+def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
+    """The keys of a process out of the folder, with those of others only where it has to know them."""
+    launch = start.launch
+    own = keys.from_launch(launch.name, launch.keys)
+    if own is None or launch.sockets.publish or launch.sockets.serve or start.command:
+        return own
+    known = {key: name for key, name in own.peers.items() if name in own.servers.values()}
+    return replace(own, peers=known, folder=None)
+
+
+def _guarded(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[str, str]:
+    """Whose requests are to be proved, by the address that they come to: all who may send them are started here."""
+    slots = experiment.resolved.net.slots
+    here = {start.launch.name for start in starts}
+    complete = here >= set(experiment.component_names)
+    found: dict[str, str] = {}
+    schedulers = [start for start in starts if start.role is Role.SCHEDULER and not start.command]
+    for start in schedulers:
+        slot = slots.get(f"{start.launch.name}/serve")
+        others_know = slot is not None and slot.address is not None
+        if start.launch.sockets.serve and (complete or not others_know):
+            found[connectable(start.launch.sockets.serve)] = start.launch.name
+    for start in starts:
+        if start.role is Role.TRANSLATOR and not start.command and schedulers and start.launch.sockets.serve:
+            found[connectable(start.launch.sockets.serve)] = start.launch.name
+    return found
+
+
+def _made(starts: Sequence[ProcessStart], guarded: Mapping[str, str], scheduler: str) -> KeyHandout:
+    """New pairs for all that is started, for those who join, and for who reports."""
+    pairs = {name: keys.pair() for name in [*(start.launch.name for start in starts), SUPERVISOR, GUEST]}
+    public = {name: pair[0] for name, pair in pairs.items()}
+
+    def of(name: str, control: str | None, role: Role = Role.COMPONENT) -> Keys | None:
+        owner = next((owner for address, owner in guarded.items() if control and reaches(control, address)), None)
+        servers = {str(control): owner} if owner is not None else {}
+        guards = name in guarded.values()
+        if not servers and not guards:
+            return None
+        asking = {Role.SCHEDULER: [*pairs], Role.TRANSLATOR: [scheduler]}.get(role, []) if guards else []
+        peers = {public[one]: one for one in [*asking, *servers.values()]}
+        return Keys(name, *pairs[name], peers, servers, everywhere=False, guards=guards)
+
+    handed = [
+        _with(start, of(start.launch.name, start.launch.sockets.control, start.role), scheduler) for start in starts
+    ]
+    asked = next((address for address, owner in guarded.items() if owner == scheduler), None)
+    outside = [None if (one := of(name, asked)) is None else one.as_launch() for name in (GUEST, SUPERVISOR)]
+    return KeyHandout(handed, *outside)

@@ -1,0 +1,133 @@
+"""What follows the end of a run: its report, and whoever wants to be told that it is over."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from afspm.clock import Clock
+from afspm.components import notifications
+from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
+from afspm.errors import ConfigError
+from afspm.experiment import Role, notifying
+from afspm.logic.supervision.run_end import EndReason
+from afspm.logic.supervisor_registry import LOGGED_AS
+from afspm.record.journal import JOURNAL_FILE
+from afspm.supervisor import summary
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from afspm.experiment import Experiment, ProcessStart
+    from afspm.supervisor.log import RunLog
+    from afspm.supervisor.supervisor import RunOutcome
+
+REPORT_WITHIN_S = 120.0
+TOLD_WITHIN_S = 30.0
+
+
+@dataclass(frozen=True)
+class EndedRun:
+    """A run that is over."""
+
+    name: str
+    folder: Path
+    outcome: RunOutcome
+    simulated: bool
+
+
+def follow(
+    experiment: Experiment,
+    ended: EndedRun,
+    starts: Sequence[ProcessStart],
+    clock: Clock,
+    log: RunLog,
+    *,
+    with_report: bool,
+) -> None:
+    """Tell whoever [notify] names, then say what was measured and write the report, which need the disk and may take
+    long.
+
+    Of the end of an experiment on several computers that one tells where its scheduler ran.
+    """
+    notify = experiment.resolved.notify
+    if any(start.role is Role.SCHEDULER for start in starts):
+        tell(ended, notifying.targets(notify, experiment.folder), notify.on, clock, log)
+    for line in summary.lines(ended.outcome, ended.folder):
+        log.write(LOGGED_AS, logging.INFO, line)
+    if with_report:
+        report(ended.folder, log)
+
+
+def report(folder: Path, log: RunLog) -> None:
+    """Write the report of a run that has a record, in a process of its own, which can neither harm the run nor hold it
+    up for long."""
+    if not (folder / JOURNAL_FILE).is_file():
+        return  # nothing was recorded
+    command = [sys.executable, "-P", "-m", "afspm.record.report", str(folder)]
+    environment = {**os.environ, "MPLBACKEND": "agg"}
+    try:
+        done = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=REPORT_WITHIN_S,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        log.write(LOGGED_AS, logging.WARNING, f"no report: it took longer than {REPORT_WITHIN_S:g} s; try afspm report")
+        return
+    except OSError as error:
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {error}")
+        return
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {said[-1] if said else f'exit code {done.returncode}'}")
+    else:
+        from afspm.record.report import REPORT_FILE
+
+        log.write(LOGGED_AS, logging.INFO, f"the report is {folder / REPORT_FILE}")
+
+
+def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
+    """Tell people that a run is over, and how. What fails is tried again, for half a minute."""
+    is_lost = ended.outcome.why is EndReason.LOST
+    what = GIVEN_UP if is_lost and GIVEN_UP in on else END
+    if what not in on:
+        return
+    notice = Notification(
+        what, ended.name, str(ended.folder), clock.now_ns(), _text(ended.outcome), simulated=ended.simulated
+    )
+    until_s = clock.monotonic_s() + TOLD_WITHIN_S
+    for way in targets.ways:
+        _tell(notice, targets, way, clock, until_s, log)
+
+
+def _tell(notice: Notification, targets: Targets, way: Way, clock: Clock, until_s: float, log: RunLog) -> None:
+    tries = 0
+    while True:
+        try:
+            targets.deliver(notice, way)
+            return
+        except ConfigError as error:
+            log.write(LOGGED_AS, logging.ERROR, f"nobody is told by the {way}: {error}")
+            return
+        except NotDelivered as error:
+            tries += 1
+            delay_s = notifications.delay_s(tries)
+            if clock.monotonic_s() + delay_s >= until_s:
+                log.write(LOGGED_AS, logging.ERROR, f"nobody could be told by the {way}: {error}")
+                return
+        threading.Event().wait(delay_s)
+
+
+def _text(outcome: RunOutcome) -> str:
+    given_up = [report.name for report in outcome.reports if report.given_up]
+    return outcome.text + (f"; given up: {', '.join(given_up)}" if given_up else "")

@@ -1,0 +1,162 @@
+"""A recorded run is published again, with a folder of its own by which it is found like a running experiment."""
+
+from __future__ import annotations
+
+import json
+import logging
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from afspm import wire
+from afspm.addresses import is_address
+from afspm.client.connect import GUEST
+from afspm.clock import NS_PER_S, ExperimentClock
+from afspm.errors import ConfigError, FileError
+from afspm.launch import Launch, Sockets
+from afspm.model import Frame, Packet
+from afspm.process.message_types import register_all
+from afspm.record.run import Run, open_run
+from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
+from afspm.record.run_lock import lock_run
+from afspm.scheduler.replayer import Replayer
+from afspm.supervisor import run_folder, signals
+from afspm.supervisor.ports import FreePorts
+from afspm.supervisor.run import now
+from afspm.transport.rate_limited_log import RateLimitedLog
+
+BEFORE_S = 1.0
+"""Real: those who join at once find the beginning still to come."""
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """How to replay a run.
+
+    Attributes:
+        speed: experiment seconds in a real second; None: as it was recorded.
+        only: names of messages; empty: all.
+        publish, serve: addresses; None: those of the recorded experiment file, else free ones.
+        stay: when all is published.
+        runs: the folder of run folders.
+    """
+
+    speed: float | None = None
+    only: Sequence[str] = ()
+    publish: str | None = None
+    serve: str | None = None
+    stay: bool = False
+    runs: Path = Path("runs")
+
+
+def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> int:
+    """Publish a recorded run again until its end, or Ctrl-C; returns how many packets were published.
+
+    Raises:
+        FileError: there is no record, or it is damaged.
+        ConfigError: there is nothing to publish, or no such message.
+        TransportError: an address can't be used.
+    """
+    with open_run(where) as run:
+        guest = _guest(run)
+        register_all(guest.messages)
+        _check(options.only)
+        left_out: set[str] = set()
+
+        def leave_out(why: str) -> None:
+            if why not in left_out:  # once, not with each channel
+                tell(f"left out: {why}")
+            left_out.add(why)
+
+        packets = run.packets(messages=tuple(options.only) or None, tell=leave_out)
+        first = next(packets, None)
+        if first is None:
+            raise ConfigError("there is nothing to replay", where=str(run.folder))
+        clock = _clock(run, options.speed, first)
+        publish, serve = _addresses(run, options)
+        complaints = RateLimitedLog(logging.getLogger("afspm.replay"), clock)
+        replayer = Replayer(chain([first], packets), clock, complaints, publish=publish, serve=serve)
+        try:
+            with (
+                signals.told(lambda _: replayer.stop(), replayer.wakeup_fileno()),
+                _folder(run, options.runs, guest, clock, publish, serve) as folder,
+            ):
+                told = f"replay of {run.folder.name} at {clock.speed:g} experiment seconds a second, in {folder}"
+                tell(f"{told}\npublished at {publish}, requests are refused at {serve}; Ctrl-C ends it")
+                replayer.run(stay=options.stay)
+        finally:
+            replayer.close()
+        return replayer.count
+
+
+def _check(only: Sequence[str]) -> None:
+    for name in only:
+        if name not in wire.known_messages():
+            raise ConfigError(f"there is no message {name!r}", where="--only", hint="e.g. Scan2d,ControlState")
+
+
+def _clock(run: Run, speed: float | None, first: Packet) -> ExperimentClock:
+    recorded = run.facts.get("clock", {})
+    start_s = (first.time_ns or 0) / NS_PER_S
+    speed = float(recorded.get("speed", 1.0)) if speed is None else speed
+    return ExperimentClock.starting_now(start_s - BEFORE_S * speed, speed)
+
+
+def _addresses(run: Run, options: ReplayOptions) -> tuple[str, str]:
+    ports = FreePorts()
+    said = _said(run)
+    return options.publish or said[0] or ports.address(), options.serve or said[1] or ports.address()
+
+
+def _said(run: Run) -> tuple[str | None, str | None]:
+    """Where the scheduler was, as far as the experiment file says so."""
+    try:
+        tables = [table for table in run.experiment.values() if isinstance(table, dict)]
+    except (FileError, tomllib.TOMLDecodeError):
+        return None, None
+    found: list[str | None] = []
+    for key in ("pubsubcache", "router"):
+        addresses = (table.get(key) for table in tables if table.get("component"))
+        found.append(next((a for a in addresses if isinstance(a, str) and is_address(a)), None))
+    return found[0], found[1]
+
+
+def _guest(run: Run) -> Launch:
+    """The launch line of whoever joins."""
+    recorded = run.facts.get(GUEST)
+    guest = Launch.from_json(json.dumps(recorded)) if isinstance(recorded, dict) else Launch("guest")
+    return replace(guest, keys=None, run="", simulated=run.simulated, sample_coordinates=run.frame is Frame.SAMPLE)
+
+
+@contextmanager
+def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish: str, serve: str) -> Iterator[Path]:
+    """A run folder, by which the replay is found; when the block is left it says that it is over."""
+    folder = run_folder.create(runs, f"replay-{run.folder.name}", now())
+    sockets = Sockets(subscribe=(publish,), control=serve)
+    joined = replace(
+        guest,
+        sockets=sockets,
+        clock=clock.as_dict(),
+        run_dir=str(folder),
+        state_dir=str(folder / STATE_DIR),
+    )
+    source = run.folder / EXPERIMENT_FILE
+    if source.is_file():
+        run_folder.write_experiment(folder, source.read_text(encoding="utf-8"))
+    facts: dict[str, Any] = {
+        "name": run.name,
+        REPLAY_OF: str(run.folder.resolve()),
+        "clock": clock.as_dict(),
+        "processes": {"replay": {"role": "scheduler", "publish": publish, "serve": serve}},
+        GUEST: json.loads(joined.to_json()),
+    }
+    with lock_run(folder):
+        run_folder.write_run(folder, facts)
+        try:
+            yield folder
+        finally:
+            run_folder.write_run(folder, {**facts, ENDED: "the replay is over"})

@@ -1,0 +1,182 @@
+"""A run that was killed, or stopped, goes on in its folder: `afspm run --resume`."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TextIO
+
+from afspm.client.connect import find_run
+from afspm.clock import NS_PER_S, ExperimentClock
+from afspm.errors import ConfigError, FileError
+from afspm.experiment import Experiment, load_expanded
+from afspm.logic.supervision.run_end import EndReason
+from afspm.record import ahead
+from afspm.record.journal import open_to_read
+from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
+from afspm.record.run_lock import lock_run
+from afspm.storage.atomic import load_checkpoint
+from afspm.supervisor import config_diff
+from afspm.supervisor import run as running
+from afspm.supervisor.ports import require_free
+from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
+from afspm.supervisor.run_identity import RunIdentity, new_identity
+
+_OVER = {EndReason.EXPERIMENT_ENDED.name.lower(), EndReason.ALL_DONE.name.lower()}
+_LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
+ZMTP = b"\xff"
+"""What a socket of ZeroMQ says first."""
+GONE_WITHIN_S = 10.0
+STEP_NS = 1_000_000
+"""By so much the time goes on between two lives of a run, so that nothing new happens at a time that has been."""
+
+
+@dataclass(frozen=True)
+class ResumableRun:
+    """A run that can go on.
+
+    Attributes:
+        homes: the folders of the files that the experiment was made of.
+        added: names of components that it did not have so far.
+    """
+
+    folder: Path
+    name: str
+    experiment: Experiment
+    facts: dict[str, Any]
+    homes: tuple[Path, ...]
+    added: tuple[str, ...] = ()
+
+    def with_overlay(self, file: Path) -> ResumableRun:
+        """The same run, which goes on with what the file adds."""
+        experiment = load_expanded(self.folder / EXPERIMENT_FILE, self.homes, file)
+        before = self.experiment.component_names
+        added = [name for name in experiment.component_names if name not in before]
+        return replace(self, experiment=experiment, added=(*self.added, *added))
+
+    def options(self, options: RunOptions) -> RunOptions:
+        """With the processes that it had on this computer, and those that were added now."""
+        names = self.experiment.component_names  # without what was added in an earlier life
+        only, without = ([name for name in self.facts.get(which, ()) if name in names] for which in (ONLY, WITHOUT))
+        return replace(options, only=(*only, *self.added) if only else (), without=tuple(without))
+
+
+def find(where: Path) -> ResumableRun:
+    """The run that is meant: by its folder, or that of all runs (the newest is meant), or the experiment file.
+
+    Raises:
+        FileError: there is no run, or what is needed of it can't be read.
+        ConfigError: it has ended, or the experiment file that names it was edited since it was begun.
+    """
+    folder = find_run(where).resolve()
+    facts = read_run_json(folder)
+    if REPLAY_OF in facts:
+        raise ConfigError("this is a replay, and not a run", where=str(folder), hint=f"it is of {facts[REPLAY_OF]}")
+    if facts.get(HOW) in _OVER:
+        raise ConfigError("this run has ended as it should", where=str(folder), hint="`afspm run FILE` begins another")
+    file = folder / EXPERIMENT_FILE
+    if not file.is_file() or not (folder / STATE_DIR).is_dir():
+        raise FileError("this is not the folder of a run", where=str(folder), hint="it lacks its experiment or state")
+    homes = tuple(map(Path, facts.get(HOMES, []))) or (folder,)
+    experiment = load_expanded(file, homes)
+    if where.suffix == ".toml":
+        begun_with = [Path(name) for name in facts.get(FILES, ())]
+        config_diff.refuse_edited(begun_with if where.resolve() in begun_with else [where], experiment, folder)
+    return ResumableRun(folder, str(facts.get("name", folder.name)), experiment, facts, homes)
+
+
+def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = None) -> FinishedRun:
+    """Go on with a run until it ends, where every process finds what it remembers. Raises as `run.run`, and
+
+    FileError: it is still going on.
+    """
+    experiment, folder, facts = found.experiment, found.folder, found.facts
+    experiment.require_valid()
+    options = found.options(options)
+    with lock_run(folder):
+        _wait_until_gone(facts, folder)
+        common = _common(experiment, options, facts, folder)
+        require_free(running.addresses_of(running.dry_run(experiment, options)))
+        names = [*facts.get("processes", ()), *found.added]
+        return running.go(experiment, options, common, folder, found.name, terminal, names)
+
+
+def _common(experiment: Experiment, options: RunOptions, facts: dict[str, Any], folder: Path) -> RunIdentity:
+    """As before, with real time, or the simulated time after the last that anybody has seen."""
+    simulated = bool(facts.get("simulated")) or experiment.simulated(options.only, options.without)
+    clock = _clock_after(facts, folder) if simulated else experiment.clock()
+    return RunIdentity(clock, str(facts.get(RUN) or new_identity()), simulated)
+
+
+def _clock_after(facts: dict[str, Any], folder: Path) -> ExperimentClock:
+    before = ExperimentClock.from_dict(facts["clock"])
+    seen_ns = max(last_seen_ns(folder), round(before.start_s * NS_PER_S))
+    return ExperimentClock.starting_now((seen_ns + STEP_NS) / NS_PER_S, before.speed)
+
+
+def last_seen_ns(folder: Path) -> int:
+    """The last time in the experiment that anything of the run's folder knows of; 0 if nothing does."""
+    seen = [0]
+    state = folder / STATE_DIR
+    for written in ahead.folders(state):
+        seen += [one.packet.time_ns or 0 for one in ahead.written_ahead(written)]
+    for file in state.glob("*.json"):
+        try:
+            kept, _ = load_checkpoint(file, json.loads)
+        except FileError:
+            continue
+        translator = kept.get("translator", {}) if isinstance(kept, dict) else {}
+        for values in (kept, translator):
+            if isinstance(values, dict):
+                seen += [values[name] for name in ("last_ns", "seen_ns") if isinstance(values.get(name), int)]
+    with suppress(FileError, sqlite3.DatabaseError):  # damaged: the recorder puts it aside, and the others know as well
+        journal = open_to_read(folder)
+        with closing(journal):
+            newest = journal.execute("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ''")
+            seen.append(newest.fetchone()[0])
+    return max(seen)
+
+
+def _wait_until_gone(facts: dict[str, Any], folder: Path) -> None:
+    """Whoever lost his parent ends within a moment; two of one name must not be at work in one folder.
+
+    Raises:
+        FileError: somebody stays.
+    """
+    until_s = ExperimentClock.real().monotonic_s() + GONE_WITHIN_S
+    ports = {
+        int(match[2]): name
+        for name, process in facts.get("processes", {}).items()
+        for use in ("publish", "serve")
+        if (match := _LOOPBACK.fullmatch(str(process.get(use))))
+    }
+    if not ports:
+        return
+    with ThreadPoolExecutor(len(ports)) as pool:  # Windows takes two seconds to say of one that nobody is there
+        for name, is_gone in zip(ports.values(), pool.map(lambda port: _is_gone(port, until_s), ports), strict=True):
+            if not is_gone:
+                hint = "end it, then resume the run"
+                raise FileError(f"{name} of this run is still running", where=str(folder), hint=hint)
+
+
+def _is_gone(port: int, until_s: float) -> bool:
+    """Whether nobody listens on a port any more; a connection that is closed says that it is so, or soon will be."""
+    clock = ExperimentClock.real()
+    while (left_s := until_s - clock.monotonic_s()) > 0.0:
+        try:
+            with socket.create_connection(("127.0.0.1", port), timeout=left_s) as peer:
+                if peer.recv(1) not in (b"", ZMTP):
+                    return True  # somebody else has the port by now
+                while peer.recv(1024):
+                    peer.settimeout(max(0.001, until_s - clock.monotonic_s()))
+        except TimeoutError:
+            return False
+        except OSError:
+            return True
+    return False

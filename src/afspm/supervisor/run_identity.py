@@ -1,0 +1,90 @@
+"""What all parts of an experiment have in common: a part that is started without the scheduler asks that for it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from afspm import wire
+from afspm.clock import NS_PER_S, ExperimentClock
+from afspm.errors import ConfigError, WireError
+from afspm.launch import Launch
+from afspm.model import CLOCK_REQUEST, ControlResponse, Request, Response
+from afspm.transport.port import ControlConnected, ReplyReceived
+from afspm.transport.zmq_port import open_port
+
+AGAIN_S = 1.0
+_SAME_S = 1e-3  # two processes of one computer agree on real time to that
+
+
+@dataclass(frozen=True)
+class RunIdentity:
+    """What is the same in all processes of a run, on all of its computers.
+
+    Attributes:
+        run: the identity of the run, random; empty: it is not known here.
+        simulated: True only if the microscope is simulated for certain.
+    """
+
+    clock: ExperimentClock
+    run: str
+    simulated: bool
+
+
+def new_identity() -> str:
+    """An identity that no other run has."""
+    return os.urandom(8).hex()
+
+
+def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
+    """Ask the scheduler that `launch` leads to, which is waited for. One of version 1 knows real time alone.
+
+    Raises:
+        ConfigError: it does not tell.
+    """
+    wall = ExperimentClock.real()
+    port = open_port(launch, wall)
+    session, sent, asked, asked_s, again_s = os.urandom(4).hex(), 0, "", wall.now_s(), -math.inf
+    connected = waiting = False
+    try:
+        while True:
+            if connected and wall.monotonic_s() >= again_s:
+                sent, asked_s, again_s = sent + 1, wall.now_s(), wall.monotonic_s() + AGAIN_S
+                asked = f"{launch.name}/{session}/{sent}"
+                port.send(wire.encode_request(Request(CLOCK_REQUEST, id=asked)))
+            found = port.poll(AGAIN_S)
+            for incoming in found:
+                connected = connected or isinstance(incoming, ControlConnected)
+                if isinstance(incoming, ReplyReceived) and incoming.response.id == asked:
+                    if incoming.response.code == ControlResponse.CMD_NOT_SUPPORTED:
+                        tell(f"{incoming.response.reason}: the experiment goes by real time")
+                        return RunIdentity(wall, "", simulated=False)
+                    return _read(incoming.response, asked_s, wall.now_s(), str(launch.sockets.control))
+            if not found and not waiting:
+                waiting = True
+                tell(f"waiting for the scheduler at {launch.sockets.control}, whose run and clock this part joins")
+    finally:
+        port.close()
+
+
+def _read(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
+    """What was told between two moments of real time, with the clock as it is to be read on this computer."""
+    if not response.ok:
+        raise ConfigError(f"the scheduler does not tell the time: {response.reason}", where=where)
+    try:
+        told = json.loads(response.payload)
+        run, simulated = str(told.pop("run", "")), told.pop("simulated", False) is True
+        now_s = int(told.pop("now_ns")) / NS_PER_S
+        clock = ExperimentClock.from_dict(told)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise WireError(f"the scheduler's time can't be read: {error!r}", where=where) from error
+    if told.get("waits"):
+        return RunIdentity(clock, run, simulated)
+    real_s = (asked_s + answered_s) / 2
+    shown_s = clock.start_s + (real_s - clock.origin_s) * clock.speed
+    if abs(now_s - shown_s) <= ((answered_s - asked_s) / 2 + _SAME_S) * clock.speed:
+        return RunIdentity(clock, run, simulated)  # the same clock on the wall: exactly the same time
+    return RunIdentity(ExperimentClock(real_s, now_s, clock.speed), run, simulated)

@@ -1,0 +1,157 @@
+"""The emulated controller of a run: its process tells its address in a file under a lock that dies with it.
+
+The file lies in the folder of the run's state. While the lock is held, the process that wrote the address lives, and it
+listens there: nobody else can. So a translator that reads the address talks to the emulator of its own run, and never
+to a real controller at the vendor's usual port.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+from afspm.errors import ConfigError
+from afspm.file_lock import lock
+from afspm.translator.driver import ControllerLost
+
+if TYPE_CHECKING:
+    from afspm.launch import Launch
+    from afspm.translator.driver import Driver
+
+_LOCKED_BYTES = 1
+"""Windows lets nobody read what is locked: the text begins behind it."""
+
+
+@dataclass(frozen=True)
+class Listening:
+    """One life of an emulator at one address.
+
+    Attributes:
+        run: the identity of the run that started it.
+        life: differs between two lives of the process, and between two times that it began to listen.
+    """
+
+    address: str
+    run: str
+    life: str
+
+
+class AddressNotice:
+    """Tells, as long as this process lives, where its emulated controller listens. Made by the emulator.
+
+    Args:
+        file: see `notice_file`.
+        run: the identity of the run.
+    """
+
+    def __init__(self, file: Path, run: str) -> None:
+        self._run = run
+        self._file = file.open("a+b")
+        lock(self._file, wait=True)  # a reader has it for a moment
+        self.tell("")
+
+    def tell(self, address: str) -> None:
+        """The controller listens at this address; empty: nowhere, for now."""
+        text = json.dumps({"address": address, "run": self._run, "life": os.urandom(8).hex()})
+        self._file.truncate(0)
+        self._file.write(b" " * _LOCKED_BYTES + text.encode())
+        self._file.flush()
+
+    def close(self) -> None:
+        """The controller is gone."""
+        self._file.close()
+
+
+class EmulatedController:
+    """The emulator that a translator is wired to, as its notice tells it.
+
+    Args:
+        name: of the emulator's process.
+        file: see `notice_file`.
+        run: the identity of the run, which the emulator must have, too.
+    """
+
+    def __init__(self, name: str, file: Path, run: str) -> None:
+        self._name, self._file, self._run = name, file, run
+        self._reached: Listening | None = None
+
+    def reach(self, microscope: Driver) -> None:
+        """Connect to this run's emulator, or to nobody.
+
+        Raises:
+            ControllerLost: the emulator does not listen. And whatever `Driver.connect` raises.
+        """
+        found = self._reached = self._find()
+        microscope.controller_at, microscope.prove = found.address, self.prove
+        try:
+            microscope.connect()
+            self.prove()
+        except BaseException:
+            microscope.close()
+            raise
+
+    def prove(self) -> None:
+        """Return if the emulator that was reached still listens where it was reached.
+
+        Raises:
+            ControllerLost: it does not.
+        """
+        if self._reached is None or self._find() != self._reached:
+            what = "the emulated controller is not the one that was connected to"
+            raise ControllerLost(what, where=f"[{self._name}]")
+
+    def _find(self) -> Listening:
+        where = f"[{self._name}]"
+        try:
+            with self._file.open("rb") as file:
+                if _is_unlocked(file):
+                    raise ControllerLost("the emulated controller does not run", where=where)
+                file.seek(_LOCKED_BYTES)
+                found = Listening(**json.loads(file.read()))
+        except FileNotFoundError:
+            raise ControllerLost("the emulated controller was not started yet", where=where) from None
+        except (OSError, ValueError, TypeError) as error:
+            raise ControllerLost(f"the emulated controller can't be found: {error}", where=where) from error
+        if not found.address:
+            raise ControllerLost("the emulated controller does not listen now", where=where)
+        if found.run != self._run:
+            raise ControllerLost("the emulated controller is of another run", where=where)
+        return found
+
+
+def notice_file(state_dir: str, name: str) -> Path:
+    """Where the emulator called `name` tells its address."""
+    return Path(state_dir) / f"{name}.controller"
+
+
+def wired_to(launch: Launch, microscope: Driver) -> EmulatedController | None:
+    """The emulator that a translator may talk to; None: the controller in its settings, or none at all.
+
+    Raises:
+        ConfigError: the experiment is called simulated, and the translator would command a controller that is not
+            proved to be an emulator.
+    """
+    if not launch.controller and not (launch.simulated and microscope.controller_at):
+        return None
+    hint = "leave `simulated` out of its class for a real controller"
+    if not launch.controller:
+        what = f"the experiment is simulated, and nothing proves that {microscope.controller_at} is an emulator"
+        raise ConfigError(what, where=launch.name, hint=hint)
+    if not (launch.state_dir and launch.run):
+        raise ConfigError(f"nobody tells where [{launch.controller}] listens", where=launch.name)
+    if not microscope.controller_at:
+        what = f"{type(microscope).__name__} has no controller_at, so it can't be wired to [{launch.controller}]"
+        raise ConfigError(what, where=launch.name, hint="see the how-to on writing a translator")
+    return EmulatedController(launch.controller, notice_file(launch.state_dir, launch.controller), launch.run)
+
+
+def _is_unlocked(file: IO[bytes]) -> bool:
+    """True while no process holds the lock. What this takes is given back when the file is closed."""
+    try:
+        lock(file, shared=True)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,350 @@
+"""The parameters of a microscope as a table: what a parameter is called generically and by the vendor, and its bounds.
+
+Inside the translator every number is in the SI unit of its parameter (angles in rad); this is where vendor's units,
+a peer's units and text are converted, and where what can't be is refused. Nothing is ever clamped.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+from afspm import units
+from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused, UnitError
+from afspm.model import ControlResponse, names
+
+Value = bool | int | float | str
+
+FEEDBACK_ON: Final = names.FEEDBACK_ON
+
+_TYPES = ("float", "int", "bool", "text")
+_LONGEST_TEXT = 200
+
+
+def refuse_value(name: str, reason: str) -> Refused:
+    """The refusal of a parameter's value: REP_PARAM_ERROR, nothing changed."""
+    return Refused(ControlResponse.PARAM_ERROR, f"{name}: {reason}")
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """One parameter of one microscope: a row of its table.
+
+    Attributes:
+        name: the generic name, e.g. "scan-speed".
+        vendor: what the controller calls it; the generic name if left out.
+        unit: the controller's unit.
+        type: "float", "int", "bool" or "text".
+        range: the smallest and largest value that is accepted, in SI.
+        choices: for a text, what it may be; empty: anything.
+        read_only: it can be asked for, not set.
+        while_busy: it may be set during a scan or a move.
+        sign: -1 where the controller counts the other way round (an axis pointing down, angles clockwise).
+        resolution: differences below it are not differences (what the controller rounds away, noise of a read-back),
+            in SI.
+        where: the file that the row is from.
+    """
+
+    name: str
+    vendor: str = ""
+    unit: str = ""
+    type: str = "float"
+    range: tuple[float, float] = (-math.inf, math.inf)
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+    while_busy: bool = False
+    sign: float = 1.0
+    resolution: float = 0.0
+    where: str = ""
+
+    @property
+    def si_unit(self) -> str:
+        """The unit of the value inside: SI, but where it depends on the operating mode (the setpoint), the row's."""
+        if self.name in names.BASE_PARAMETERS:
+            si = names.BASE_PARAMETERS[self.name]
+            return self.unit if si is None else si
+        return units.si_unit(self.unit)
+
+    @property
+    def wire_unit(self) -> str:
+        """The unit that is meant when a peer gives none, and in which it is told: lengths in m, angles in deg."""
+        return "deg" if self.si_unit == "rad" else self.si_unit
+
+    def parse(self, text: str, unit: str | None = None) -> Value:
+        """What a peer asks for, converted and checked.
+
+        Raises:
+            Refused: PARAM_ERROR, with the value, the bound that it breaks and where that was set.
+        """
+        if len(text) > _LONGEST_TEXT:
+            raise refuse_value(self.name, f"a value of {len(text)} characters is not one")
+        if self.type in ("bool", "text"):
+            if unit:
+                raise refuse_value(self.name, f"it has no unit, {unit!r} was given")
+            return self._checked_word(text)
+        try:
+            number = float(text.replace("_", "?"))  # Python would read 1_000
+        except ValueError:
+            raise refuse_value(self.name, f"{text!r} is not a number") from None
+        return self.checked(self.from_unit(number, unit))
+
+    def from_unit(self, number: float, unit: str | None) -> float:
+        """A number of a peer's unit in SI; none given means that of the wire.
+
+        Raises:
+            Refused: PARAM_ERROR: the unit is unknown or of another kind.
+        """
+        try:
+            return units.convert(float(number), unit or self.wire_unit, self.si_unit)
+        except (UnitError, OverflowError) as error:
+            raise refuse_value(self.name, str(error)) from error
+
+    def checked(self, value: Value) -> Value:
+        """`value`, in SI, if it is of the right type and within the range; a whole number becomes an int.
+
+        Raises:
+            Refused: PARAM_ERROR.
+        """
+        if self.type == "bool" and isinstance(value, bool):
+            return value
+        if self.type in ("bool", "text"):
+            return self._checked_word(str(value))
+        if isinstance(value, bool | str):
+            raise refuse_value(self.name, f"{value!r} is not a number")
+        if not math.isfinite(value):
+            raise refuse_value(self.name, f"{value} is not a finite number")
+        low, high = self.range
+        if not low <= value <= high:
+            raise refuse_value(self.name, f"{self.quantity(value)} is outside {self.range_text()}")
+        if self.type == "int":
+            if value != int(value):
+                raise refuse_value(self.name, f"{value:g} is not a whole number")
+            return int(value)
+        return float(value)
+
+    def same(self, a: Value, b: Value) -> bool:
+        """Whether two values are the same to the controller's precision."""
+        if isinstance(a, str) or isinstance(b, str):
+            return a == b
+        # what went through the vendor's unit and back may differ in the last bits
+        return math.isclose(a, b, rel_tol=1e-12, abs_tol=self.resolution)
+
+    def to_vendor(self, value: Value) -> Value:
+        """A value in SI as the controller wants it."""
+        if isinstance(value, bool | str):
+            return value
+        number = units.convert(float(value), self.si_unit, self.unit) * self.sign
+        return round(number) if self.type == "int" else number
+
+    def from_vendor(self, value: Value) -> Value:
+        """A value as the controller gives it in SI.
+
+        Raises:
+            Refused: PARAM_ERROR: the controller gave something else than the table says.
+        """
+        if self.type == "text":
+            return str(value)
+        if self.type == "bool":
+            return self._checked_word(value) if isinstance(value, str) else bool(self._finite(value))
+        try:
+            number = float(value) * self.sign
+        except (ValueError, TypeError):
+            raise refuse_value(self.name, f"the controller says {value!r}, which is not a number") from None
+        number = units.convert(self._finite(number), self.unit, self.si_unit)
+        return round(number) if self.type == "int" else number
+
+    def _finite(self, number: float) -> float:
+        if not math.isfinite(number):
+            raise refuse_value(self.name, f"the controller says {number}, which is no value")
+        return number
+
+    def told(self, value: Value, unit: str | None = None) -> tuple[str, str]:
+        """A value in SI as (text, unit) for a peer, in the unit that it used or in that of the wire."""
+        if isinstance(value, bool):
+            return ("true" if value else "false"), ""
+        if isinstance(value, str):
+            return value, ""
+        wanted = unit or self.wire_unit
+        if not units.same_kind(wanted, self.si_unit):
+            wanted = self.wire_unit
+        if isinstance(value, int):
+            return str(value), wanted
+        # 15 digits: what was set as "0.1 nm" is told as 0.1, not as 0.09999999999999999
+        return f"{units.convert(value, self.si_unit, wanted):.15g}", wanted
+
+    def quantity(self, value: Value) -> str:
+        """A value in SI with its unit, for a person."""
+        if isinstance(value, bool | str):
+            return str(value)
+        number = units.convert(float(value), self.si_unit, self.unit)
+        return f"{number:.6g} {self.unit}".rstrip()
+
+    def range_text(self) -> str:
+        """The range for a person, and where it was set."""
+        text = f"{self.quantity(self.range[0])} to {self.quantity(self.range[1])}"
+        return f"{text} (set in {self.where})" if self.where else text
+
+    def _checked_word(self, text: str) -> Value:
+        word = text.strip()
+        if self.type == "bool":
+            if word.lower() in names.ON_WORDS | names.OFF_WORDS:
+                return word.lower() in names.ON_WORDS
+            raise refuse_value(self.name, f"{text!r} is neither true nor false")
+        if self.choices and word not in self.choices:
+            raise refuse_value(self.name, f"{text!r} is none of {', '.join(self.choices)}")
+        return word
+
+
+class ParameterTable(Mapping[str, ParameterSpec]):
+    """The parameters of a microscope by their generic names."""
+
+    def __init__(self, rows: Mapping[str, ParameterSpec]) -> None:
+        self._rows = dict(rows)
+
+    @classmethod
+    def from_toml(cls, path: Path) -> ParameterTable:
+        """Read a microscope's own table: `[parameters.<generic name>]` with the attributes of `ParameterSpec`.
+
+        Raises:
+            ConfigError: the file can't be read or says something that it can't.
+        """
+        try:
+            with path.open("rb") as file:
+                content = tomllib.load(file)
+        except (OSError, tomllib.TOMLDecodeError) as error:
+            raise ConfigError(f"the parameters can't be read: {error}", where=str(path)) from error
+        return cls({}).extended(content.get("parameters", {}), where=path.name)
+
+    def extended(
+        self, rows: Mapping[str, Mapping[str, Any]], *, where: str, translated: Collection[str] = ()
+    ) -> ParameterTable:
+        """This table with rows added or changed, attribute by attribute, e.g. by the experiment file.
+
+        Args:
+            translated: the names of rows that code translates: how the controller has them is not a row's to say.
+
+        Raises:
+            ConfigError: an attribute is unknown or has a value that it can't have; those of all rows at once.
+        """
+        table = dict(self._rows)
+        errors = ErrorCollector()
+        for name, given in rows.items():
+            known = table.get(name, ParameterSpec(name, vendor=name, unit=names.BASE_PARAMETERS.get(name) or ""))
+            with errors:
+                table[name] = _row(known, given, where, translated=name in translated)
+        errors.raise_all()
+        return ParameterTable(table)
+
+    def without(self, names_: Collection[str]) -> ParameterTable:
+        """This table less some rows."""
+        return ParameterTable({name: row for name, row in self._rows.items() if name not in names_})
+
+    def find(self, name: str) -> ParameterSpec:
+        """A parameter by the name that a peer gave.
+
+        Raises:
+            Refused: PARAM_NOT_SUPPORTED, with the nearest name.
+        """
+        if name not in self._rows:
+            near = difflib.get_close_matches(name[:100], self._rows, n=1)
+            hint = f", perhaps {near[0]!r}" if near else ""
+            reason = f"this microscope has no parameter {name[:100]!r}{hint}"
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, reason)
+        return self._rows[name]
+
+    def written(self, given: Mapping[str, Any], *, where: str) -> dict[str, Value]:
+        """Values as the experiment file has them, in SI: "2 um/s", or plain numbers in the row's unit.
+
+        Raises:
+            ConfigError: a name or a value can't be; all of them at once.
+        """
+        values: dict[str, Value] = {}
+        errors = ErrorCollector()
+        for name, value in given.items():
+            try:
+                values[name] = self._written(name, value)
+            except (AfspmError, TypeError) as error:
+                errors.add(ConfigError(str(error), where=f"{where}.{name}"))
+        errors.raise_all()
+        return values
+
+    def _written(self, name: str, value: Any) -> Value:
+        spec = self.find(name)
+        if isinstance(value, str) and spec.type in ("float", "int"):
+            number, unit = units.parse_quantity(value)
+            value = spec.from_unit(number, unit or spec.unit)
+        elif not isinstance(value, bool | str):
+            value = spec.from_unit(value, spec.unit)
+        return spec.checked(value)
+
+    def __getitem__(self, name: str) -> ParameterSpec:
+        return self._rows[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+
+_ATTRIBUTES = {field.name for field in fields(ParameterSpec)} - {"name", "where"}
+_OF_THE_CONTROLLER = frozenset({"vendor", "sign"})
+
+
+def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translated: bool) -> ParameterSpec:
+    at = f"{where}, parameters.{known.name}"
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"a table is wanted, not {given!r}", where=at)
+    errors = ErrorCollector()
+    for key in given:
+        if key not in _ATTRIBUTES:
+            near = difflib.get_close_matches(key, _ATTRIBUTES, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else ""
+            errors.add(ConfigError(f"unknown attribute {key!r}", where=at, hint=hint))
+        if translated and key in _OF_THE_CONTROLLER:
+            hint = "a Driver class of your own, made from this one, can translate it otherwise"
+            told = f"{key}: code translates this parameter for this microscope, and would not look at that"
+            errors.add(ConfigError(told, where=at, hint=hint))
+    errors.raise_all()
+    values = dict(given)
+    for key in ("vendor", "unit", "type"):
+        if not isinstance(values.get(key, ""), str):
+            raise ConfigError(f"{key} is a text, not {values[key]!r}", where=at)
+    for key in ("read_only", "while_busy"):
+        if not isinstance(values.get(key, False), bool):
+            raise ConfigError(f"{key} is true or false, not {values[key]!r}", where=at)
+    if "choices" in values:
+        values["choices"] = tuple(str(choice) for choice in values["choices"])
+    row = replace(known, **{k: v for k, v in values.items() if k not in ("range", "resolution")})
+    try:
+        return _with_numbers(row, values, where)
+    except (UnitError, TypeError, ValueError) as error:
+        raise ConfigError(str(error), where=at) from error
+
+
+def _with_numbers(row: ParameterSpec, values: Mapping[str, Any], where: str) -> ParameterSpec:
+    """The row with its numbers in SI: plain ones are in the row's unit, texts carry their own."""
+
+    def number(value: Any) -> float:
+        given, unit = units.parse_quantity(value) if isinstance(value, str) else (float(value), "")
+        return units.convert(given, unit or row.unit, row.si_unit)
+
+    if row.type not in _TYPES:
+        raise ValueError(f"type is one of {', '.join(_TYPES)}, not {row.type!r}")
+    if not isinstance(row.sign, int | float) or abs(row.sign) != 1:
+        raise ValueError(f"sign is 1 or -1, not {row.sign!r}")
+    if row.type in ("float", "int"):
+        units.convert(1.0, row.unit, row.si_unit)  # the vendor's unit is of the right kind
+    if "range" in values:
+        low, high = map(number, values["range"])
+        if not low <= high:
+            raise ValueError(f"the range {values['range']} is empty")
+        row = replace(row, range=(low, high), where=where)
+    if "resolution" in values:
+        row = replace(row, resolution=number(values["resolution"]))
+    return row

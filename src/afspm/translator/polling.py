@@ -1,0 +1,91 @@
+"""How often a controller is looked at: eagerly when something is about to end, seldom else. Pure.
+
+The end of a scan is to be noticed within 20 ms of the controller saying so, and a controller that serves one request
+after the other is not to be kept busy with ours meanwhile. So the time between two looks shrinks in proportion to
+what is left until the expected end, and grows again in proportion to how far that was missed.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Hashable
+from dataclasses import dataclass
+
+EAGER_S = 0.01
+"""Between two looks when the end may come at any moment: what is left of 20 ms is for the look itself."""
+_PART = 0.1  # of what is left until the end: this much of it passes between two looks
+_GUESSED, _BY_OTHERS, _SAME = 0.35, 0.03, 0.005  # how wrong an expectation may be, as a part of the duration
+_LEAST_DOUBT_S = 0.05
+_REMEMBERED = 64
+
+
+@dataclass(frozen=True)
+class ExpectedEnd:
+    """When something that began at `began_s` should end, and how sure that is; None: nothing is known of it."""
+
+    began_s: float
+    end_s: float | None = None
+    doubt_s: float = 0.0
+
+
+class AdaptivePolling:
+    """Learns how long measurements take, and says when to look next. All times are real seconds.
+
+    Args:
+        idle_s: between two looks when nothing is about to happen.
+        eager_s: when something is.
+    """
+
+    def __init__(self, idle_s: float, eager_s: float = EAGER_S) -> None:
+        self._idle_s = idle_s
+        self._eager_s = min(eager_s, idle_s)
+        self._lasted_s: OrderedDict[Hashable, float] = OrderedDict()
+        self._ratio: float | None = None
+        self._measuring: tuple[Hashable, float | None] | None = None
+        self._expected: ExpectedEnd | None = None
+        self._over_s: float | None = None
+
+    def began(self, what: Hashable, now_s: float, guess_s: float | None = None) -> None:
+        """A measurement began: `what` is the same for those that take as long; `guess_s` what its settings say."""
+        self._measuring, self._over_s = (what, guess_s), None
+        lasts_s, doubt = self._lasted_s.get(what), _SAME
+        if lasts_s is None and guess_s is not None:
+            lasts_s, doubt = guess_s * (self._ratio or 1.0), _GUESSED if self._ratio is None else _BY_OTHERS
+        if lasts_s is None:
+            self._expected = ExpectedEnd(now_s)
+        else:
+            self._expected = ExpectedEnd(now_s, now_s + lasts_s, max(_LEAST_DOUBT_S, doubt * lasts_s))
+
+    def moved(self, now_s: float) -> None:
+        """Something else began that should not take long."""
+        self._measuring = None
+        self._expected = ExpectedEnd(now_s, now_s)
+
+    def over(self, now_s: float) -> None:
+        """The controller has ended the measurement; what came of it may take a moment to be there."""
+        if self._over_s is None and self._expected is not None:
+            self._over_s = now_s
+            self._expected = ExpectedEnd(self._expected.began_s, now_s)
+
+    def ended(self, now_s: float, *, as_expected: bool) -> None:
+        """All is done; what was broken off is nothing to learn from."""
+        if as_expected and self._measuring is not None and self._expected is not None:
+            what, guess_s = self._measuring
+            lasted_s = (now_s if self._over_s is None else self._over_s) - self._expected.began_s
+            self._lasted_s[what] = lasted_s
+            self._lasted_s.move_to_end(what)
+            if len(self._lasted_s) > _REMEMBERED:
+                self._lasted_s.popitem(last=False)
+            if guess_s:
+                self._ratio = lasted_s / guess_s
+        self._measuring = self._expected = self._over_s = None
+
+    def wait_s(self, now_s: float) -> float:
+        """So long may pass until the next look."""
+        expected = self._expected
+        if expected is None:
+            return self._idle_s
+        if expected.end_s is None:
+            return self._eager_s
+        away_s = max(0.0, abs(expected.end_s - now_s) - expected.doubt_s)
+        return min(self._idle_s, max(self._eager_s, _PART * away_s))

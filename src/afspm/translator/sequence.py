@@ -1,0 +1,129 @@
+"""In which order peers see what a microscope does (wire format, "What a translator does"). Pure.
+
+The controller is polled: it may be free again before it was ever seen scanning, its file may come later than its
+state. What is published is always the whole story: SS_SCANNING, the results, SS_FREE; or SS_SCANNING,
+SS_INTERRUPTED, SS_FREE.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from afspm.model import ScopeState, ScopeStatus
+from afspm.translator.driver import MEASURING
+
+
+@dataclass(frozen=True)
+class PublishStatus:
+    """Publish this status."""
+
+    status: ScopeStatus
+
+
+@dataclass(frozen=True)
+class PublishResults:
+    """Publish the results that have come."""
+
+
+@dataclass(frozen=True)
+class DiscardResults:
+    """The results that have come, if any, are of something broken off: they are not published."""
+
+
+@dataclass(frozen=True)
+class LogError:
+    """Something that should not be: into the log."""
+
+    text: str
+
+
+SequenceStep = PublishStatus | PublishResults | DiscardResults | LogError
+
+_INTERRUPTED = ScopeStatus(ScopeState.INTERRUPTED)
+
+
+class StatusSequence:
+    """Turns what is seen at the controller into what is published.
+
+    Args:
+        said: what was published last (by an earlier process of this translator).
+        result_timeout_s: how long results may come after the end, and a stop may take.
+    """
+
+    def __init__(self, said: ScopeStatus, result_timeout_s: float) -> None:
+        self.said = said
+        self._timeout_s = result_timeout_s
+        self._waiting_since_s: float | None = None
+        self._broken_off = ScopeState.UNDEFINED
+
+    def begin(self, state: ScopeState) -> list[SequenceStep]:
+        """A request was accepted that leads to `state`, seen at the controller already or not."""
+        return self._say(ScopeStatus(state))
+
+    def interrupt(self) -> list[SequenceStep]:
+        """What is running was told to stop."""
+        return self._say(_INTERRUPTED)
+
+    def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
+        """The controller was looked at.
+
+        Args:
+            seen: what it is doing.
+            results: whether there are results that have not been published.
+            now_s: experiment time.
+        """
+        if self.said.state is ScopeState.INTERRUPTED:
+            return self._after_interruption(seen, now_s)
+        if seen == self.said:
+            self._waiting_since_s = None
+            return self._unseen(results) if seen.state is ScopeState.FREE else []
+        if self.said.state not in MEASURING or seen.state is self.said.state:
+            # results that are there already belong to what began and ended between two looks
+            return (self._unseen(results) if seen.state is ScopeState.FREE else []) + self._say(seen)
+        return self._after_measuring(seen, results, now_s)
+
+    def _unseen(self, results: bool) -> list[SequenceStep]:
+        """Someone at the controller's panel took a scan between two looks at it."""
+        if not results or self.said.state is ScopeState.UNDEFINED:
+            return []
+        after = self.said
+        return [*self._say(ScopeStatus(ScopeState.SCANNING)), PublishResults(), *self._say(after)]
+
+    def _after_measuring(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
+        if seen.state is ScopeState.INTERRUPTED:
+            return self._say(seen)
+        if results:
+            return [PublishResults(), *self._say(seen)]
+        if not self._timed_out(now_s):
+            return []
+        text = "a scan or spectrum ended without a result: it was stopped at the controller, or its file is missing"
+        return [LogError(text), *self._say(_INTERRUPTED), DiscardResults(), *self._say(seen)]
+
+    def _after_interruption(self, seen: ScopeStatus, now_s: float) -> list[SequenceStep]:
+        if seen.state is ScopeState.INTERRUPTED:
+            return []
+        if seen.state not in MEASURING:
+            return [DiscardResults(), *self._say(seen)]
+        if self._broken_off in MEASURING and seen.state is not self._broken_off:
+            return [DiscardResults(), *self._say(seen)]  # of the other kind: somebody began it
+        if not self._timed_out(now_s):
+            return []
+        return [LogError("the controller goes on in spite of being stopped"), *self._say(seen)]
+
+    def _timed_out(self, now_s: float) -> bool:
+        if self._waiting_since_s is None:
+            self._waiting_since_s = now_s
+        return now_s - self._waiting_since_s >= self._timeout_s
+
+    def deadline_s(self) -> float | None:
+        """When `observe` should be called again at the latest, experiment time."""
+        return None if self._waiting_since_s is None else self._waiting_since_s + self._timeout_s
+
+    def _say(self, status: ScopeStatus) -> list[SequenceStep]:
+        self._waiting_since_s = None
+        if status == self.said:
+            return []
+        if status == _INTERRUPTED:
+            self._broken_off = self.said.state
+        self.said = status
+        return [PublishStatus(status)]

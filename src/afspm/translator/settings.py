@@ -1,0 +1,119 @@
+"""What is in force at the microscope: read together, checked together, published together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from afspm.errors import InvalidValue, Refused
+from afspm.model import ControlResponse, Feedback, ProbePosition, Region, ScanParameters, names
+from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value, refuse_value
+
+Published = ScanParameters | Feedback | ProbePosition
+
+FRAME: Final = (
+    names.SCAN_TOP_LEFT_X,
+    names.SCAN_TOP_LEFT_Y,
+    names.SCAN_SIZE_X,
+    names.SCAN_SIZE_Y,
+    names.SCAN_ANGLE,
+    names.SCAN_RESOLUTION_X,
+    names.SCAN_RESOLUTION_Y,
+)
+EXTENT: Final = (names.SCAN_SIZE_X, names.SCAN_RESOLUTION_Y, names.SCAN_RESOLUTION_X, names.SCAN_SIZE_Y)
+"""What, with the speed, a scan's duration depends on: the width, the rows, and perhaps the rest."""
+FEEDBACK: Final = (FEEDBACK_ON, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
+POSITION: Final = (names.PROBE_POS_X, names.PROBE_POS_Y)
+
+MOVES: Final = frozenset(FRAME + POSITION)
+
+
+def watched(table: ParameterTable) -> list[str]:
+    """The parameters whose changes are published, as far as the microscope has them."""
+    return [name for name in (*FRAME, *FEEDBACK, names.ENGAGED, *POSITION) if name in table]
+
+
+def messages(values: Mapping[str, Value]) -> dict[str, Published]:
+    """What to publish of the values, by message: those that the microscope has all the parameters for."""
+    published: dict[str, Published] = {}
+    if all(name in values for name in FRAME if name != names.SCAN_ANGLE):
+        published["ScanParameters2d"] = scan_parameters(values)
+    if any(name in values for name in FEEDBACK):
+        published["ZCtrlParameters"] = feedback(values)
+    if all(name in values for name in POSITION):
+        published["ProbePosition"] = ProbePosition((_number(values, POSITION[0]), _number(values, POSITION[1])))
+    return published
+
+
+def of_message(message: str) -> tuple[str, ...]:
+    """The parameters that a published message tells."""
+    return {"ScanParameters2d": FRAME, "ZCtrlParameters": FEEDBACK, "ProbePosition": POSITION}[message]
+
+
+def scan_parameters(values: Mapping[str, Value]) -> ScanParameters:
+    """The frame that values describe, as it is published."""
+    return ScanParameters(*frame(values))
+
+
+def frame(values: Mapping[str, Value]) -> tuple[Region, tuple[int, int]]:
+    """The frame that values describe: its region and (rows, columns).
+
+    Raises:
+        InvalidValue: they describe none.
+    """
+    corner = (_number(values, names.SCAN_TOP_LEFT_X), _number(values, names.SCAN_TOP_LEFT_Y))
+    size = (_number(values, names.SCAN_SIZE_X), _number(values, names.SCAN_SIZE_Y))
+    region = Region.from_top_left(corner, size, _number(values, names.SCAN_ANGLE, 0.0))
+    shape = (int(_number(values, names.SCAN_RESOLUTION_Y)), int(_number(values, names.SCAN_RESOLUTION_X)))
+    return region, shape
+
+
+def feedback(values: Mapping[str, Value]) -> Feedback:
+    """The z feedback that values describe. Of a tip that is known to be withdrawn nobody is told that it is without
+    feedback, which would be a danger at the sample."""
+    on = values.get(FEEDBACK_ON)
+    is_away = values.get(names.ENGAGED) is False
+    return Feedback(
+        on=None if on is None or (is_away and not on) else bool(on),
+        proportional_gain=_optional(values, names.ZCTRL_PGAIN),
+        integral_gain=_optional(values, names.ZCTRL_IGAIN),
+        setpoint=_optional(values, names.ZCTRL_SETPOINT),
+    )
+
+
+def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixels: int) -> None:
+    """What a frame must be as a whole: not empty, not too many pixels, all of it within reach of the probe.
+
+    Raises:
+        Refused: PARAM_ERROR.
+    """
+    if not all(name in values for name in FRAME if name != names.SCAN_ANGLE):
+        return
+    try:
+        region, (rows, columns) = frame(values)
+    except InvalidValue as error:
+        raise Refused(ControlResponse.PARAM_ERROR, str(error)) from error
+    if rows * columns > max_pixels:
+        raise refuse_value(
+            "scan-resolution", f"{columns} x {rows} pixels are more than the {max_pixels} that this microscope takes"
+        )
+    for axis, name in enumerate(POSITION):
+        if name in table:
+            low, high = table[name].range
+            reached = region.corners_m()[:, axis]
+            slack = 1e-9 * max(abs(reached).max(), region.size_m[axis])
+            if reached.min() < low - slack or reached.max() > high + slack:
+                extent = " to ".join(table[name].quantity(float(end)) for end in (reached.min(), reached.max()))
+                raise refuse_value(
+                    "scan frame",
+                    f"it reaches from {extent} in {'xy'[axis]}, outside the probe's {table[name].range_text()}",
+                )
+
+
+def _number(values: Mapping[str, Value], name: str, default: float | None = None) -> float:
+    value = values[name] if default is None else values.get(name, default)
+    return float(value)
+
+
+def _optional(values: Mapping[str, Value], name: str) -> float | None:
+    return _number(values, name) if name in values else None

@@ -1,0 +1,104 @@
+"""Values that are in force for a while, as those of a bias pulse: what was there before is put back.
+
+The translator holds the microscope busy meanwhile. It remembers what to put back, so that a translator that is started
+anew, or finds a lost controller again, does so first.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from afspm.model import ScopeState, ScopeStatus
+from afspm.translator.driver import LOST, Driver
+from afspm.translator.parameters import Value
+from afspm.translator.settings import MOVES
+
+_KEY = "temporary"
+
+
+class TemporarySettings:
+    """What is in force for a while, if anything is.
+
+    Args:
+        kept: JSON-able, and lasts.
+        apply: sets values, or changes nothing and raises Refused.
+        save: writes `kept` down.
+    """
+
+    def __init__(
+        self,
+        microscope: Driver,
+        kept: dict[str, Any],
+        apply: Callable[[Mapping[str, Value]], None],
+        save: Callable[[], None],
+        log: logging.Logger,
+    ) -> None:
+        self._microscope = microscope
+        self._kept = kept
+        self._apply = apply
+        self._save = save
+        self._log = log
+
+    def begin(self, values: Mapping[str, Value], for_s: float) -> None:
+        """Set values, to be put back after `for_s`, experiment time.
+
+        Raises:
+            Refused: nothing was changed.
+        """
+        values = {name: self._microscope.table[name].checked(value) for name, value in values.items()}
+        former = self._microscope.in_force(values.keys())
+        self._kept[_KEY] = {"former": former, "until_s": self._microscope.clock.now_s() + for_s}
+        self._save()  # before anything is changed
+        try:
+            if values:
+                self._apply(values)
+        except LOST:
+            raise  # whether it was set is not known: it is put back when the controller is found again
+        except Exception:
+            self._forget()
+            raise
+        self._kept[_KEY]["until_s"] = self._microscope.clock.now_s() + for_s
+
+    @property
+    def until_s(self) -> float | None:
+        """When it is over, experiment time; None: nothing is temporary."""
+        found = self._kept.get(_KEY)
+        return None if found is None else float(found["until_s"])
+
+    @property
+    def status(self) -> ScopeStatus | None:
+        """What the microscope is in meanwhile; None: nothing is temporary."""
+        found = self._kept.get(_KEY)
+        if found is None:
+            return None
+        return ScopeStatus(state_for(found["former"]))
+
+    def end_if_due(self) -> None:
+        """Put back what was there, once it is time. Raises what says that the controller is lost."""
+        if self.until_s is not None and self._microscope.clock.now_s() >= self.until_s:
+            self.end()
+
+    def end(self) -> None:
+        """Put back what was there, if anything is temporary. Raises what says that the controller is lost."""
+        found = self._kept.get(_KEY)
+        if found is None:
+            return
+        try:
+            if found["former"]:
+                self._apply(found["former"])
+        except LOST:
+            raise
+        except Exception as error:
+            self._log.critical("can't put back %s: %s", found["former"], error)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._kept.pop(_KEY, None)
+        self._save()
+
+
+def state_for(values: Mapping[str, Value]) -> ScopeState:
+    """Return what the microscope is in while such values are in force for a while."""
+    return ScopeState.MOVING if MOVES & values.keys() else ScopeState.BUSY_PARAM

@@ -1,0 +1,317 @@
+"""The invariants can fail: what is broken on purpose is found within a few nights."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from afspm.logic import answers, arbitration, control_change, event_log, scheduler_core
+from afspm.logic.arbitration import ArbitrationEvent, ControlChange, Transition
+from afspm.logic.cache import PacketCache
+from afspm.logic.event_log import EventLog
+from afspm.logic.events import Effect, SaveState
+from afspm.logic.forwarder import Forwarder
+from afspm.logic.holder_timeout import HolderTimeout, Lease
+from afspm.logic.idempotency_cache import IdempotencyCache
+from afspm.logic.lifecycle import ExperimentEnd
+from afspm.logic.limit_checker import LimitChecker
+from afspm.logic.microscope_status import MicroscopeStatus
+from afspm.logic.sessions import Hearing, SessionTable
+from afspm.logic.state import SchedulerState, StateDraft
+from afspm.logic.watchdog import Watchdog
+from afspm.model import JournalEntries, JournalEntry
+from tests.simulation.invariants import InvariantViolated
+from tests.simulation.night import Fault, Night, Plan, plan
+
+NIGHTS = 16
+Patch = pytest.MonkeyPatch
+
+_FEW = ("experiment", "classifier", "corrector", "feedback", "person")
+
+
+def _bad_night(seed: int) -> Plan:
+    """A night in which much goes wrong, half of them with a translator of version 1, some with somebody greedy."""
+    away = [Fault("outage", "experiment", (seed % 10) / 10.0, 60.0)]
+    drawn = plan(seed, hours=4.0)
+    if seed % 4 == 3:  # few others and slow, so that control stays where it is
+        drawn = replace(drawn, hours=8.0, speed=60.0, cast=(*_FEW, "greedy"), lease_s=900.0)
+        away += [Fault("outage", holder, ((seed + place) % 10) / 10.0, 60.0) for place, holder in enumerate(_FEW)]
+    if seed % 4 == 1:  # one whose tip is often in danger, at a microscope that can't always withdraw it
+        cast = (*_FEW, "careless", "stranger")
+        drawn = replace(drawn, cast=cast, ends=True, retracts=seed != 13, speed=60.0)
+    there = ("scheduler", "translator", *drawn.cast)
+    faults = (*(fault for fault in drawn.faults if fault.whom in there), *away)
+    slow = replace(drawn, speed=drawn.speed / 2.0)  # in more real time more connections come and go
+    return replace(slow, faults=faults, ids_known=seed % 2 == 0, dies_in_step=0.003, doubles=0.1, hangs=0.005)
+
+
+def _rows(
+    patch: Patch, event: ArbitrationEvent, change: Callable[[tuple[Transition, ...]], tuple[Transition, ...]]
+) -> None:
+    patch.setitem(arbitration.TABLE, event, change(arbitration.TABLE[event]))
+
+
+def _without(condition: arbitration.Condition) -> Callable[[tuple[Transition, ...]], tuple[Transition, ...]]:
+    return lambda rows: tuple(row for row in rows if row.when is not condition)
+
+
+def _not_doing(do: ControlChange) -> Callable[[tuple[Transition, ...]], tuple[Transition, ...]]:
+    return lambda rows: tuple(replace(row, do=tuple(d for d in row.do if d is not do)) for row in rows)
+
+
+def flag_leaves_control(patch: Patch) -> None:
+    _rows(patch, ArbitrationEvent.FLAG, _not_doing(ControlChange.TAKE))
+
+
+def two_in_control(patch: Patch) -> None:
+    _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.OTHER_HOLDS))
+
+
+def anybody_while_flagged(patch: Patch) -> None:
+    _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_NONE))
+
+
+def manual_lets_in(patch: Patch) -> None:
+    _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.IS_MANUAL))
+
+
+def manual_leaves_control(patch: Patch) -> None:
+    _rows(patch, ArbitrationEvent.SET_MODE, _not_doing(ControlChange.TAKE))
+
+
+def solver_stays_when_solved(patch: Patch) -> None:
+    _rows(patch, ArbitrationEvent.CLEAR, _not_doing(ControlChange.TAKE))
+
+
+def anybody_commands(patch: Patch) -> None:
+    rows = arbitration.TABLE[ArbitrationEvent.COMMAND]
+    _rows(patch, ArbitrationEvent.COMMAND, lambda _: (replace(rows[0], when=arbitration.OTHERWISE),))
+
+
+def the_dead_keep_control(patch: Patch) -> None:
+    _rows(patch, ArbitrationEvent.DEAD, _not_doing(ControlChange.TAKE))
+
+
+def no_lease(patch: Patch) -> None:
+    patch.setattr(Lease, "deadline_ns", lambda self, is_free: None)
+
+
+def nobody_is_dead(patch: Patch) -> None:
+    patch.setattr(HolderTimeout, "dead_at_s", lambda self, *args: None)
+
+
+def an_impostor_is_let_in(patch: Patch) -> None:
+    real = SessionTable.hear
+
+    def hear(self: SessionTable, *args: Any) -> tuple[SessionTable, Hearing]:
+        table, hearing = real(self, *args)
+        if hearing is Hearing.TAKEN:
+            return table.bound(args[1], None, args[0]), Hearing.ACCEPTED
+        return table, hearing
+
+    patch.setattr(SessionTable, "hear", hear)
+
+
+def ids_are_forgotten(patch: Patch) -> None:
+    patch.setattr(IdempotencyCache, "look_up", lambda self, client, request: None)
+
+
+def sent_actions_are_not_saved(patch: Patch) -> None:
+    patch.setattr(IdempotencyCache, "sent", lambda self, client, request: self)
+
+
+def nothing_expires(patch: Patch) -> None:
+    patch.setattr(Forwarder, "expired", lambda self, now_s: (self, ()))
+
+
+def any_answer_will_do(patch: Patch) -> None:
+    real = Forwarder.answered
+
+    def answered(self: Forwarder, number: int, response: Any, now_s: float) -> Any:
+        return real(self, self.flight.number if self.flight else number, response, now_s)
+
+    patch.setattr(Forwarder, "answered", answered)
+
+
+def nothing_is_called_back(patch: Patch) -> None:
+    patch.setattr(answers, "call_back", lambda draft, former, cause: None)
+
+
+def told_before_saved(patch: Patch) -> None:
+    real = StateDraft.finish
+
+    def finish(self: StateDraft) -> tuple[SchedulerState, list[Effect]]:
+        state, effects = real(self)
+        return state, sorted(effects, key=lambda effect: isinstance(effect, SaveState))
+
+    patch.setattr(StateDraft, "finish", finish)
+
+
+def times_go_back(patch: Patch) -> None:
+    def next_ns(self: PacketCache, time_ns: int) -> int:
+        self._last_ns = time_ns
+        return time_ns
+
+    patch.setattr(PacketCache, "_next_ns", next_ns)
+
+
+def doubles_of_the_translator_pass(patch: Patch) -> None:
+    patch.setattr(PacketCache, "remember", lambda self, recent: None)
+
+
+def replay_by_one_newest_time(patch: Patch) -> None:
+    real = PacketCache.replay
+    patch.setattr(PacketCache, "replay", lambda self, prefixes, since_ns: real(self, prefixes, since_ns)[-3:])
+
+
+def replay_envelope_by_envelope(patch: Patch) -> None:
+    real = PacketCache.replay
+
+    def replay(self: PacketCache, prefixes: Any, since_ns: int) -> Any:
+        return tuple(sorted(real(self, prefixes, since_ns), key=lambda packet: packet.envelope))
+
+    patch.setattr(PacketCache, "replay", replay)
+
+
+def answers_are_written_down_once_more(patch: Patch) -> None:
+    real, before = EventLog.take, list[JournalEntry]()
+
+    def take(self: EventLog, *args: Any) -> tuple[EventLog, JournalEntries]:
+        log, taken = real(self, *args)
+        twice = JournalEntries((*before, *taken.entries))
+        before[:] = taken.entries[-1:]
+        return log, twice
+
+    patch.setattr(EventLog, "take", take)
+
+
+def every_fiftieth_answer_is_not_written_down(patch: Patch) -> None:
+    real, count = EventLog.add_request, itertools.count(1)
+
+    def add_request(self: EventLog, *args: Any) -> EventLog:
+        return real(self, *args) if next(count) % 50 else self
+
+    patch.setattr(EventLog, "add_request", add_request)
+
+
+def changes_of_control_are_not_written_down(patch: Patch) -> None:
+    patch.setattr(control_change, "control_entries", lambda *args: [])
+
+
+def entries_are_held_back(patch: Patch) -> None:
+    patch.setattr(scheduler_core, "_entries_due_s", lambda state: None)
+
+
+def entries_are_published_at_once(patch: Patch) -> None:
+    patch.setattr(event_log, "PERIOD_S", 0.0)
+
+
+def entries_backwards(patch: Patch) -> None:
+    real = EventLog.take
+
+    def take(self: EventLog, *args: Any) -> tuple[EventLog, JournalEntries]:
+        log, taken = real(self, *args)
+        return log, JournalEntries(taken.entries[::-1])
+
+    patch.setattr(EventLog, "take", take)
+
+
+def entries_are_not_kept_over_a_kill(patch: Patch) -> None:
+    real = PacketCache.restore
+
+    def restore(self: PacketCache, packets: Any, *args: Any) -> None:
+        real(self, [entry for entry in packets if entry[0].envelope != event_log.ENTRIES], *args)
+
+    patch.setattr(PacketCache, "restore", restore)
+
+
+def the_tip_is_never_retracted(patch: Patch) -> None:
+    patch.setattr(Watchdog, "_endangered", lambda self, microscope: self)
+
+
+def a_danger_that_can_not_be_helped_is_never_told(patch: Patch) -> None:
+    patch.setattr(MicroscopeStatus, "telling", lambda self: (self, None))
+
+
+def nobody_is_called_to_a_tip_that_was_retracted(patch: Patch) -> None:
+    patch.setattr(Watchdog, "left_to_people", False)
+
+
+def other_problems_are_solved_with_a_tip_that_is_away(patch: Patch) -> None:
+    _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_OTHER_THAN_MALFUNCTION))
+
+
+def the_end_does_not_wait_for_the_tip(patch: Patch) -> None:
+    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s, owes_retract: self.by_s is not None)
+
+
+def the_end_never_comes(patch: Patch) -> None:
+    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s, owes_retract: False)
+
+
+def limits_are_not_checked(patch: Patch) -> None:
+    patch.setattr(LimitChecker, "check", lambda self, *args: None)
+
+
+def everybody_has_every_role(patch: Patch) -> None:
+    patch.setattr(arbitration, "may", lambda role, who: True)
+
+
+MUTANTS = [
+    the_tip_is_never_retracted,
+    a_danger_that_can_not_be_helped_is_never_told,
+    nobody_is_called_to_a_tip_that_was_retracted,
+    other_problems_are_solved_with_a_tip_that_is_away,
+    the_end_does_not_wait_for_the_tip,
+    the_end_never_comes,
+    limits_are_not_checked,
+    everybody_has_every_role,
+    answers_are_written_down_once_more,
+    every_fiftieth_answer_is_not_written_down,
+    changes_of_control_are_not_written_down,
+    entries_are_held_back,
+    entries_are_published_at_once,
+    entries_backwards,
+    entries_are_not_kept_over_a_kill,
+    flag_leaves_control,
+    two_in_control,
+    anybody_while_flagged,
+    manual_lets_in,
+    manual_leaves_control,
+    solver_stays_when_solved,
+    anybody_commands,
+    the_dead_keep_control,
+    no_lease,
+    nobody_is_dead,
+    an_impostor_is_let_in,
+    ids_are_forgotten,
+    sent_actions_are_not_saved,
+    nothing_expires,
+    any_answer_will_do,
+    nothing_is_called_back,
+    told_before_saved,
+    times_go_back,
+    doubles_of_the_translator_pass,
+    replay_by_one_newest_time,
+    replay_envelope_by_envelope,
+]
+
+
+def _nights() -> None:
+    for seed in range(NIGHTS):
+        Night(_bad_night(seed)).run()
+
+
+def test_without_a_mutant_nothing_is_found() -> None:
+    _nights()
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)
+def test_a_broken_scheduler_is_found(mutant: Callable[[Patch], None], monkeypatch: Patch) -> None:
+    mutant(monkeypatch)
+    with pytest.raises(InvariantViolated):
+        _nights()

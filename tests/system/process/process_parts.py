@@ -1,0 +1,114 @@
+"""Components for the tests of the host."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from pathlib import Path
+
+from afspm.client.component import Component
+from afspm.model import Region, Scan
+
+
+def say(*words: object) -> None:
+    """To the test, which reads our standard output."""
+    sys.stdout.write(" ".join(map(str, words)) + "\n")
+    sys.stdout.flush()
+
+
+class Diary(Component):
+    """Says on standard output what happens to it."""
+
+    def on_start(self) -> None:
+        say("start")
+
+    def on_end(self) -> None:
+        say("end")
+
+
+class NeedsThreshold(Component):
+    def __init__(self, threshold: float) -> None:
+        self.threshold = threshold
+
+
+class Stuck(Component):
+    """Computes for ever, and lets nobody interrupt it."""
+
+    longest_step_s = 12.5
+
+    def on_start(self) -> None:
+        say("stuck")
+        while True:
+            threading.Event().wait(0.001)
+
+
+class SlowToMake(Component):
+    """Loads the weights of a network, say."""
+
+    def __init__(self) -> None:
+        say("made")
+        threading.Event().wait()
+
+
+class Hanging(Stuck):
+    """Computes for longer than it says that it may."""
+
+    longest_step_s = 0.2
+
+
+class Stubborn(Component):
+    """A script that swallows every error."""
+
+    def run(self) -> None:
+        say("start")
+        while True:
+            try:
+                self.scope.sleep(3600.0)
+            except Exception:
+                self.log.info("never mind")
+
+
+class Broken(Component):
+    def on_start(self) -> None:
+        raise ZeroDivisionError("the tip\nis gone")
+
+
+class ReadsStdin(Component):
+    def run(self) -> None:
+        say(f"read {sys.stdin.read()!r}")
+        self.log.warning("two\nlines")
+
+
+class EndsEverything(Component):
+    def run(self) -> None:
+        self.scope.end_experiment()
+        self.scope.wait_until(lambda: False)
+
+
+class Peaks(Component):
+    """Publishes a message of the user's own."""
+
+    def run(self) -> None:
+        from afspm import wire
+
+        message = wire.message_type("PeakList")()
+        message.heights.extend([1.0, 2.0])
+        say(message.DESCRIPTOR.name, len(message.heights))
+
+
+class Survey(Component):
+    """Takes three scans, each once."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def run(self) -> None:
+        for i in range(3):
+            region = Region((i * 2e-6, 0.0), (1e-6, 1e-6))
+            scans = self.scope.scan(region, shape=(16, 16), key=f"tile-{i}")
+            say(f"tile {i} {scans.region.center_m[0]:.1e}")
+        say("all")
+
+    def on_scan(self, scan: Scan) -> None:
+        with (self.folder / "seen").open("a") as file:
+            file.write(f"{scan.channel} {scan.region.center_m[0]:.1e} {scan.time_ns}\n")

@@ -1,0 +1,83 @@
+"""The guard of components in other languages."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import pytest
+
+from afspm.exit_codes import ExitCode
+
+GUARD = [sys.executable, "-m", "afspm.process.foreign"]
+
+# other languages have no Python: these use nothing of ours
+ECHO = "import sys; print(sys.stdin.readline().strip(), flush=True); print('eof', repr(sys.stdin.read()), flush=True)"
+DEAF = (
+    "import signal, threading; print('deaf', flush=True); "
+    "signal.signal(signal.SIGTERM, signal.SIG_IGN); threading.Event().wait()"
+)
+
+
+def python(code: str) -> list[str]:
+    return [sys.executable, "-c", code]
+
+
+@pytest.mark.parametrize("separator", [[], ["--"]])
+def test_the_line_is_passed_on_and_the_end_too(start: Any, separator: list[str]) -> None:
+    child = start([*GUARD, *separator, *python(ECHO)], '{"name": "x"}')
+    child.expect('{"name": "x"}')
+    child.let_go()
+    child.expect("eof ''")
+    assert child.exit_code() == 0
+
+
+def test_the_exit_code_is_passed_on(start: Any) -> None:
+    assert start([*GUARD, *python("raise SystemExit(80)")], "{}").exit_code() == ExitCode.ENDED
+
+
+def test_one_that_does_not_listen_is_ended(start: Any) -> None:
+    child = start([*GUARD, *python(DEAF)], "{}")
+    child.expect("deaf")
+    child.let_go()
+    assert child.exit_code() == ExitCode.ORPHAN
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
+def test_a_guard_that_is_terminated_takes_its_command_along(start: Any) -> None:
+    child = start([*GUARD, *python(DEAF)], "{}")
+    child.expect("deaf")
+    child.popen.terminate()
+    assert child.exit_code() == ExitCode.ORPHAN
+
+
+TERMINATED_AT_ONCE = """
+import os, signal, subprocess, sys
+from afspm.process import foreign
+
+class Popen(subprocess.Popen):
+    def __init__(self, *args, **settings):
+        super().__init__(*args, **settings)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+subprocess.Popen = Popen
+sys.exit(int(foreign.main(sys.argv[1:])))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
+def test_a_guard_that_is_terminated_as_its_command_starts_takes_it_along(start: Any) -> None:
+    child = start([*python(TERMINATED_AT_ONCE), *python(DEAF)], "{}")
+    assert child.exit_code() == ExitCode.ORPHAN
+
+
+def test_a_crash_is_a_crash(start: Any) -> None:
+    child = start([*GUARD, *python("import os; os.abort()")], "{}")
+    assert child.exit_code() not in (ExitCode.DONE, ExitCode.ENDED, ExitCode.ORPHAN, ExitCode.CONFIG)
+
+
+@pytest.mark.parametrize("command", [[], ["/no/such/program"]])
+def test_what_can_not_be_started_is_told(start: Any, command: list[str]) -> None:
+    child = start([*GUARD, *command], "{}")
+    assert child.exit_code() == ExitCode.CONFIG
+    assert child.error_text.startswith("ERROR ")

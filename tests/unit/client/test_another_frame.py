@@ -1,0 +1,78 @@
+"""Somebody else, at the panel or by another program, moves the frame: what is measured then is not taken for ours."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from client_lab import OTHER_REGION, REGION, SOURCE, Lab, LabPort
+
+from afspm import model
+from afspm.client.link import ExperimentLink
+from afspm.client.scope import Scope
+from afspm.errors import NoResponse
+from afspm.model import ControlRequest
+
+
+def test_a_frame_of_somebody_else_is_not_taken_for_what_ours_was_rounded_to(lab: Lab, scope: Scope) -> None:
+    publish = lab._move
+    lab._move = lambda thing: publish(model.ScanParameters(OTHER_REGION, (8, 8)))  # type: ignore[method-assign]
+    scope.scan(REGION)
+    scope.scan(REGION)
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 2
+
+
+@pytest.mark.parametrize(
+    ("frame", "told"),
+    [
+        (model.ScanParameters(OTHER_REGION, (8, 8)), r"1 x 1 um at \(5, 0\) um, 8 x 8 pixels"),
+        (model.ScanParameters(REGION, (4, 4)), r"1 x 1 um at \(0, 0\) nm, 4 x 4 pixels"),
+    ],
+)
+def test_a_scan_of_another_frame_is_not_ours_and_is_said_and_taken_again(
+    lab: Lab, scope: Scope, frame: model.ScanParameters, told: str
+) -> None:
+    def at_the_panel() -> None:
+        lab.parameters = frame
+        lab.publish(frame)
+
+    lab.at(20.0, at_the_panel)
+    scans = scope.scan(REGION, shape=(8, 8))
+    assert (scans.region, scans.first.shape, lab.begun_scans) == (REGION, (8, 8), 2)
+    assert len(scans.interruptions) == 1
+    assert re.search(told, scans.interruptions[0])
+
+
+def test_a_frame_that_is_never_scanned_is_given_up(lab: Lab, scope: Scope) -> None:
+    def elsewhere() -> None:
+        lab.publish_scan(OTHER_REGION)
+
+    lab._finish_scan = elsewhere  # type: ignore[method-assign]
+    with pytest.raises(NoResponse, match="failed 5 times: not what was asked for"):
+        scope.scan(REGION, shape=(8, 8))
+
+
+@pytest.mark.parametrize(("off", "scale", "scans"), [(0.4, 1.03, 1), (0.8, 1.0, 2), (0.0, 2.0, 2)])
+def test_where_drift_is_corrected_a_scan_lies_where_it_turned_out_to_be(
+    lab: Lab, off: float, scale: float, scans: int
+) -> None:
+    scope = Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE), frame=model.Frame.SAMPLE)
+    wrong = model.Region((off * 1e-6, 0.0), (scale * 1e-6, scale * 1e-6), frame=model.Frame.SAMPLE)
+
+    def first_elsewhere() -> None:
+        lab.publish_scan(wrong if lab.begun_scans == 1 else REGION)
+
+    lab._finish_scan = first_elsewhere  # type: ignore[method-assign]
+    scope.scan(REGION)
+    assert lab.begun_scans == scans
+
+
+def test_a_spectrum_somewhere_else_is_taken_again(lab: Lab, scope: Scope) -> None:
+    def moved() -> None:
+        lab.position = model.ProbePosition((0.0, 0.0))
+        lab.publish(lab.position)
+
+    lab.at(20.0, moved)
+    spectrum = scope.spectrum((2e-7, 3e-7), kind="IV")
+    assert spectrum.position_m == (2e-7, 3e-7)
+    assert lab.begun_scans == 2

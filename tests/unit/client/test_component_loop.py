@@ -1,0 +1,500 @@
+"""The component's loop: which handler gets what, in which order, and how it ends."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from client_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
+
+from afspm import model, wire
+from afspm.client.component import Component
+from afspm.errors import ConfigError, ExperimentEnded, Refused
+from afspm.exit_codes import ExitCode
+from afspm.launch import Launch
+from afspm.model import ControlResponse, Problem, Response, ResponseDetail, Scan, ScopeState, ScopeStatus
+from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
+from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
+
+TIP = Problem.TIP_SHAPE_CHANGED
+
+
+class Sharpness(Component):
+    """The ten lines of the documentation."""
+
+    def __init__(self, threshold: float = 0.5) -> None:
+        self.threshold = threshold
+        self.seen: list[str] = []
+
+    def on_scan(self, scan: Scan) -> None:
+        self.seen.append(scan.channel)
+        if scan.values.std() < self.threshold:
+            self.scope.flag("tip-shape-changed")
+
+
+class Diary(Component):
+    """Writes everything down."""
+
+    def __init__(self) -> None:
+        self.lines: list[Any] = []
+
+    def on_start(self) -> None:
+        self.lines.append("start")
+
+    def on_state(self, status: ScopeStatus) -> None:
+        self.lines.append(status.state)
+
+    def on_problem(self, problem: int, flagged: bool) -> None:
+        self.lines.append((problem, flagged))
+
+    def on_end(self) -> None:
+        self.lines.append("end")
+
+
+def test_ten_lines_take_part_in_an_experiment() -> None:
+    lab = Lab("sharpness")
+    lab.at(10.0, lambda: lab.publish_scan(REGION))
+    lab.at(20.0, lab.kill)
+    component = Sharpness()
+    assert run(component, lab) == ExitCode.ENDED
+    assert component.seen == ["Height", "Phase"]
+    assert TIP in lab.control.problems
+
+
+def test_handlers_are_called_in_the_order_of_what_happened() -> None:
+    lab = Lab()
+    lab.at(1.0, lambda: lab.publish(ScopeStatus(ScopeState.SCANNING)))
+    lab.at(2.0, lambda: lab.flag(TIP))
+    lab.at(3.0, lambda: lab.publish(ScopeStatus(ScopeState.FREE)))
+    lab.at(4.0, lambda: lab.clear(TIP))
+    lab.at(5.0, lab.kill)
+    diary = Diary()
+    run(diary, lab)
+    assert diary.lines == [
+        "start", ScopeState.FREE, ScopeState.SCANNING, (TIP, True), ScopeState.FREE, (TIP, False), "end",
+    ]  # fmt: skip
+
+
+def test_a_problem_flagged_before_the_start_is_told_at_the_start() -> None:
+    lab = Lab()
+    lab.flag(TIP)
+    lab.at(1.0, lab.kill)
+    diary = Diary()
+    run(diary, lab)
+    assert (TIP, True) in diary.lines
+
+
+def test_a_problem_of_the_experiment_file_comes_as_its_number() -> None:
+    lab = Lab()
+    lab.at(1.0, lambda: lab.publish(model.ControlState(problems=(42,))))
+    lab.at(2.0, lab.kill)
+    diary = Diary()
+    run(diary, lab, problems={"water-film": 42})
+    assert (42, True) in diary.lines
+
+
+def test_what_arrives_while_a_handler_blocks_is_handled_afterwards_in_order() -> None:
+    class Busy(Component):
+        def __init__(self) -> None:
+            self.seen: list[Any] = []
+
+        def on_problem(self, problem: int, flagged: bool) -> None:
+            if flagged:
+                self.seen.append("repairing")
+                with self.scope.control(solving=problem):
+                    self.scope.move_probe((1e-6, 0.0))
+                    self.scope.clear(problem)
+                self.seen.append("repaired")
+
+        def on_scan(self, scan: Scan) -> None:
+            self.seen.append(scan.region.center_m[0])
+
+    lab = Lab("corrector")
+    lab.at(1.0, lambda: lab.flag(TIP))
+    lab.at(1.5, lambda: lab.publish_scan(REGION))
+    lab.at(1.6, lambda: lab.publish_scan(OTHER_REGION))
+    lab.at(60.0, lab.kill)
+    busy = Busy()
+    run(busy, lab)
+    assert busy.seen == ["repairing", "repaired", 0.0, 0.0, 5e-6, 5e-6]
+    assert not lab.control.problems
+
+
+def test_other_messages_come_by_their_name_or_to_on_message() -> None:
+    class Others(Component):
+        def __init__(self) -> None:
+            self.named: list[Any] = []
+            self.rest: list[str] = []
+
+        def on_feedback_analysis(self, message: Any) -> None:
+            assert self.packet is not None
+            self.named.append((self.packet.envelope, message.proportionOverThreshold))
+
+        def on_message(self, envelope: str, message: Any) -> None:
+            self.rest.append(envelope)
+
+        def on_control(self, control_state: model.ControlState) -> None:
+            pass
+
+    lab = Lab()
+    lab.at(1.0, lambda: lab.publish(FeedbackAnalysis(proportionOverThreshold=0.25), "FeedbackAnalysis_fine"))
+    lab.at(2.0, lambda: lab.publish(SpatialPointWithScoreList(channel="Height")))
+    lab.at(3.0, lab.kill)
+    others = Others()
+    run(others, lab)
+    assert others.named == [("FeedbackAnalysis_fine", 0.25)]
+    assert others.rest == ["ScopeStateMsg", "ScanParameters2d", "ProbePosition", "SpatialPointWithScoreList"]
+
+
+def test_only_the_envelopes_subscribed_to_are_handled() -> None:
+    lab = Lab()
+    lab.at(1.0, lambda: lab.publish(Scan(REGION, "A", "m", _zeros()), "Scan2d_wide_A"))
+    lab.at(1.1, lambda: lab.publish(Scan(REGION, "B", "m", _zeros()), "Scan2d_narrow_B"))
+    lab.at(2.0, lab.kill)
+    component = Sharpness(threshold=-1.0)
+    run(component, lab, envelopes=("Scan2d_narrow",))
+    assert component.seen == ["B"]
+
+
+def test_what_can_not_be_read_is_dropped_and_told(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab()
+
+    def publish_rubbish() -> None:
+        lab.publish(Scan(REGION, "A", "m", _zeros()))
+        packet = next(incoming.packet for incoming in lab._inbox)  # type: ignore[union-attr]
+        packet.payload = packet.payload[:-20]
+        packet.envelope = "Scan2d"
+        lab.publish(ScopeStatus(ScopeState.FREE), "NobodyKnows")
+
+    lab.at(1.0, publish_rubbish)
+    lab.at(2.0, lambda: lab.publish_scan(REGION))
+    lab.at(3.0, lab.kill)
+    component = Sharpness(threshold=-1.0)
+    assert run(component, lab) == ExitCode.ENDED
+    assert component.seen == ["Height", "Phase"]
+    assert "can't be read" in caplog.text
+
+
+def test_ticks_keep_the_beat_of_the_experiment() -> None:
+    class Beat(Component):
+        period_s = 900.0
+
+        def __init__(self) -> None:
+            self.times_s: list[float] = []
+
+        def on_tick(self) -> None:
+            self.times_s.append(round(self.clock.now_s() - EPOCH_S))
+            if len(self.times_s) == 2:
+                self.scope.sleep(2000.0)  # two beats are missed
+
+    lab = Lab()
+    lab.at(4600.0, lab.kill)
+    beat = Beat()
+    run(beat, lab)
+    assert beat.times_s == [0, 900, 3600, 4500]
+
+
+def test_a_period_that_is_none_is_refused() -> None:
+    component = Diary()
+    component.period_s = 0.0
+    with pytest.raises(ConfigError, match="period"):
+        run(component, Lab())
+
+
+def test_a_script_is_done_when_it_returns() -> None:
+    class Script(Component):
+        def __init__(self) -> None:
+            self.scans: list[Any] = []
+            self.ended = False
+
+        def run(self) -> None:
+            self.scans.append(self.scope.scan(REGION))
+
+        def on_end(self) -> None:
+            self.ended = True
+
+    lab = Lab()
+    script = Script()
+    assert run(script, lab) == ExitCode.DONE
+    assert script.scans[0].region == REGION
+    assert script.ended
+    assert not lab.open
+
+
+def test_a_script_that_ends_the_experiment_has_ended() -> None:
+    class Script(Component):
+        def run(self) -> None:
+            self.scope.end_experiment()
+
+    assert run(Script(), Lab()) in (ExitCode.ENDED, ExitCode.DONE)
+
+
+def test_who_asks_for_control_before_it_has_heard_of_the_end_has_ended_too() -> None:
+    """The answer may come before the signal."""
+
+    class Script(Component):
+        def run(self) -> None:
+            with self.scope.control():
+                raise AssertionError("there is nothing to control any more")
+
+    lab = Lab()
+    lab.intercept = lambda request: Response(ControlResponse.FAILURE, detail=ResponseDetail.EXPERIMENT_ENDED)
+    assert run(Script(), lab) == ExitCode.ENDED
+
+
+def test_the_handlers_of_a_script_are_called_between_its_calls() -> None:
+    class Script(Component):
+        def __init__(self) -> None:
+            self.lines: list[str] = []
+
+        def run(self) -> None:
+            for i in range(2):
+                self.scope.scan(REGION)
+                self.lines.append(f"scan {i}")
+
+        def on_scan(self, scan: Scan) -> None:
+            self.lines.append(scan.channel)
+
+    script = Script()
+    run(script, Lab())
+    assert script.lines == ["Height", "Phase", "scan 0", "Height", "Phase", "scan 1"]
+
+
+def test_a_script_without_handlers_keeps_nothing_in_memory() -> None:
+    class Script(Component):
+        def run(self) -> None:
+            self.scope.scan(REGION)
+
+    lab = Lab()
+    from afspm.client.loop import ComponentLoop
+
+    loop = ComponentLoop(Script(), context_of(lab))
+    loop.run()
+    assert len(loop._backlog) == 0
+
+
+@pytest.mark.parametrize("who", ["kill", "parent"])
+def test_the_end_comes_while_a_handler_waits(who: str) -> None:
+    class Waits(Diary):
+        def on_start(self) -> None:
+            self.scope.wait_until(lambda: False)
+
+    lab = Lab()
+    lab.at(5.0, lab.kill if who == "kill" else lab.parent_goes)
+    component = Waits()
+    assert run(component, lab) == (ExitCode.ENDED if who == "kill" else ExitCode.ORPHAN)
+    assert component.lines == ["end"]
+    assert lab.clock.passed_s == pytest.approx(5.0)
+
+
+def test_an_error_in_a_handler_is_the_end_of_the_process() -> None:
+    class Faulty(Diary):
+        def on_state(self, status: ScopeStatus) -> None:
+            raise ZeroDivisionError
+
+    lab = Lab()
+    component = Faulty()
+    with pytest.raises(ZeroDivisionError):
+        run(component, lab)
+    assert "end" not in component.lines
+    assert not lab.open
+
+
+def test_an_error_at_the_end_does_not_hide_why_it_ended(caplog: pytest.LogCaptureFixture) -> None:
+    class Faulty(Component):
+        def on_end(self) -> None:
+            raise ZeroDivisionError
+
+    lab = Lab()
+    lab.at(1.0, lab.kill)
+    assert run(Faulty(), lab) == ExitCode.ENDED
+    assert "on_end failed" in caplog.text
+
+
+def test_asking_for_something_at_the_end_does_no_harm() -> None:
+    class Asks(Component):
+        def on_end(self) -> None:
+            self.scope.flag(TIP)
+
+    lab = Lab()
+    lab.at(1.0, lab.kill)
+    assert run(Asks(), lab) == ExitCode.ENDED
+
+
+def test_what_is_given_by_the_runtime_is_missed_in_words_in_the_constructor() -> None:
+    class Early(Component):
+        def __init__(self) -> None:
+            self.scope.flag(TIP)
+
+    with pytest.raises(AttributeError, match="scope is not there yet in __init__"):
+        Early()
+    with pytest.raises(AttributeError, match="no attribute 'skope'"):
+        _ = Sharpness().skope  # type: ignore[attr-defined]
+
+
+class Counts(Component):
+    """Counts scans, and fails at those of one channel."""
+
+    def on_scan(self, scan: Scan) -> None:
+        self.memory.setdefault("seen", []).append(scan.channel)
+        if scan.channel == "Phase":
+            raise ValueError("I can't read that")
+
+
+def test_what_a_handler_remembers_is_kept_when_it_returns_and_not_when_it_fails(tmp_path: Path) -> None:
+    lab = Lab("counts")
+    lab.at(10.0, lambda: lab.publish_scan(REGION))
+    with pytest.raises(ValueError, match="read that"):
+        run(Counts(), lab, tmp_path)
+    assert json.loads((tmp_path / "counts.json").read_text()) == {"seen": ["Height"]}
+
+
+def test_a_script_says_itself_when_it_has_remembered_all(tmp_path: Path) -> None:
+    class Script(Counts):
+        def on_scan(self, scan: Scan) -> None:
+            self.memory["half"] = True
+
+        def run(self) -> None:
+            self.scope.scan(REGION)
+
+    run(Script(), Lab("script"), tmp_path)
+    assert not (tmp_path / "script.json").exists()
+
+
+def test_everything_promised_is_there_at_the_start(tmp_path: Path) -> None:
+    class Looks(Component):
+        def on_start(self) -> None:
+            self.found = {name: getattr(self, name) for name in Component.__annotations__ if name in PROMISED}
+            self.memory["n"] = 1
+            self.memory.save()
+            raise ExperimentEnded("enough")
+
+    looks = Looks()
+    run(looks, Lab("looks"), tmp_path, run_dir="/runs/x")
+    assert looks.found["name"] == "looks"
+    assert looks.found["run_dir"] == Path("/runs/x")
+    assert looks.found["clock"].now_s() == EPOCH_S
+    assert json.loads((tmp_path / "looks.json").read_text()) == {"n": 1}
+
+
+PROMISED = {"scope", "clock", "log", "name", "memory", "run_dir"}
+
+
+def test_publishing_goes_out_under_the_name_of_the_message_or_an_envelope_that_begins_with_it() -> None:
+    class Publishes(Component):
+        def on_start(self) -> None:
+            self.publish(FeedbackAnalysis(proportionOverThreshold=0.5))
+            self.publish(FeedbackAnalysis(), "FeedbackAnalysis_fine")
+            with pytest.raises(ConfigError, match="does not begin with"):
+                self.publish(FeedbackAnalysis(), "Scan2d_x")
+
+        def run(self) -> None:
+            pass
+
+    lab = Lab()
+    run(Publishes(), lab)
+    assert [envelope for envelope, _ in lab.published] == ["FeedbackAnalysis", "FeedbackAnalysis_fine"]
+    assert wire.decode("FeedbackAnalysis", lab.published[0][1]).proportionOverThreshold == 0.5
+
+
+def test_packets_of_other_publishers_are_handled_and_are_no_state_of_the_microscope() -> None:
+    from afspm.transport.port import PacketReceived
+
+    lab = Lab()
+    message, payload = wire.encode(ScopeStatus(ScopeState.SPEC))
+
+    def publish() -> None:
+        lab._inbox.append(PacketReceived(model.Packet(message, payload, 1), "memory://another"))
+
+    lab.at(1.0, publish)
+    lab.at(2.0, lab.kill)
+
+    class Watches(Diary):
+        def on_state(self, status: ScopeStatus) -> None:
+            super().on_state(status)
+            assert self.scope._link.view.state is ScopeState.FREE
+
+    component = Watches()
+    assert run(component, lab) == ExitCode.ENDED
+    assert ScopeState.SPEC in component.lines
+
+
+def test_control_of_an_earlier_life_is_given_back_when_it_is_not_needed() -> None:
+    from afspm.logic.arbitration import ArbitrationEvent
+
+    lab = Lab("corrector")
+    lab.does(ArbitrationEvent.REQUEST_CONTROL, "corrector")
+    lab.at(1.0, lab.kill)
+    run(Diary(), lab)
+    assert lab.control.holder is None
+
+
+def test_busy_and_waiting_are_told_apart() -> None:
+    ages: list[float] = []
+
+    class Works(Component):
+        longest_step_s = 7.0
+
+        def on_state(self, status: ScopeStatus) -> None:
+            lab.clock.passed_s += 5.0  # computing
+            ages.append(context.activity.age_s())
+            lab.at(3.0, lambda: ages.append(context.activity.age_s()))
+            self.scope.sleep(4.0)
+            ages.append(context.activity.age_s())
+            raise ExperimentEnded("enough")
+
+    lab = Lab()
+    context = context_of(lab)
+    Works().run_process(context)
+    assert ages == [5.0, 0.0, 0.0]
+    assert context.activity.longest_step_s == 7.0
+    assert context.activity.age_s() == 0.0
+
+
+def test_refused_in_a_script_that_does_not_expect_it_is_a_crash() -> None:
+    class Script(Component):
+        def run(self) -> None:
+            self.scope.action("x-crash")
+
+    with pytest.raises(Refused, match="no such action"):
+        run(Script(), Lab())
+
+
+def test_a_component_that_waits_for_nothing_waits_without_a_timeout() -> None:
+    with pytest.raises(Nothing):
+        run(Diary(), Lab())
+
+
+def test_a_launch_line_needs_no_sockets() -> None:
+    assert Launch("x").sockets.subscribe == ()
+
+
+def _zeros() -> Any:
+    import numpy as np
+
+    return np.zeros((4, 4))
+
+
+@pytest.mark.parametrize("who", ["kill", "parent"])
+def test_what_was_measured_before_the_end_is_handled(who: str) -> None:
+    class Table(Component):
+        def __init__(self) -> None:
+            self.rows: list[str] = []
+
+        def on_scan(self, scan: Scan) -> None:
+            self.rows.append(scan.channel)
+
+    def measured_and_ended() -> None:
+        lab.publish_scan(REGION)
+        if who == "kill":
+            lab.kill()
+        else:
+            lab.parent_goes()
+
+    lab = Lab()
+    lab.at(5.0, measured_and_ended)
+    component = Table()
+    run(component, lab)
+    assert component.rows == ["Height", "Phase"]

@@ -1,0 +1,271 @@
+"""With a key, a scan is there exactly once, whenever the component is killed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from afspm.client.link import ExperimentLink
+from afspm.client.scope import Scope
+from afspm.errors import InvalidValue, NoResponse, Refused
+from afspm.logic.arbitration import ArbitrationEvent
+from afspm.model import ControlRequest, ControlResponse, Problem, Request, Response, ScanSet
+
+TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
+
+
+def scope_of(lab: Lab, folder: Path, life: int, port: LabPort | None = None) -> Scope:
+    return Scope(ExperimentLink(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
+
+
+def kill_in(lab: Lab, seconds: float, port: LabPort) -> None:
+    def die() -> None:
+        port.is_dead = True
+
+    lab.at(seconds, die)
+
+
+def survey(scope: Scope) -> list[ScanSet]:
+    return [scope.scan(region, shape=(8, 8), key=f"tile-{i}") for i, region in enumerate(TILES)]
+
+
+def survive(lab: Lab, folder: Path, kills_s: list[float], *, is_noticed: bool) -> list[ScanSet]:
+    """Run the survey, kill it after each of `kills_s` (from the start of each life), and start it again."""
+    for life, kill_s in enumerate([*kills_s, None]):
+        port = LabPort(lab)
+        if kill_s is not None:
+            kill_in(lab, kill_s, port)
+        try:
+            return survey(scope_of(lab, folder, life, port))
+        except Kill9:
+            if is_noticed:  # the scheduler takes control from the dead, and stops the scan
+                lab.does(ArbitrationEvent.DEAD, lab.name)
+            lab.restart_component()
+    raise AssertionError
+
+
+def test_a_script_that_starts_from_the_beginning_gets_the_scans_of_its_earlier_life(tmp_path: Path) -> None:
+    lab = Lab()
+    before = survey(scope_of(lab, tmp_path, 0))
+    lab.restart_component()
+    after = survey(scope_of(lab, tmp_path, 1))
+    assert lab.begun_scans == 3
+    assert [s.region for s in before] == [s.region for s in after] == TILES
+    assert [s.first.time_ns for s in before] == [s.first.time_ns for s in after]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    kills_s=st.lists(st.floats(0.0, 2.5 * SCAN_S), min_size=1, max_size=3),
+    is_noticed=st.booleans(),
+)
+def test_every_tile_is_scanned_exactly_once_whenever_it_is_killed(kills_s: list[float], *, is_noticed: bool) -> None:
+    lab = Lab()
+    with TemporaryDirectory() as folder:
+        scans = survive(lab, Path(folder), kills_s, is_noticed=is_noticed)
+    assert [s.region for s in scans] == TILES
+    assert lab.finished == TILES
+    assert lab.control.holder is None
+
+
+@pytest.mark.parametrize("is_noticed", [True, False])
+@pytest.mark.parametrize("is_late", [True, False])
+def test_every_tile_is_scanned_exactly_once_at_whichever_step_it_is_killed(*, is_late: bool, is_noticed: bool) -> None:
+    for deadly_call in range(1, 1000):
+        lab = Lab()
+        with TemporaryDirectory() as folder:
+            port = LabPort(lab, deadly_call, is_late=is_late)
+            try:
+                survey(scope_of(lab, Path(folder), 0, port))
+                break  # survived: all steps were tried
+            except Kill9:
+                pass
+            if is_noticed:
+                lab.does(ArbitrationEvent.DEAD, lab.name)
+            lab.restart_component()
+            survey(scope_of(lab, Path(folder), 1))
+        assert lab.finished == TILES, f"killed at call {deadly_call}"
+    assert deadly_call > 20
+
+
+def test_a_scan_that_went_on_during_the_death_is_taken_up_and_not_asked_for_again(tmp_path: Path) -> None:
+    lab = Lab()
+    survive(lab, tmp_path, [50.0], is_noticed=False)
+    assert lab.begun_scans == 3
+
+
+def test_a_scan_that_was_finished_during_the_death_is_found_in_the_cache(tmp_path: Path) -> None:
+    lab = Lab()
+    port = LabPort(lab)
+    kill_in(lab, 50.0, port)
+    with pytest.raises(Kill9):
+        survey(scope_of(lab, tmp_path, 0, port))
+    lab.publish(lab.control.published())
+    while lab._happenings:  # nobody takes what arrives
+        lab.poll(1000.0)
+    lab.restart_component()
+    scope_of(lab, tmp_path, 1).scan(TILES[0], shape=(8, 8), key="tile-0")
+    assert lab.begun_scans == 1
+    assert lab.control.holder is None, "control of the earlier life is given back"
+
+
+def test_what_is_measured_without_a_key_first_does_not_forget_the_scan_with_one(tmp_path: Path) -> None:
+    def measure(scope: Scope) -> None:
+        scope.spectrum()
+        scope.scan(TILES[0], shape=(8, 8), key="tile-0")
+
+    lab = Lab()
+    port = LabPort(lab)
+    kill_in(lab, 155.0, port)  # the spectrum took 100 s
+    with pytest.raises(Kill9):
+        measure(scope_of(lab, tmp_path, 0, port))
+    while lab._happenings:  # it ends while nobody is there
+        lab.poll(1000.0)
+    assert len(lab.finished) == 1
+    lab.restart_component()
+    measure(scope_of(lab, tmp_path, 1))
+    assert len(lab.finished) == 1
+
+
+def test_a_scan_that_is_finished_while_a_later_life_waits_for_control_is_taken_up(tmp_path: Path) -> None:
+    lab = Lab()
+    lab.begin_unheard(TILES[0], in_s=20.0)
+    lab.at(2.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    port = LabPort(lab)
+    kill_in(lab, 5.0, port)
+    with pytest.raises(Kill9):
+        scope_of(lab, tmp_path, 0, port).scan(TILES[0], shape=(8, 8), key="tile-0")
+    lab.restart_component()
+    scans = scope_of(lab, tmp_path, 1).scan(TILES[0], shape=(8, 8), key="tile-0")
+    assert scans.region == TILES[0]
+    assert lab.begun_scans == 1
+
+
+def test_interruptions_of_an_earlier_life_are_said_too(tmp_path: Path) -> None:
+    lab = Lab()
+    lab.at(20.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    scans = survive(lab, tmp_path, [100.0], is_noticed=False)
+    assert "tip-shape-changed" in scans[0].interruptions[0]
+
+
+def test_a_key_is_for_one_measurement(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    scope.scan(TILES[0], key="same")
+    with pytest.raises(InvalidValue, match="another measurement"):
+        scope.scan(TILES[1], key="same")
+
+
+@pytest.mark.parametrize("key", ["", "a/b", "x" * 101, "line\nbreak"])
+def test_a_key_must_fit_into_an_id(tmp_path: Path, key: str) -> None:
+    with pytest.raises(InvalidValue, match="key"):
+        scope_of(Lab(), tmp_path, 0).scan(TILES[0], key=key)
+
+
+def test_keys_that_look_alike_on_disk_are_told_apart(tmp_path: Path) -> None:
+    scope = scope_of(Lab(), tmp_path, 0)
+    a, b = scope.scan(TILES[0], key="Tile 1"), scope.scan(TILES[1], key="tile 1")
+    assert (a.region, b.region) == (TILES[0], TILES[1])
+
+
+def test_without_a_key_every_call_is_a_new_scan(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    scope.scan(TILES[0])
+    scope.scan(TILES[0])
+    assert lab.begun_scans == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_spectrum_with_a_key_is_taken_once(tmp_path: Path) -> None:
+    lab = Lab()
+    for life in range(2):
+        scope_of(lab, tmp_path, life).spectrum((1e-7, 0.0), key="iv-1")
+        lab.restart_component()
+    assert lab.begun_scans == 1
+    assert lab.count(ControlRequest.SET_PROBE_POS) == 1
+
+
+def test_a_scan_that_was_given_up_waiting_for_is_taken_up_by_the_next_call(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    with pytest.raises(NoResponse):
+        scope.scan(TILES[0], key="tile", timeout_s=0.5 * SCAN_S)
+    scope.scan(TILES[0], key="tile")
+    assert lab.begun_scans == 1
+
+
+def test_after_a_refusal_the_same_key_is_asked_for_with_another_id(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    lab.intercept = lambda request: Response(ControlResponse.ACTION_ERROR) if request.subject else "go on"
+    with pytest.raises(Refused):
+        scope.scan(None, key="tile")
+    lab.intercept = lambda request: "go on"
+    scope.scan(None, key="tile")
+    ids = [request.id for request in lab.requests if request.subject == "start-scan"]
+    assert ids == ["experiment/key/tile/1", "experiment/key/tile/2"]
+
+
+def retracted(lab: Lab) -> Callable[[], None]:
+    """The tip is retracted: no scan begins, and ids are remembered with that answer. Returns what engages it again."""
+    execute, is_retracted = lab._execute, [True]
+
+    def carry_out(request: Request) -> Response:
+        if is_retracted and request.subject == "start-scan":
+            return Response(ControlResponse.ACTION_ERROR, reason="the tip is retracted")
+        return execute(request)
+
+    lab._execute = carry_out  # type: ignore[method-assign]
+    return is_retracted.clear
+
+
+def test_what_was_refused_in_earlier_lives_is_done_once_it_can_be(tmp_path: Path) -> None:
+    lab = Lab()
+    engage = retracted(lab)
+    for life in range(3):
+        with pytest.raises(Refused, match="retracted"):
+            scope_of(lab, tmp_path, life).scan(REGION, shape=(8, 8), key="tile")
+        lab.restart_component()
+    engage()
+    assert scope_of(lab, tmp_path, 3).scan(REGION, shape=(8, 8), key="tile").region == REGION
+    assert lab.begun_scans == 1
+
+
+@pytest.mark.parametrize("is_late", [True, False])
+def test_what_was_refused_is_done_once_at_whichever_step_it_was_killed(*, is_late: bool) -> None:
+    for deadly_call in range(1, 1000):
+        lab = Lab()
+        engage = retracted(lab)
+        with TemporaryDirectory() as folder:
+            port = LabPort(lab, deadly_call, is_late=is_late)
+            with pytest.raises((Kill9, Refused)):
+                scope_of(lab, Path(folder), 0, port).scan(REGION, shape=(8, 8), key="tile")
+            engage()
+            lab.restart_component()
+            scope_of(lab, Path(folder), 1).scan(REGION, shape=(8, 8), key="tile")
+        assert lab.finished == [REGION], f"killed at call {deadly_call}"
+        if not port.is_dead:
+            break
+    assert deadly_call > 5
+
+
+def test_what_is_forgotten_is_measured_again_and_takes_no_space(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    survey(scope)
+    scope.forget("tile-1")
+    scope.forget("tile-1")
+    assert len(list(tmp_path.rglob("tile-*"))) == 2
+    survey(scope)
+    assert lab.finished == [*TILES, TILES[1]]
+    with pytest.raises(InvalidValue, match="can't be a key"):
+        scope.forget("../tile-1")

@@ -1,0 +1,147 @@
+"""What is kept on disk, and what waits in memory."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afspm.client.backlog import Backlog
+from afspm.errors import FileError, InvalidValue
+from afspm.model import Packet
+from afspm.process.memory import Memory
+
+
+def test_what_is_saved_is_there_after_a_restart(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "state" / "x.json")
+    memory["step"] = 17
+    memory["places"] = [[1.5e-9, 2.0]]
+    memory.save()
+    memory["step"] = 18  # not saved
+    assert dict(Memory(tmp_path / "state" / "x.json")) == {"step": 17, "places": [[1.5e-9, 2.0]]}
+
+
+def test_nothing_is_left_of_a_value_that_can_not_be_kept(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "x.json")
+    memory["a"] = 1
+    memory.save()
+    memory["b"] = object()
+    with pytest.raises(InvalidValue, match="can't be kept"):
+        memory.save()
+    assert dict(Memory(tmp_path / "x.json")) == {"a": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["x.json"]
+
+
+def test_numbers_of_numpy_are_kept_and_arrays_are_not(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "x.json")
+    memory["n"], memory["sharpness"] = np.int64(3), [np.float32(0.5)]
+    memory.save()
+    assert dict(Memory(tmp_path / "x.json")) == {"n": 3, "sharpness": [0.5]}
+    memory["scan"] = np.zeros((2, 2))
+    with pytest.raises(InvalidValue, match="ndarray"):
+        memory.save()
+
+
+def test_changes_are_written_however_deep_they_are_and_nothing_else(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "x.json")
+    memory.save_changes()
+    assert not (tmp_path / "x.json").exists()
+    memory["places"] = [1]
+    memory.save_changes()
+    memory["places"].append(2)
+    memory.save_changes()
+    (tmp_path / "x.json").unlink()
+    memory.save_changes()
+    assert not (tmp_path / "x.json").exists()
+    memory.save()
+    assert dict(Memory(tmp_path / "x.json")) == {"places": [1, 2]}
+
+
+def test_a_key_that_would_come_back_as_another_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidValue, match="text"):
+        Memory(None)[5] = "x"  # type: ignore[index]
+
+
+@pytest.mark.parametrize("content", ["{", "[1]", "\0"])
+def test_a_file_that_is_something_else_is_told(tmp_path: Path, content: str) -> None:
+    (tmp_path / "x.json").write_text(content)
+    with pytest.raises(FileError, match="remove it"):
+        Memory(tmp_path / "x.json")
+
+
+def test_a_folder_that_can_not_be_written_to_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A drive that is away for a while must not end a component, which would be given up by the time it is back."""
+    (tmp_path / "file").write_text("")
+    memory = Memory(None)
+    memory._path = tmp_path / "file" / "x.json"
+    assert memory.save() is False
+    assert [record.levelname for record in caplog.records] == ["CRITICAL"]
+
+
+def test_what_is_on_a_drive_that_is_away_is_not_begun_anew(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="the folder of the run is not there"):
+        Memory(tmp_path / "away" / "state" / "x.json")
+
+
+def test_a_full_disk_is_told_once_and_all_is_kept_when_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    caplog.set_level(logging.INFO)
+    memory = Memory(tmp_path / "x.json")
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", full)
+        for step in range(3):
+            memory["step"] = step
+            assert memory.save() is False
+    assert [record.levelname for record in caplog.records] == ["CRITICAL"]
+    assert memory.save() is True
+    assert dict(Memory(tmp_path / "x.json")) == {"step": 2}
+    assert "it can be written again" in caplog.text
+
+
+OPERATIONS = st.lists(st.one_of(st.none(), st.tuples(st.binary(max_size=40), st.none() | st.integers(0, 2**62))))
+
+
+@given(OPERATIONS)
+def test_a_backlog_is_a_queue_however_much_of_it_is_on_disk(operations: list[tuple[bytes, int | None] | None]) -> None:
+    backlog, model = Backlog(limit_bytes=60), deque[Packet]()
+    for number, operation in enumerate(operations):
+        if operation is None:
+            assert backlog.take() == (model.popleft() if model else None)
+        else:
+            packet = Packet(f"Enveloppe_é_{number}", *operation)
+            backlog.put(packet)
+            model.append(packet)
+        assert len(backlog) == len(model)
+        assert backlog._memory_bytes <= 60
+    while model:
+        assert backlog.take() == model.popleft()
+    assert backlog._file is None, "an empty backlog keeps no file"
+    backlog.close()
+
+
+def test_a_packet_larger_than_the_limit_is_kept_all_the_same() -> None:
+    backlog = Backlog(limit_bytes=10)
+    backlog.put(Packet("Scan2d", b"x" * 100, 1))
+    backlog.put(Packet("Scan2d", memoryview(b"y" * 100), 2))
+    assert [bytes(p.payload[:1]) for p in iter(backlog.take, None)] == [b"x", b"y"]
+
+
+def test_what_comes_later_does_not_overtake_what_waits_on_disk() -> None:
+    backlog = Backlog(limit_bytes=10)
+    for time_ns in range(3):  # the first in memory, the others on disk
+        backlog.put(Packet("Scan2d", b"x" * 8, time_ns))
+    first = backlog.take()
+    backlog.put(Packet("Scan2d", b"x", 3))  # there would be room for it in memory
+    assert first is not None
+    assert [first.time_ns, *(packet.time_ns for packet in iter(backlog.take, None))] == [0, 1, 2, 3]

@@ -1,0 +1,28 @@
+"""Classes out of modules beside an experiment file."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+from afspm.experiment import class_loader
+
+
+def test_modules_beside_the_file_are_forgotten_and_those_of_an_environment_in_its_folder_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else numpy, say, would have to be imported once more, which it refuses."""
+    environment = tmp_path / ".venv" / "site-packages"
+    for file in (tmp_path / "beside.py", tmp_path / "package" / "__init__.py", environment / "library.py"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("import library\n" if file.name == "beside.py" else "", encoding="utf-8")
+    monkeypatch.syspath_prepend(environment)
+    with class_loader.importing_from([tmp_path]):
+        for name in ("beside", "package"):
+            importlib.import_module(name)
+        assert {"beside", "package", "library"} <= set(sys.modules)
+    assert not {"beside", "package"} & set(sys.modules)
+    del sys.modules["library"]  # it was there still

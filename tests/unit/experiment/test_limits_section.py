@@ -1,0 +1,182 @@
+"""[limits] becomes the limits of the scheduler; what contradicts is an error, also against what is planned."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from afspm.experiment.limits_section import to_settings
+from afspm.logic.limit_checker import LimitChecker
+from afspm.model import ControlRequest, ProblemNames, Request
+from afspm.scheduler.settings import scheduler_settings
+
+from .conftest import Write, errors, line_of, only_error
+
+CORRECTOR = '[repair]\ncomponent = true\nclass = "parts.Corrector"\n'
+BIAS = "[limits.tip-bias-voltage]\n"
+
+
+def test_limits_reach_the_scheduler_in_si(write: Write) -> None:
+    experiment = write(
+        CORRECTOR
+        + BIAS
+        + 'min = "-3 V"\nmax = "300 mV"\nstep = "0.5 V"\nrate = "1 V/min"\nevery = "2 s"\nonly = ["repair"]\n'
+        + "[limits.scan-angle]\nmax = 1.0\n"
+        + '[limits.actions.x-crash]\nonly = []\nevery = "10 min"\n'
+    )
+    assert not errors(experiment)
+    bias = experiment.resolved.limits.parameters["tip-bias-voltage"]
+    assert (bias.low, bias.high, bias.step) == (-3.0, 0.3, 0.5)
+    assert bias.rate_per_s == pytest.approx(1 / 60)
+    assert (bias.interval_s, bias.only, bias.unit) == (2.0, ("repair",), "V")
+    assert bias.source.endswith(f"night.toml:{line_of(experiment, '[limits.tip')}")
+    assert experiment.resolved.limits.actions["x-crash"].only == ()
+    assert experiment.resolved.limits.parameters["scan-angle"].high == 1.0
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        '{ x = ["-5 um", "5 um"], y = ["0 um", "2 um"] }',
+        '{ center = ["0 um", "1 um"], size = ["10 um", "2 um"] }',
+    ],
+)
+def test_a_region_may_be_given_by_its_ends_or_its_centre(write: Write, region: str) -> None:
+    found = write(f"[limits]\nregion = {region}\n").resolved.limits.region
+    assert found is not None
+    assert found.center_m == pytest.approx((0, 1e-6))
+    assert found.size_m == pytest.approx((10e-6, 2e-6))
+
+
+def test_a_region_may_be_turned(write: Write) -> None:
+    text = '[limits]\nregion = { center = ["0 m", "0 m"], size = ["1 um", "1 um"], angle = "45 deg" }\n'
+    found = write(text).resolved.limits.region
+    assert found is not None
+    assert found.angle_rad == pytest.approx(math.pi / 4)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (BIAS + 'min = "3 V"\nmax = "-3 V"\n', "is above max"),
+        (BIAS + 'max = "3 nm"\n', "nm can't be converted to V"),
+        (BIAS + 'rate = "3 V"\n', "can't be converted"),
+        (BIAS + 'step = "0 V"\n', "not above zero"),
+        (BIAS + 'max = "a lot"\n', "not a number"),
+        (BIAS + "max = nan\n", "not a finite number"),
+        (BIAS + 'highest = "3 V"\n', "highest is not a setting"),
+        (BIAS + 'only = ["repiar"]\n', "there is no component 'repiar'"),
+        ("[limits]\ntip-bias-voltage = 3\n", "[limits] tip-bias-voltage"),
+        ('[limits.scan-sped]\nmax = "1 um/s"\n', "there is no parameter 'scan-sped'"),
+        ('[limits]\nregion = [["0 um", "1 um"], ["0 um", "1 um"]]\n', "region is a table of keys and values"),
+        ("[limits.actions.strat-scan]\nonly = []\n", "there is no action 'strat-scan'"),
+        ('[limits]\nregion = { x = ["5 um", "-5 um"], y = ["0 um", "1 um"] }\n', "region is empty"),
+        ('[limits]\nregion = { x = ["0 um", "1 um"] }\n', "either x and y, or center and size"),
+        ("[limits]\nmost_pixels = 0\n", "most_pixels"),
+        (
+            '[limits]\nregion = { x = ["0 um", "1 um"], y = ["0 um", "1 um"] }\n[limits.scan-size-x]\nmin = "3 um"\n',
+            "does not fit into [limits] region",
+        ),
+    ],
+)
+def test_limits_that_contradict_are_errors(write: Write, text: str, said: str) -> None:
+    assert said in only_error(write(text)).what
+
+
+@pytest.mark.parametrize(
+    ("region", "doubted"),
+    [("{ x = [-3, 3], y = [-3e-6, 3e-6] }", True), ("{ x = [-3e-6, 3e-6], y = [-3e-6, 3e-6] }", False)],
+)
+def test_a_region_of_metres_is_doubted(write: Write, region: str, doubted: bool) -> None:
+    found = [finding.what for finding in write(f"[limits]\nregion = {region}\n").check()]
+    assert found == (["[limits] region is 6 m x 6e-06 m: it keeps nothing safe"] if doubted else [])
+
+
+def test_an_action_among_the_parameters_is_told_where_it_belongs(write: Write) -> None:
+    assert "[limits.actions.start-scan]" in only_error(write("[limits.start-scan]\nonly = []\n")).hint
+
+
+def test_a_limit_of_unknown_dimension_is_in_the_unit_given(write: Write) -> None:
+    experiment = write('[limits.zctrl-setpoint]\nmin = "0.1 V"\nmax = "500 mV"\n')
+    assert not errors(experiment)
+    limit = experiment.resolved.limits.parameters["zctrl-setpoint"]
+    assert (limit.low, limit.high, limit.unit) == (0.1, 0.5, "V")
+
+
+SIMULATED = '[scheduler]\ncomponent = true\nclass = "Scheduler"\n[microscope]\ncomponent = true\nclass = "Simulator"\n'
+
+
+@pytest.mark.parametrize(
+    ("settings", "limit", "said"),
+    [
+        ("", "0.9 V", ""),
+        ("", "1 nA", "nA can't be converted to V"),
+        ('feedback = { mode = "current", setpoint = 1e-10 }\n', "1 nA", ""),
+        ('surface = "lattice"\n', "1 nA", ""),  # where it tunnels, unless said otherwise
+    ],
+)
+def test_a_setpoint_is_limited_in_the_unit_of_the_operating_mode(
+    write: Write, settings: str, limit: str, said: str
+) -> None:
+    experiment = write(f'[limits.zctrl-setpoint]\nmax = "{limit}"\n', frame=SIMULATED + settings)
+    assert (said in only_error(experiment).what) if said else not errors(experiment)
+
+
+ADDED = 'actions = { x-high = { set = { tip-bias-voltage = "8 V", scan-angle = 90 } } }\n'
+
+
+def test_what_an_added_action_sets_is_limited_too(write: Write) -> None:
+    experiment = write(BIAS + 'max = "3 V"\n', frame=SIMULATED + ADDED)
+    error = only_error(experiment)
+    assert "always refuse x-high: tip-bias-voltage = 8 V is above the highest allowed, 3 V" in error.what
+    assert error.place is not None
+    assert error.place.line == line_of(experiment, "actions")
+
+
+def test_what_added_actions_set_reaches_the_scheduler(write: Write) -> None:
+    experiment = write(CORRECTOR + BIAS + 'only = ["repair"]\n', frame=SIMULATED + ADDED)
+    assert not errors(experiment)
+    limits = scheduler_settings({}, to_settings(experiment.resolved.limits), {}, ProblemNames(), 5.0).limits
+    assert limits.sets == experiment.resolved.limits.sets
+    guard = LimitChecker(limits)
+    high = Request(int(ControlRequest.ACTION), "x-high")
+    assert guard.check("repair", high, 0) is None
+    refusal = guard.check("series", high, 0)
+    assert refusal is not None
+    assert "only repair" in refusal.reason
+
+
+def test_a_rate_of_a_wrong_unit_is_told_what_a_rate_is(write: Write) -> None:
+    error = only_error(write('[limits.scan-speed]\nrate = "1 um/s^2"\n'))
+    assert "1 m/s/s" in error.hint
+
+
+SERIES = '[series]\ncomponent = true\nclass = "ScanSeries"\nsize = ["2 um", "2 um"]\n'
+REGION = '[limits]\nregion = { x = ["-1.5 um", "1.5 um"], y = ["-1.5 um", "1.5 um"] }\n'
+
+
+def test_a_planned_scan_within_the_limits_is_fine(write: Write) -> None:
+    assert not errors(write(SERIES + REGION))
+
+
+@pytest.mark.parametrize(
+    ("plan", "limits", "said"),
+    [
+        ('center = ["1 um", "0 um"]\n', REGION, "outside the region allowed"),
+        ("pixels = [512, 512]\n", "[limits]\nmost_pixels = 10_000\n", "512 x 512 pixels"),
+        ("", '[limits.scan-size-x]\nmax = "1 um"\n', "scan-size-x"),
+        ("", CORRECTOR + '[limits.scan-size-x]\nonly = ["repair"]\n', "may not use"),
+    ],
+)  # fmt: skip
+def test_a_planned_scan_that_the_limits_would_refuse_is_an_error(
+    write: Write, plan: str, limits: str, said: str
+) -> None:
+    experiment = write(SERIES + plan + limits)
+    error = only_error(experiment)
+    assert said in error.what
+    assert "[series]" in error.what
+
+
+def test_settings_that_do_not_fit_together_are_an_error_of_the_component(write: Write) -> None:
+    assert "`end_when_done` without an end" in only_error(write(SERIES + "end_when_done = true\n")).what

@@ -1,0 +1,215 @@
+"""A file that is saved often outlives a kill as it is, and a power cut as it was a moment before."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from afspm.errors import FileError
+from afspm.process.memory import Memory
+from afspm.scheduler.state_file import StateFile
+from afspm.storage import atomic
+from afspm.storage.atomic import CheckpointFile, load_checkpoint, previous_generation
+
+CUT = [b"", b"\0" * 40, b'{"control": {"mo']
+"""What a power cut may leave of a file that was not synced."""
+
+
+def saved(path: Path, *contents: bytes) -> None:
+    """Saved one after the other, each made sure of."""
+    for content in contents:
+        kept = CheckpointFile(path)
+        kept.save(content)
+        kept.close()
+
+
+def number(content: bytes) -> int:
+    return int(content)
+
+
+def test_what_was_saved_last_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "x"
+    saved(path, b"1", b"2")
+    assert load_checkpoint(path, number) == (2, "")
+
+
+def test_what_was_closed_is_there_twice(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = CheckpointFile(path)
+    for n in range(50):
+        kept.save(b"%d" % n)
+    kept.close()
+    kept.close()
+    assert (path.read_bytes().splitlines()[-1], previous_generation(path).read_bytes()) == (b"49", b"49\n")
+
+
+def test_a_file_that_has_grown_long_is_begun_anew(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = CheckpointFile(path, longest=10)
+    for n in range(10, 50):
+        kept.save(b"%d" % n)
+        assert load_checkpoint(path, number) == (n, "")
+        assert path.stat().st_size <= 10
+    kept.close()
+
+
+def test_where_a_kill_left_a_part_of_a_generation_that_before_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = CheckpointFile(path, period_s=100.0)
+    for text in (b"{}", b'{"a": 1}', b'{"a": 2}'):
+        kept.save(text)
+    kept.close()
+    path.write_bytes(path.read_bytes()[:-4])
+    value, damage = load_checkpoint(path, json.loads)
+    assert value == {"a": 1}
+    assert damage
+
+
+def test_a_file_that_is_removed_meanwhile_is_there_again_with_the_next_generation(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = CheckpointFile(path)
+    kept.save(b"1")
+    path.unlink()
+    kept.save(b"2")
+    kept.close()
+    assert load_checkpoint(path, number) == (2, "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
+def test_on_a_full_disk_what_was_saved_before_is_still_the_last(tmp_path: Path) -> None:
+    script = """
+import resource, signal, sys
+from pathlib import Path
+from afspm.errors import FileError
+from afspm.storage.atomic import CheckpointFile, load
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+path = Path(sys.argv[1])
+kept = CheckpointFile(path)
+saved = failed = 0
+while failed < 3:
+    try:
+        kept.save(b"%d" % (10**20 + saved))
+        saved += 1
+    except FileError:
+        failed += 1
+    assert load(path, int) == (10**20 + saved - 1, "")
+print(saved)
+"""
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "x")], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.stderr) == ("270", ""), "after each failure it is tried to begin the file anew"
+
+
+def test_while_it_is_saved_the_generation_before_is_made_sure_of_by_itself(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    kept = CheckpointFile(path, period_s=0.001)
+    n = 0
+    while not previous_generation(path).exists() or int(previous_generation(path).read_bytes()) < 5:
+        n += 1
+        kept.save(b"%d" % n)
+    kept.close()
+
+
+class Reader:
+    """Has a file open, as only Windows minds, for some tries."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, tries: int) -> None:
+        self.left = tries
+        rename = Path.replace
+
+        def replace(source: Path, target: Path) -> Path:
+            self.left -= 1
+            if self.left >= 0:
+                raise PermissionError(13, "Access is denied", str(target))
+            return rename(source, target)
+
+        monkeypatch.setattr(Path, "replace", replace)
+        monkeypatch.setattr(atomic, "_AGAIN_S", 0.0)
+        monkeypatch.setattr(atomic.sys, "platform", "win32")
+
+
+def test_a_file_that_somebody_reads_for_a_moment_is_replaced_after_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader = Reader(monkeypatch, tries=3)
+    atomic.replace_file(tmp_path / "x", [b"1"], synced=False)
+    assert (tmp_path / "x").read_bytes() == b"1"
+    assert reader.left == -1
+
+
+def test_a_file_that_somebody_keeps_open_is_told_and_nothing_is_left_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Reader(monkeypatch, tries=1000)
+    with pytest.raises(FileError, match="Access is denied"):
+        atomic.write_atomic(tmp_path / "x", [b"1"], synced=False)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("left", CUT)
+def test_after_a_power_cut_the_generation_before_is_read_and_that_is_told(tmp_path: Path, left: bytes) -> None:
+    path = tmp_path / "x"
+    saved(path, b"1")
+    path.write_bytes(left)
+    value, damage = load_checkpoint(path, number)
+    assert value == 1
+    assert damage
+
+
+def test_where_neither_can_be_read_nothing_is_guessed(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    saved(path, b"1")
+    path.write_bytes(b"")
+    previous_generation(path).write_bytes(b"")
+    with pytest.raises(FileError, match="remove it"):
+        load_checkpoint(path, number)
+
+
+def test_a_file_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    saved(path, b"1")
+    path.unlink()
+    assert load_checkpoint(path, number) == (None, "")
+
+
+@pytest.mark.parametrize("left", CUT)
+def test_a_scheduler_after_a_power_cut_knows_the_problems_and_gives_control_to_nobody(
+    tmp_path: Path, left: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = logging.getLogger("scheduler")
+    path = tmp_path / "scheduler.json"
+    state = {"control": {"mode": 1, "holder": "series", "solving": 3, "problems": {"3": "a"}, "ended": False}}
+    file = StateFile(path, log)
+    file.save({**state, "granted_to": "token", "last_ns": 7})
+    file.close()
+    assert StateFile(path, log).load()["control"]["holder"] == "series"
+    assert not caplog.records
+    path.write_bytes(left)
+    again = StateFile(path, log).load()
+    assert again["control"] == {**state["control"], "holder": None, "solving": 0}
+    assert (again["granted_to"], again["last_ns"]) == (None, 7)
+    assert "nobody in control" in caplog.text
+
+
+def test_what_is_saved_without_waiting_for_the_disk_has_a_generation_before(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "microscope.json", synced=False)
+    memory["tip"] = "blunt"
+    memory.save()
+    assert memory._generations is not None
+    memory._generations.close()
+    assert (
+        Memory(tmp_path / "microscope.json").damage,
+        json.loads(previous_generation(tmp_path / "microscope.json").read_bytes()),
+    ) == (
+        "",
+        {"tip": "blunt"},
+    )
+    (tmp_path / "microscope.json").write_bytes(b"")
+    again = Memory(tmp_path / "microscope.json", synced=False)
+    assert again["tip"] == "blunt"
+    assert again.damage

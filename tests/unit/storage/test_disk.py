@@ -1,0 +1,112 @@
+"""Work for a disk: in order, waited for, but not for long."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from afspm.storage import disk
+from afspm.storage.disk import DiskThread, DiskTimeout, Syncer, run_bounded
+
+DEADLINE_S = 10.0
+
+
+class Hanging:
+    """Work that is not done before it is let go."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+        self.goes_on = threading.Event()
+
+    def hang(self) -> None:
+        assert self.goes_on.wait(DEADLINE_S)
+        self.done.append("hung")
+
+
+def test_what_is_asked_for_is_done_in_order_and_its_error_is_told() -> None:
+    done: list[int] = []
+    work = DiskThread()
+    for number in range(100):
+        work.run(lambda number=number: done.append(number))
+        assert done[-1] == number
+    with pytest.raises(FileNotFoundError):
+        work.run(lambda: os.stat("/nowhere"))  # noqa: PTH116
+    assert work.close(DEADLINE_S)
+    assert done == [*range(100)]
+
+
+def test_who_asks_goes_on_while_the_disk_hangs_and_all_is_done_later_in_order() -> None:
+    hanging, work = Hanging(), DiskThread(deadline_s=0.01)
+    with pytest.raises(DiskTimeout):
+        work.run(hanging.hang)
+    for name in ("a", "b"):
+        with pytest.raises(DiskTimeout):
+            work.run(lambda name=name: hanging.done.append(name))
+    hanging.goes_on.set()
+    assert work.close(DEADLINE_S)
+    assert hanging.done == ["hung", "a", "b"]
+    assert not work.hangs
+
+
+def test_no_more_than_a_bound_waits_for_a_disk_that_hangs() -> None:
+    hanging, work = Hanging(), DiskThread(deadline_s=0.01, most_bytes=100)
+    with pytest.raises(DiskTimeout):
+        work.run(hanging.hang)
+    for size in (60, 60, 30):
+        with pytest.raises(DiskTimeout):
+            work.run(lambda size=size: hanging.done.append(str(size)), size)
+    hanging.goes_on.set()
+    assert work.close(DEADLINE_S)
+    assert hanging.done == ["hung", "60", "30"]
+
+
+def test_what_is_read_once_is_not_waited_for_without_end() -> None:
+    hanging = Hanging()
+    assert run_bounded(lambda: 7, DEADLINE_S) == 7
+    with pytest.raises(DiskTimeout):
+        run_bounded(hanging.hang, 0.01)
+    hanging.goes_on.set()
+
+
+@pytest.fixture
+def synced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The files that were synced, by number."""
+    found: list[int] = []
+    monkeypatch.setattr(disk, "sync_data", lambda descriptor: found.append(os.fstat(descriptor).st_ino))
+    return found
+
+
+def test_what_was_written_is_on_the_disk_a_moment_later_though_it_was_closed(tmp_path: Path, synced: list[int]) -> None:
+    syncer, done = Syncer(period_s=0.01), threading.Event()
+    for name in ("a", "b"):
+        with (tmp_path / name).open("wb", buffering=0) as file:
+            file.write(b"x")
+            syncer.soon(file.fileno())
+    syncer.folder_soon(tmp_path)
+    wanted = {path.stat().st_ino for path in (tmp_path / "a", tmp_path / "b", tmp_path)}
+    while set(synced) != wanted and not done.wait(0.01):
+        pass
+
+
+def test_what_is_wanted_now_is_on_the_disk_now(tmp_path: Path, synced: list[int]) -> None:
+    syncer = Syncer(period_s=100.0)
+    syncer.now(DEADLINE_S)  # nothing was written
+    with (tmp_path / "a").open("wb", buffering=0) as file:
+        file.write(b"x")
+        syncer.soon(file.fileno())
+        syncer.now(DEADLINE_S)
+        assert synced == [os.fstat(file.fileno()).st_ino]
+
+
+def test_a_disk_that_does_not_sync_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    goes_on = threading.Event()
+    monkeypatch.setattr(disk, "sync_data", lambda descriptor: goes_on.wait(DEADLINE_S))
+    syncer = Syncer(period_s=100.0)
+    with (tmp_path / "a").open("wb", buffering=0) as file:
+        syncer.soon(file.fileno())
+        with pytest.raises(DiskTimeout):
+            syncer.now(0.01)
+    goes_on.set()

@@ -1,0 +1,143 @@
+"""Each process gets its own keys alone, whether they are the file's or made for the run."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import stat
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.client.connect import GUEST_KEYS, _keys_in
+from afspm.errors import ConfigError
+from afspm.experiment import Experiment, load
+from afspm.supervisor.key_handout import KeyHandout, hand_over
+from afspm.transport.keys import Keys, from_launch, generate
+
+FILE = """
+[microscope]
+component = true
+class = "Simulator"
+
+[scheduler]
+component = true
+class = "Scheduler"
+{router}
+
+[series]
+component = true
+class = "ScanSeries"
+size = ["1 um", "1 um"]
+
+[other]
+component = true
+command = ["python", "x.py"]
+
+[record]
+on = false
+"""
+WRITTEN = 'router = "tcp://127.0.0.1:29103"'
+
+
+def experiment(folder: Path, more: str = "", router: str = "") -> Experiment:
+    file = folder / "experiment.toml"
+    file.write_text(FILE.format(router=router) + more, encoding="utf-8")
+    return load(file)
+
+
+def handed(made: Experiment, **which: Any) -> KeyHandout:
+    ports = itertools.count(21_000)
+    return hand_over(made, made.launches(take_address=lambda: f"tcp://127.0.0.1:{next(ports)}", **which))
+
+
+def lines(found: KeyHandout) -> dict[str, Mapping[str, Any]]:
+    return {start.launch.name: start.launch.keys or {} for start in found.starts}
+
+
+def test_each_gets_its_own_pair_and_the_public_keys_of_whom_it_has_to_know(tmp_path: Path) -> None:
+    found = handed(experiment(tmp_path))
+    keys = lines(found)
+    secrets = {name: own["secret"] for name, own in keys.items()}
+    assert len(set(secrets.values())) == 4
+    for start in found.starts:
+        text = start.launch.to_json()
+        assert [name for name, secret in secrets.items() if secret in text] == [start.launch.name]
+    assert {name: set(own["peers"].values()) for name, own in keys.items()} == {
+        "microscope": {"scheduler"},
+        "scheduler": {"microscope", "scheduler", "series", "other", "supervisor", "guest"},
+        "series": {"scheduler"},
+        "other": {"scheduler"},
+    }
+    assert {name: own["guards"] for name, own in keys.items()} == {
+        "microscope": True, "scheduler": True, "series": False, "other": False,
+    }  # fmt: skip
+    assert not any(own["everywhere"] for own in keys.values())
+    assert found.guest is not None
+    assert found.supervisor is not None
+    assert set(found.guest["servers"].values()) == {"scheduler"}
+
+
+def test_keys_are_new_in_each_run(tmp_path: Path) -> None:
+    made = experiment(tmp_path)
+    assert lines(handed(made))["series"]["secret"] != lines(handed(made))["series"]["secret"]
+
+
+@pytest.mark.parametrize("more", ["plain = true", "insecure = true"])
+def test_none_are_made_where_the_file_says_so(tmp_path: Path, more: str) -> None:
+    found = handed(experiment(tmp_path, f"[security]\n{more}\n"))
+    assert found.guest is None
+    assert not any("secret" in own for own in lines(found).values())
+
+
+def test_none_are_made_where_others_are_started_elsewhere_that_know_the_address(tmp_path: Path) -> None:
+    assert "secret" in lines(handed(experiment(tmp_path, router=WRITTEN)))["series"]
+    assert "secret" in lines(handed(experiment(tmp_path), without=["other"]))["series"]
+    assert "secret" not in lines(handed(experiment(tmp_path, router=WRITTEN), without=["other"]))["series"]
+
+
+def test_a_scheduler_of_another_language_is_asked_without(tmp_path: Path) -> None:
+    text = FILE.format(router="").replace('class = "Scheduler"', 'command = ["python", "s.py"]\nrole = "scheduler"')
+    (tmp_path / "experiment.toml").write_text(text, encoding="utf-8")
+    assert not any(lines(handed(load(tmp_path / "experiment.toml"))).values())
+
+
+def test_of_keys_of_the_file_each_gets_its_own_too(tmp_path: Path) -> None:
+    generate(tmp_path / "keys", ["microscope", "scheduler", "series", "other", "supervisor"])
+    found = handed(experiment(tmp_path, '[security]\nkeys = "keys"\n'))
+    own = lines(found)["series"]
+    assert own["folder"] is None
+    assert set(own["peers"].values()) == {"scheduler"}
+    assert own["everywhere"]
+    series = from_launch("series", own)
+    assert isinstance(series, Keys)
+    assert series.secret.decode() in (tmp_path / "keys" / "private" / "series.key_secret").read_text(encoding="utf-8")
+    assert lines(found)["scheduler"]["folder"] == str(tmp_path / "keys" / "public")
+    assert "series" in lines(found)["scheduler"]["peers"].values()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no modes there")
+def test_a_secret_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    generate(tmp_path / "keys", ["microscope", "scheduler", "series", "other", "supervisor"])
+    assert stat.S_IMODE((tmp_path / "keys" / "private").stat().st_mode) == 0o700
+    loose = tmp_path / "keys" / "private" / "series.key_secret"
+    loose.chmod(0o640)
+    with pytest.raises(ConfigError, match="others may read this secret: its mode is 0640"):
+        handed(experiment(tmp_path, '[security]\nkeys = "keys"\n'))
+
+
+def test_who_may_read_the_run_folder_finds_the_key_for_guests_as_long_as_the_run_lasts(tmp_path: Path) -> None:
+    found = handed(experiment(tmp_path))
+    file = tmp_path / "state" / GUEST_KEYS
+    with found.laid_down(tmp_path):
+        assert _keys_in(tmp_path) == {"keys": json.loads(json.dumps(found.guest))}
+        if sys.platform != "win32":
+            assert stat.S_IMODE(file.stat().st_mode) == 0o600
+            file.chmod(0o644)
+            with pytest.raises(ConfigError, match="others may read"):
+                _keys_in(tmp_path)
+    assert not file.exists()
+    assert _keys_in(tmp_path) == {}

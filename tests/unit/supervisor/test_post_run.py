@@ -1,0 +1,127 @@
+"""What follows the end of a run."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+
+import pytest
+
+from afspm.clock import ExperimentClock
+from afspm.components import notifications
+from afspm.components.notifications import OCCASIONS, Targets
+from afspm.experiment import load
+from afspm.logic.supervision.run_end import EndReason
+from afspm.record.report import REPORT_FILE
+from afspm.record.store import RecordStore
+from afspm.supervisor import post_run
+from afspm.supervisor.ports import FreePorts
+from afspm.supervisor.post_run import EndedRun
+from afspm.supervisor.supervisor import ProcessReport, RunOutcome
+
+
+class Log:
+    """Keeps what is written."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[int, str]] = []
+
+    def write(self, name: str, level: int, text: str) -> None:
+        self.lines.append((level, text))
+
+
+def told(folder: Path, why: EndReason, on: tuple[str, ...] = OCCASIONS) -> list[dict[str, object]]:
+    """What a command is told of a run that ended so."""
+    file = folder / "told.txt"
+    code = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
+    reports = (ProcessReport("judge", 3, True, "exit code 1"), ProcessReport("series", 1, False, "done"))
+    outcome = RunOutcome(why, "the microscope is given up", reports, 60.0)
+    targets = Targets([sys.executable, "-c", code, str(file)])
+    post_run.tell(EndedRun("night", folder, outcome, True), targets, on, ExperimentClock.real(), Log())  # type: ignore[arg-type]
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+@pytest.mark.parametrize(
+    ("why", "on", "what"),
+    [
+        (EndReason.EXPERIMENT_ENDED, OCCASIONS, "end"),
+        (EndReason.STOPPED, ("end",), "end"),
+        (EndReason.LOST, OCCASIONS, "given-up"),
+        (EndReason.LOST, ("end",), "end"),
+    ],
+)
+def test_the_end_is_told_with_how_it_ended(tmp_path: Path, why: EndReason, on: tuple[str, ...], what: str) -> None:
+    (notice,) = told(tmp_path, why, on)
+    assert (notice["what"], notice["experiment"], notice["run"]) == (what, "night", str(tmp_path))
+    assert notice["text"] == "the microscope is given up; given up: judge"
+
+
+def test_who_does_not_want_to_know_is_not_told(tmp_path: Path) -> None:
+    assert told(tmp_path, EndReason.EXPERIMENT_ENDED, ("unsolved-problem",)) == []
+
+
+class TenSeconds:
+    """A clock on which each try takes ten seconds."""
+
+    def __init__(self) -> None:
+        self.t_s = -10.0
+
+    def monotonic_s(self) -> float:
+        self.t_s += 10.0
+        return self.t_s
+
+    def now_ns(self) -> int:
+        return 0
+
+
+def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(notifications, "FIRST_DELAY_S", 0.01)
+    log, count = Log(), tmp_path / "count"
+    code = "import sys; open(sys.argv[1], 'a').write('x'); sys.exit('no network')"
+    ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all is done", (), 1.0), False)
+    targets = Targets([sys.executable, "-c", code, str(count)])
+    post_run.tell(ended, targets, ("end",), TenSeconds(), log)  # type: ignore[arg-type]
+    assert count.read_text() == "xxx"
+    assert [level for level, _ in log.lines] == [logging.ERROR]
+    assert "nobody could be told by the command" in log.lines[0][1]
+
+
+def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
+    RecordStore(tmp_path).close()
+    log = Log()
+    post_run.report(tmp_path, log)  # type: ignore[arg-type]
+    assert (tmp_path / REPORT_FILE).is_file()
+    assert log.lines == [(logging.INFO, f"the report is {tmp_path / REPORT_FILE}")]
+
+
+def test_without_a_record_there_is_none_and_no_word_of_it(tmp_path: Path) -> None:
+    log = Log()
+    post_run.report(tmp_path, log)  # type: ignore[arg-type]
+    assert log.lines == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_report_that_fails_is_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "journal.sqlite").write_bytes(b"not a database at all, but long enough to be looked at" * 20)
+    log = Log()
+    post_run.report(tmp_path, log)  # type: ignore[arg-type]
+    ((level, text),) = log.lines
+    assert level == logging.WARNING
+    assert text.startswith("no report: ")
+
+
+def test_people_are_told_before_the_report_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """That may take two minutes, and who is in a hurry presses Ctrl-C."""
+    done: list[str] = []
+    monkeypatch.setattr(post_run, "tell", lambda *_: done.append("told"))
+    monkeypatch.setattr(post_run, "report", lambda *_: done.append("reported"))
+    file = tmp_path / "experiment.toml"
+    parts = [f'[{name}]\ncomponent = true\nclass = "{name.capitalize()}"\n' for name in ("simulator", "scheduler")]
+    file.write_text("\n".join(parts))
+    experiment = load(file)
+    starts = experiment.launches(take_address=FreePorts().address)
+    ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all is done", (), 1.0), True)
+    post_run.follow(experiment, ended, starts, ExperimentClock.real(), Log(), with_report=True)  # type: ignore[arg-type]
+    assert done == ["told", "reported"]

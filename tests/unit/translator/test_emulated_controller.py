@@ -1,0 +1,133 @@
+"""A translator that is wired to an emulator reaches that of its own run, or nobody."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.errors import ConfigError
+from afspm.launch import Launch
+from afspm.translator.driver import ControllerLost
+from afspm.translator.emulated_controller import AddressNotice, EmulatedController, notice_file, wired_to
+
+RUN = "0123456789abcdef"
+TELLS = """
+import sys
+from pathlib import Path
+from afspm.translator.emulated_controller import AddressNotice
+notice = AddressNotice(Path(sys.argv[1]), sys.argv[2])
+notice.tell("127.0.0.1:1234")
+print("told", flush=True)
+sys.stdin.read()
+"""
+
+
+class Vendor:
+    """What of a microscope is used."""
+
+    def __init__(self, controller_at: str = "127.0.0.1:6501") -> None:
+        self.controller_at = controller_at
+        self.connected: list[str] = []
+        self.at_connect: Any = lambda: None
+
+    def connect(self) -> None:
+        self.at_connect()
+        self.connected.append(self.controller_at)
+
+    def close(self) -> None:
+        self.connected.append("closed")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return notice_file(str(tmp_path), "controller")
+
+
+@pytest.fixture
+def notice(file: Path) -> Iterator[AddressNotice]:
+    with closing(AddressNotice(file, RUN)) as made:
+        yield made
+
+
+def reach(file: Path, vendor: Vendor, run: str = RUN) -> EmulatedController:
+    found = EmulatedController("controller", file, run)
+    found.reach(vendor)  # type: ignore[arg-type]
+    return found
+
+
+def test_it_goes_where_the_emulator_tells_and_not_where_the_settings_say(file: Path, notice: AddressNotice) -> None:
+    notice.tell("127.0.0.1:40001")
+    vendor = Vendor()
+    reach(file, vendor).prove()
+    assert vendor.connected == ["127.0.0.1:40001"]
+
+
+def test_nothing_is_reached_before_the_emulator_listens(file: Path) -> None:
+    vendor = Vendor()
+    with pytest.raises(ControllerLost, match="not started"):
+        reach(file, vendor)
+    with closing(AddressNotice(file, RUN)), pytest.raises(ControllerLost, match="does not listen"):
+        reach(file, vendor)
+    assert vendor.connected == []
+
+
+def test_the_address_of_an_emulator_that_was_killed_is_worth_nothing(file: Path) -> None:
+    command = [sys.executable, "-c", TELLS, str(file), RUN]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as emulator:
+        assert emulator.stdout is not None
+        assert emulator.stdout.readline() == b"told\n"
+        vendor = Vendor()
+        reached = reach(file, vendor)
+        emulator.kill()
+        emulator.wait()
+        with pytest.raises(ControllerLost, match="does not run"):
+            reached.prove()
+        with pytest.raises(ControllerLost, match="does not run"):
+            reach(file, vendor)
+    assert vendor.connected == ["127.0.0.1:1234"]
+
+
+def test_the_emulator_of_another_run_is_not_this_run_s(file: Path) -> None:
+    vendor = Vendor()
+    with closing(AddressNotice(file, "another")) as notice:
+        notice.tell("127.0.0.1:40001")
+        with pytest.raises(ControllerLost, match="another run"):
+            reach(file, vendor)
+    assert vendor.connected == []
+
+
+def test_one_that_has_let_go_of_its_address_proves_nothing_until_it_is_reached_again(
+    file: Path, notice: AddressNotice
+) -> None:
+    notice.tell("127.0.0.1:40001")
+    reached = reach(file, Vendor())
+    notice.tell("")
+    with pytest.raises(ControllerLost, match="does not listen"):
+        reached.prove()
+    notice.tell("127.0.0.1:40001")
+    with pytest.raises(ControllerLost, match="not the one"):
+        reached.prove()
+
+
+def test_a_connection_that_was_made_while_the_emulator_changed_is_closed(file: Path, notice: AddressNotice) -> None:
+    notice.tell("127.0.0.1:40001")
+    vendor = Vendor()
+    vendor.at_connect = lambda: notice.tell("127.0.0.1:40002")
+    with pytest.raises(ControllerLost, match="not the one"):
+        reach(file, vendor)
+    assert vendor.connected == ["127.0.0.1:40001", "closed"]
+
+
+def test_what_is_called_simulated_commands_no_controller_that_proves_nothing() -> None:
+    with pytest.raises(ConfigError, match="nothing proves"):
+        wired_to(Launch("microscope", simulated=True), Vendor())  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="has no controller_at"):
+        wired_to(Launch("m", controller="c", run=RUN, state_dir="."), Vendor(""))  # type: ignore[arg-type]
+    assert wired_to(Launch("microscope", simulated=True), Vendor("")) is None  # type: ignore[arg-type]
+    assert wired_to(Launch("microscope"), Vendor()) is None  # type: ignore[arg-type]

@@ -1,0 +1,119 @@
+"""Values through the table: units both ways, and refusals."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afspm.errors import ConfigError, Refused
+from afspm.microscopes.asylum import Asylum
+from afspm.microscopes.gxsm import Gxsm
+from afspm.microscopes.nanonis import Nanonis
+from afspm.microscopes.simulator import Simulator
+from afspm.model import names
+from afspm.translator import Driver, ParameterSpec, ParameterTable, Value
+
+TABLE = ParameterTable({}).extended(
+    {
+        "scan-size-x": {"vendor": "W", "unit": "nm", "range": ["1 nm", "10 um"]},
+        "scan-angle": {"unit": "deg", "sign": -1, "range": [-180, 180]},
+        "scan-resolution-x": {"type": "int", "range": [2, 64]},
+        "x-on": {"type": "bool"},
+    },
+    where="the test",
+)
+
+
+@given(st.floats(1.0, 10_000.0), st.sampled_from([("nm", 1.0), ("um", 1e-3), ("m", 1e-9), ("Å", 10.0)]))
+def test_a_value_comes_back_from_the_controller_as_it_was_asked_for(number: float, unit: tuple[str, float]) -> None:
+    spec = TABLE["scan-size-x"]
+    given_number = min(max(number * unit[1], unit[1] * 1.0000001), unit[1] * 9999.999)
+    value = spec.parse(repr(given_number), unit[0])
+    back = spec.from_vendor(spec.to_vendor(value))
+    assert spec.same(back, value)
+    assert float(spec.told(back, unit[0])[0]) == pytest.approx(given_number, rel=1e-14)
+
+
+@given(st.text(max_size=20), st.one_of(st.none(), st.text(max_size=10)))
+def test_any_text_is_a_value_within_the_range_or_refused_with_a_reason(text: str, unit: str | None) -> None:
+    for name in TABLE:
+        spec = TABLE[name]
+        value, reason = _parsed(spec, text, unit)
+        if value is None:
+            assert reason.startswith(name)
+        else:
+            assert isinstance(value, bool) or spec.range[0] <= float(value) <= spec.range[1]
+
+
+def _parsed(spec: ParameterSpec, text: str, unit: str | None) -> tuple[Value | None, str]:
+    try:
+        return spec.parse(text, unit), ""
+    except Refused as refused:
+        return None, refused.reason
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e308])
+def test_numbers_that_are_none_are_refused(value: float) -> None:
+    for name in ("scan-size-x", "scan-angle", "scan-resolution-x"):
+        with pytest.raises(Refused):
+            TABLE[name].checked(value)
+
+
+def test_angles_are_degrees_unless_said_otherwise_and_may_run_the_other_way() -> None:
+    spec = TABLE["scan-angle"]
+    assert spec.parse("90") == pytest.approx(math.pi / 2)
+    assert spec.parse("1.5", "rad") == 1.5
+    assert spec.to_vendor(math.pi / 2) == pytest.approx(-90)
+    assert spec.told(math.pi / 2) == ("90", "deg")
+
+
+def test_an_experiment_file_changes_single_attributes_of_a_row() -> None:
+    narrow = TABLE.extended({"scan-size-x": {"range": ["1 nm", "2 um"]}}, where="the experiment file")
+    assert narrow["scan-size-x"].vendor == "W"
+    with pytest.raises(Refused, match="the experiment file"):
+        narrow["scan-size-x"].parse("3", "um")
+
+
+@pytest.mark.parametrize("microscope", [Asylum, Gxsm, Nanonis])
+def test_how_the_controller_has_what_code_translates_is_not_a_rows_to_say(microscope: type[Driver]) -> None:
+    narrow = microscope.parameter_table({"scan-angle": {"range": ["-90 deg", "90 deg"]}})
+    assert narrow["scan-angle"].range[1] == pytest.approx(math.pi / 2)
+    for row in ({"sign": -1}, {"vendor": "Rotation"}):
+        with pytest.raises(ConfigError, match=f"the experiment file, parameters.scan-angle: {next(iter(row))}: code"):
+            microscope.parameter_table({"scan-angle": row})
+    without_vendor = {name for name, row in microscope.parameter_table({}).items() if row.vendor == name}
+    assert without_vendor <= {*microscope.translated, *microscope.kept}
+
+
+def test_a_file_that_is_no_table_is_said_with_its_name(tmp_path: Path) -> None:
+    (tmp_path / "parameters.toml").write_text("[parameters\n")
+    with pytest.raises(ConfigError, match=r"parameters\.toml"):
+        ParameterTable.from_toml(tmp_path / "parameters.toml")
+
+
+def test_the_simulator_has_every_base_parameter_and_the_right_unit_for_its_mode() -> None:
+    assert set(names.BASE_PARAMETERS) <= set(Simulator().table)
+    assert Simulator(feedback={"mode": "amplitude"}).table[names.ZCTRL_SETPOINT].unit == "V"
+    assert Simulator(surface="lattice").table[names.ZCTRL_SETPOINT].unit == "A"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"surfaces": "steps"},
+        {"surface": "cheese"},
+        {"initial": {"scan-speed": "1 V"}},
+        {"initial": {"scan-sped": 1}},
+        {"faults": [{"kind": "explode"}]},
+        {"faults": [{"kind": "slow", "when": 3}]},
+        {"panel": [{"at_s": 1.0, "set": {"scan-sped": 1}}]},
+        {"panel": [{"at_s": 1.0, "action": "x-dance"}]},
+    ],
+)
+def test_settings_of_the_simulator_that_cannot_be_are_refused(settings: dict[str, object]) -> None:
+    with pytest.raises((ConfigError, TypeError)):
+        Simulator(**settings)  # type: ignore[arg-type]

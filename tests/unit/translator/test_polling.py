@@ -1,0 +1,104 @@
+"""How often a controller is looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from afspm.translator.polling import EAGER_S, AdaptivePolling
+
+IDLE_S = 0.25
+
+
+def looks(pace: AdaptivePolling, began_s: float, end_s: float) -> tuple[int, float]:
+    """How often the controller is looked at while it measures, and how late the end is noticed."""
+    now_s, count = began_s, 0
+    while now_s < end_s:
+        now_s += pace.wait_s(now_s)
+        count += 1
+    return count, now_s - end_s
+
+
+def test_at_rest_it_is_looked_at_seldom() -> None:
+    assert AdaptivePolling(IDLE_S).wait_s(5.0) == IDLE_S
+
+
+@pytest.mark.parametrize("error_s", [-0.3, -0.04, 0.0, 0.04, 0.3])
+def test_the_second_scan_of_a_kind_is_noticed_at_once_for_few_looks(error_s: float) -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.began("a", 0.0)
+    pace.ended(100.0, as_expected=True)
+    pace.began("a", 200.0)
+    count, late_s = looks(pace, 200.0, 300.0 + error_s)
+    assert late_s <= 0.020
+    assert count < 550  # at the eager rate all along it would be 10000
+
+
+def test_another_frame_is_expected_by_what_its_settings_say_and_by_how_wrong_that_was() -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.began("a", 0.0, guess_s=100.0)
+    pace.ended(125.0, as_expected=True)  # this controller turns round slowly
+    pace.began("b", 200.0, guess_s=40.0)
+    count, late_s = looks(pace, 200.0, 250.3)
+    assert late_s <= 0.020
+    assert count < 450
+
+
+@pytest.mark.parametrize("lasts_s", [70.0, 100.0, 130.0])
+def test_the_first_is_looked_at_eagerly_as_long_as_the_guess_may_be_wrong(lasts_s: float) -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.began("a", 0.0, guess_s=100.0)
+    assert pace.wait_s(1.0) == IDLE_S
+    assert looks(pace, 0.0, lasts_s)[1] <= EAGER_S + 1e-9
+
+
+def test_what_nothing_is_known_of_is_looked_at_eagerly() -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.began("a", 0.0)
+    assert {pace.wait_s(t_s) for t_s in (0.0, 10.0, 1000.0)} == {EAGER_S}
+
+
+def test_what_takes_far_longer_than_expected_is_looked_at_less_and_less() -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.began("a", 0.0)
+    pace.ended(10.0, as_expected=True)
+    pace.began("a", 20.0)
+    waits = [pace.wait_s(t_s) for t_s in (30.0, 30.5, 31.0, 60.0)]
+    assert waits == sorted(waits)
+    assert (waits[0], waits[-1]) == (EAGER_S, IDLE_S)
+
+
+def test_what_was_broken_off_teaches_nothing() -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.began("a", 0.0)
+    pace.ended(1.0, as_expected=False)
+    pace.began("a", 10.0)
+    assert pace.wait_s(11.0) == EAGER_S
+
+
+def test_a_file_that_comes_late_is_waited_for_eagerly_and_makes_no_scan_longer() -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.began("a", 0.0)
+    pace.over(100.0)
+    assert [pace.wait_s(t_s) for t_s in (100.0, 110.0)] == [EAGER_S, IDLE_S]
+    pace.over(102.0)  # it is still waited for
+    pace.ended(104.0, as_expected=True)
+    pace.began("a", 200.0)
+    assert pace.wait_s(300.0) == EAGER_S
+    assert pace.wait_s(304.0) == IDLE_S
+
+
+def test_a_move_is_looked_at_eagerly_at_first() -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.moved(10.0)
+    assert [pace.wait_s(t_s) for t_s in (10.0, 11.0, 20.0)] == [EAGER_S, pytest.approx(0.1), IDLE_S]
+    pace.ended(12.0, as_expected=True)
+    assert pace.wait_s(12.0) == IDLE_S
+
+
+@pytest.mark.parametrize("change", [lambda pace: pace.began("a", 0.0), lambda pace: pace.moved(0.0)])
+def test_it_is_never_more_eager_than_the_period_that_was_set(change: Callable[[AdaptivePolling], None]) -> None:
+    pace = AdaptivePolling(0.001)
+    change(pace)
+    assert pace.wait_s(0.0) == 0.001

@@ -1,0 +1,71 @@
+"""Whatever a controller does and however late it is looked at, peers hear whole stories."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afspm.model import ScopeState, ScopeStatus
+from afspm.translator.driver import MEASURING
+from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, StatusSequence
+
+SEEN = [state for state in ScopeState if state is not ScopeState.UNDEFINED]
+LOOKS = st.tuples(st.sampled_from(SEEN), st.booleans(), st.floats(0.0, 20.0))
+ASKED = st.one_of(st.just("stop"), st.sampled_from([ScopeState.SCANNING, ScopeState.SPEC, ScopeState.MOVING]))
+
+
+@given(st.lists(st.one_of(LOOKS, ASKED), max_size=30))
+def test_a_measurement_ends_with_its_results_or_as_interrupted_and_with_nothing_else(events: list[object]) -> None:
+    sequence = StatusSequence(ScopeStatus(ScopeState.FREE), result_timeout_s=10.0)
+    now_s, said = 0.0, ScopeState.FREE
+    delivered = False
+    for event in events:
+        if isinstance(event, tuple):
+            state, results, after_s = event
+            now_s += after_s
+            steps = sequence.observe(ScopeStatus(state), results, now_s)
+        elif event == "stop":
+            steps = sequence.interrupt() if said in MEASURING else []
+        else:
+            assert isinstance(event, ScopeState)
+            steps = sequence.begin(event) if said is ScopeState.FREE else []
+        for step in steps:
+            if isinstance(step, PublishResults):
+                assert said in MEASURING, "results come while something is being measured"
+                delivered = True
+            elif isinstance(step, PublishStatus):
+                assert step.status.state is not said or step.status.paused is not None, "said twice"
+                if said in MEASURING and step.status.state not in MEASURING:
+                    assert delivered or step.status.state is ScopeState.INTERRUPTED
+                said, delivered = step.status.state, False
+            else:
+                assert isinstance(step, DiscardResults | LogError)
+        assert said is sequence.said.state
+
+
+@given(st.lists(LOOKS, max_size=20))
+def test_a_controller_that_comes_to_rest_is_told_as_free(looks: list[tuple[ScopeState, bool, float]]) -> None:
+    sequence = StatusSequence(ScopeStatus(ScopeState.UNDEFINED), result_timeout_s=10.0)
+    now_s = 0.0
+    for state, results, after_s in looks:
+        now_s += after_s
+        sequence.observe(ScopeStatus(state), results, now_s)
+    for _ in range(3):
+        now_s += 11.0
+        sequence.observe(ScopeStatus(ScopeState.FREE), False, now_s)
+    assert sequence.said.state is ScopeState.FREE
+
+
+def test_the_deadline_is_told_while_something_is_waited_for() -> None:
+    sequence = StatusSequence(ScopeStatus(ScopeState.SCANNING), result_timeout_s=10.0)
+    assert sequence.deadline_s() is None
+    assert sequence.observe(ScopeStatus(ScopeState.FREE), False, 5.0) == []
+    assert sequence.deadline_s() == 15.0
+
+
+def test_what_somebody_begins_after_something_was_broken_off_is_another_story() -> None:
+    sequence = StatusSequence(ScopeStatus(ScopeState.SPEC), result_timeout_s=10.0)
+    broken_off, scanning = ScopeStatus(ScopeState.INTERRUPTED), ScopeStatus(ScopeState.SCANNING)
+    assert sequence.observe(broken_off, False, 1.0) == [PublishStatus(broken_off)]
+    assert sequence.observe(ScopeStatus(ScopeState.SPEC), False, 2.0) == [], "it has not stopped yet"
+    assert sequence.observe(scanning, False, 3.0) == [DiscardResults(), PublishStatus(scanning)]

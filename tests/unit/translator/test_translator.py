@@ -1,0 +1,831 @@
+"""What a translator says and publishes (wire format, "What a translator does, and in which order peers see it")."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from afspm import wire
+from afspm.errors import ConfigError, WireError
+from afspm.exit_codes import ExitCode
+from afspm.model import (
+    CLOCK_REQUEST,
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Parameter,
+    ProbePosition,
+    Region,
+    ResponseDetail,
+    ScanParameters,
+    ScopeState,
+    names,
+)
+from afspm.process.parent import TIP_WITHIN_S
+from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
+from afspm.wire.generated import feedback_pb2, scan_pb2
+
+ACTION, PARAM, SUPPORT = ControlRequest.ACTION, ControlRequest.PARAM, ControlRequest.ACTION_SUPPORT
+FRAME, POSITION = ControlRequest.SET_SCAN_PARAMS, ControlRequest.SET_PROBE_POS
+OK, NOT_FREE, PARAM_ERROR = ControlResponse.SUCCESS, ControlResponse.NOT_FREE, ControlResponse.PARAM_ERROR
+
+
+def told(response: Any) -> tuple[str | None, str | None]:
+    assert response.code == OK, response.reason
+    parameter = wire.decode_parameter(response.payload)
+    return parameter.value, parameter.unit
+
+
+def test_at_the_start_everything_in_force_is_published(make_bench: Any) -> None:
+    assert make_bench().heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
+
+
+def test_a_scheduler_that_comes_is_told_everything_again(bench: Any) -> None:
+    bench.translator.handle(SubscriberJoined())
+    assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
+
+
+def test_nothing_new_is_not_published(bench: Any) -> None:
+    for _ in range(5):
+        bench.look()
+    assert bench.heard() == []
+
+
+def test_a_scan_is_told_as_scanning_all_channels_free(bench: Any, scan: Any) -> None:
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    assert bench.heard() == ["SCANNING"]
+    bench.look()
+    assert bench.heard() == []
+    bench.microscope.files["a"] = [scan("Height"), scan("Phase")]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    assert bench.heard() == ["Scan2d", "Scan2d", "FREE"]
+
+
+def test_a_scan_that_is_over_before_it_was_seen_is_told_as_a_whole(bench: Any, scan: Any) -> None:
+    def at_once() -> None:
+        bench.microscope.files["a"] = [scan()]
+
+    bench.translator._service.actions[names.START_SCAN] = _with(
+        bench.translator._service.actions[names.START_SCAN], at_once
+    )
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    assert bench.heard() == ["SCANNING", "Scan2d", "FREE"]
+
+
+def _with(action: Any, do: Any) -> Any:
+    from dataclasses import replace
+
+    return replace(action, do=do)
+
+
+def test_a_scan_taken_at_the_panel_is_published_too(bench: Any, scan: Any) -> None:
+    bench.microscope.state = ScopeState.SCANNING
+    bench.look()
+    bench.microscope.files["a"] = [scan()]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    bench.microscope.files["b"] = [scan()]  # begun and ended between two looks
+    bench.look()
+    assert bench.heard() == ["SCANNING", "Scan2d", "FREE", "SCANNING", "Scan2d", "FREE"]
+
+
+def test_a_file_that_comes_late_is_waited_for(bench: Any, scan: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.state = ScopeState.FREE
+    bench.microscope.files["a"] = None  # half written
+    bench.look()
+    assert bench.heard() == ["SCANNING"]
+    bench.microscope.files["a"] = [scan()]
+    bench.look()
+    assert bench.heard() == ["Scan2d", "FREE"]
+
+
+def test_a_scan_without_a_file_ends_as_interrupted(bench: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    bench.look(after_s=10.0)
+    assert bench.heard() == ["SCANNING", "INTERRUPTED", "FREE"]
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_the_tip_does_not_go_on_scanning_when_the_run_is_stopped(bench: Any, lost: bool) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.lost = lost
+    assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    assert bench.microscope.done == (["scan"] if lost else ["scan", "stop"])
+    assert bench.heard() == (["SCANNING", "UNDEFINED"] if lost else ["SCANNING", "INTERRUPTED", "FREE"])
+
+
+def switched(bench: Any, to: str) -> None:
+    told(bench.ask(PARAM, Parameter(names.FEEDBACK_ON, to)))
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_without_the_feedback_that_a_request_has_switched_off_the_tip_is_retracted_when_the_run_is_stopped(
+    bench: Any, caplog: pytest.LogCaptureFixture, killed: bool
+) -> None:
+    switched(bench, "false")
+    bench.ask(ACTION, names.START_SCAN)
+    if killed:
+        bench.start()
+    assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    assert bench.microscope.done == ["scan", "stop", "retract"]
+    assert "the feedback off: the tip is retracted" in caplog.text
+
+
+class Killed(BaseException):
+    """The process, just here."""
+
+
+@pytest.mark.parametrize("answered", [False, True])
+def test_one_that_is_killed_while_it_switches_the_feedback_off_does_not_leave_that_to_nobody(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, answered: bool
+) -> None:
+    set_ = bench.microscope.set
+
+    def kill(*what: Any) -> None:
+        if not answered:
+            set_(*what)
+        raise Killed
+
+    whom, what = (bench.translator, "_observe_values") if answered else (bench.microscope, "set")
+    with monkeypatch.context() as patched:
+        patched.setattr(whom, what, kill)
+        with pytest.raises(Killed):
+            switched(bench, "false")
+    bench.start()
+    assert bench.translator.leaves_danger()
+    assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    assert bench.microscope.done == ["retract"]
+
+
+def broken(*_: Any) -> Any:
+    raise ValueError("a bug of the implementer, or a controller that makes no sense")
+
+
+@pytest.mark.parametrize("what", ["status", "load"])
+def test_the_way_out_is_open_whatever_else_is_wrong(bench: Any, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    switched(bench, "false")
+    bench.microscope.files["one.dat"] = []
+    monkeypatch.setattr(bench.microscope, what, broken)
+    for _ in range(3):
+        bench.look(after_s=1.0)
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    assert bench.microscope.done == ["retract"]
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_controller_that_is_lost_or_refuses_when_the_run_is_stopped_is_asked_again(
+    bench: Any, caplog: pytest.LogCaptureFixture, lost: bool
+) -> None:
+    switched(bench, "false")
+    bench.microscope.lost = lost
+    bench.microscope.lacking = {} if lost else {names.RETRACT: "it is not possible now"}
+
+    def is_back() -> None:
+        bench.microscope.lost, bench.microscope.lacking = False, {}
+
+    assert bench.run_to_the_end(ParentGone(), after_s=(3.0, is_back)) == ExitCode.ORPHAN
+    assert bench.microscope.done == ["retract"]
+    assert "the feedback off: the tip is retracted" in caplog.text
+    assert "CRITICAL" not in caplog.text
+
+
+def test_the_tip_stays_where_the_feedback_is_on_or_was_switched_off_by_others(bench: Any) -> None:
+    def left() -> list[str]:
+        assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+        done, bench.microscope.done = bench.microscope.done, []
+        bench.microscope.values["Loop"] = True
+        bench.start()
+        return list(done)
+
+    switched(bench, "false")
+    switched(bench, "true")
+    assert left() == []
+    switched(bench, "false")
+    bench.microscope.values["Loop"] = True  # and on again, at the panel
+    bench.look()
+    assert left() == []
+    bench.ask(PARAM, Parameter("tip-bias-voltage", "1", "V"))
+    bench.look()
+    bench.microscope.values["Loop"] = False
+    bench.look()
+    assert left() == []  # at the panel
+    switched(bench, "false")
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    assert left() == ["retract"]  # once
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    bench.microscope.values["Loop"] = False  # by that
+    bench.look()
+    assert left() == ["retract"]
+    switched(bench, "false")
+    bench.microscope.lacking = {names.RETRACT: "its motor is stuck"}
+    assert not bench.ask(ACTION, names.RETRACT).ok
+    bench.microscope.lacking = {}
+    assert left() == ["retract"]  # at last
+    bench.start(retracts=False)
+    switched(bench, "false")
+    assert left() == []
+
+
+def test_a_scheduler_that_has_ended_the_experiment_has_seen_to_the_tip(bench: Any) -> None:
+    switched(bench, "false")
+    assert bench.run_to_the_end(ParentGone(), RequestReceived([wire.CLOSE])) == ExitCode.ENDED
+    assert bench.microscope.done == []
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_that_a_tip_without_feedback_can_not_be_retracted_is_critical(
+    bench: Any, caplog: pytest.LogCaptureFixture, lost: bool
+) -> None:
+    switched(bench, "false")
+    bench.microscope.lost = lost
+    bench.microscope.lacking = {names.RETRACT: "it has no coarse motor"}
+    began_s = bench.clock.t_s
+    assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    assert 8.0 <= bench.clock.t_s - began_s < TIP_WITHIN_S, "it ends before it is ended"
+    last = caplog.records[-1]
+    assert last.levelname == "CRITICAL"
+    assert ("unplugged" if lost else "it has no coarse motor") in last.getMessage()
+
+
+def test_a_stop_interrupts_and_no_scan_comes(bench: Any, scan: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.files["partial"] = [scan()]  # some controllers save what they have
+    assert bench.ask(ACTION, names.STOP_SCAN).code == OK
+    bench.look()
+    assert bench.heard() == ["SCANNING", "INTERRUPTED", "FREE"]
+
+
+def test_a_stop_with_nothing_running_is_a_success_without_interruption(bench: Any) -> None:
+    assert bench.ask(ACTION, names.STOP_SCAN).code == OK
+    bench.look()
+    assert bench.heard() == []
+    assert bench.microscope.done == []
+
+
+def test_a_frame_is_set_as_moving_the_frame_once_free(bench: Any) -> None:
+    region = Region((1e-6, 2e-6), (2e-6, 1e-6), math.radians(30))
+    assert bench.ask(FRAME, ScanParameters(region, (16, 32))).code == OK
+    packets = list(bench.port.packets)
+    assert bench.heard() == ["MOVING", "ScanParameters2d", "FREE"]
+    published = packets[1][1]
+    assert published.shape == (16, 32)
+    assert published.region.center_m == pytest.approx(region.center_m, rel=1e-12)
+    assert published.region.angle_rad == pytest.approx(region.angle_rad, rel=1e-12)
+    assert bench.microscope.values["A"] == pytest.approx(-30)  # this controller counts clockwise
+    assert (bench.microscope.values["NX"], bench.microscope.values["NY"]) == (32, 16)
+
+
+def test_the_frame_that_is_in_force_already_is_told_once(bench: Any) -> None:
+    same = ScanParameters(Region.from_top_left((0.0, 0.0), (1e-6, 0.5e-6)), (4, 8))
+    assert bench.ask(FRAME, same).code == OK
+    assert bench.heard() == ["MOVING", "ScanParameters2d", "FREE"]
+
+
+def test_a_move_that_takes_time_ends_when_the_controller_says_so(bench: Any) -> None:
+    bench.microscope.state = ScopeState.MOVING
+    bench.look()
+    assert bench.heard() == ["MOVING"]
+    assert bench.ask(POSITION, ProbePosition((1e-6, 1e-6))).code == NOT_FREE
+    bench.microscope.state = ScopeState.FREE
+    assert bench.ask(POSITION, ProbePosition((1e-6, 1e-6))).code == OK
+    assert bench.heard() == ["FREE", "MOVING", "ProbePosition", "FREE"]
+
+
+def test_only_what_is_present_is_set(bench: Any) -> None:
+    message = scan_pb2.ScanParameters2d()
+    message.spatial.roi.size.y = 250.0
+    message.spatial.length_units = "nm"
+    assert bench.ask(FRAME, payload=message.SerializeToString()).code == OK
+    assert (bench.microscope.values["W"], bench.microscope.values["H"]) == (1000.0, pytest.approx(250.0))
+    gain = feedback_pb2.ZCtrlParameters(proportionalGain=0.0)
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, payload=gain.SerializeToString()).code == OK
+    assert bench.microscope.values["P"] == 0.0
+    assert (bench.microscope.values["Setpoint"], bench.microscope.values["Loop"]) == (1.0, True)
+
+
+def test_feedback_is_switched_off_and_told(bench: Any) -> None:
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False)).code == OK
+    assert bench.microscope.values["Loop"] is False
+    assert bench.port.packets[-1][1].on is False
+    assert told(bench.ask(PARAM, Parameter("x-feedback-on", "true"))) == ("true", None)
+    assert bench.microscope.values["Loop"] is True
+
+
+def test_feedback_goes_on_after_all_else_and_off_before(bench: Any, monkeypatch: Any) -> None:
+    plain, order = bench.microscope.set, []
+
+    def noted(given: Any) -> None:
+        order.append(set(given))
+        plain(given)
+
+    monkeypatch.setattr(bench.microscope, "set", noted)
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5)).code == OK
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).code == OK
+    assert order == [{"Loop"}, {"Setpoint"}, {"Setpoint"}, {"Loop"}]
+
+
+def test_a_gain_sent_as_float32_is_the_number_that_was_meant(bench: Any) -> None:
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(proportional_gain=0.1)).code == OK
+    assert bench.microscope.values["P"] == 0.1
+
+
+def test_a_change_at_the_panel_is_published_once(bench: Any) -> None:
+    bench.microscope.values["X"] = 100.0
+    bench.look()
+    bench.microscope.values["Setpoint"] = 2.0
+    bench.look()
+    bench.look()
+    assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters"]
+
+
+def test_parameters_are_told_in_the_unit_that_was_asked_in(bench: Any) -> None:
+    assert told(bench.ask(PARAM, Parameter("scan-speed"))) == ("1e-06", "m/s")
+    assert told(bench.ask(PARAM, Parameter("scan-speed", "1500.0", "nm/s"))) == ("1500", "nm/s")
+    assert bench.microscope.values["Speed"] == 1.5
+    assert told(bench.ask(PARAM, Parameter("scan-angle", "45"))) == ("45", "deg")
+    assert told(bench.ask(PARAM, Parameter("scan-angle", None, "rad")))[0] == f"{math.pi / 4:.15g}"
+    assert told(bench.ask(PARAM, Parameter("scan-resolution-x"))) == ("8", "px")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "unit"),
+    [
+        ("scan-speed", "fast", None),
+        ("scan-speed", "nan", "um/s"),
+        ("scan-speed", "inf", None),
+        ("scan-speed", "1e400", None),
+        ("scan-speed", "1_0", "um/s"),
+        ("scan-speed", "1", "V"),
+        ("scan-speed", "1", "parsec per fortnight and then some"),
+        ("scan-speed", "1", "m/s"),  # a metre a second is a million times the limit
+        ("scan-speed", "", "um/s"),
+        ("scan-size-x", "0", "nm"),
+        ("scan-size-x", "-5", "nm"),
+        ("scan-top-left-x", "9.9", "um"),  # the corner is in reach, the frame is not
+        ("scan-resolution-x", "7.5", "px"),
+        ("scan-resolution-x", "1000000000", "px"),
+        ("x-feedback-on", "perhaps", None),
+        ("x-mode", "CV", None),
+        ("x-serial", "008", None),
+        ("x-mode", "I" * 1000, None),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused_with_a_reason_and_changes_nothing(
+    bench: Any, name: str, value: str, unit: str | None
+) -> None:
+    before = dict(bench.microscope.values)
+    response = bench.ask(PARAM, Parameter(name, value, unit))
+    assert response.code == PARAM_ERROR
+    assert len(response.reason) > 10
+    assert bench.microscope.values == before
+    assert bench.heard() == []
+
+
+def test_a_billion_pixels_are_refused(make_bench: Any) -> None:
+    unbounded = {name: {"range": [1, 1e9]} for name in (names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y)}
+    bench = make_bench({"parameters": unbounded})
+    response = bench.ask(FRAME, ScanParameters(shape=(31623, 31623)))
+    assert response.code == PARAM_ERROR
+    assert "pixels" in response.reason
+
+
+def test_a_turned_frame_whose_corner_is_out_of_reach_is_refused(bench: Any) -> None:
+    region = Region((9e-6, 0.0), (2e-6, 2e-6), math.radians(45))
+    response = bench.ask(FRAME, ScanParameters(region))
+    assert response.code == PARAM_ERROR
+    assert "reaches" in response.reason
+    assert bench.ask(FRAME, ScanParameters(Region((9e-6, 0.0), (2e-6, 2e-6)))).code == OK
+
+
+def test_the_reason_names_value_limit_and_where_it_was_set(bench: Any) -> None:
+    reason = bench.ask(PARAM, Parameter("scan-speed", "200", "um/s")).reason
+    assert reason == "scan-speed: 200 um/s is outside 0.001 um/s to 100 um/s (set in parameters.toml)"
+
+
+def test_what_the_controller_makes_something_else_of_is_refused_and_put_back(bench: Any) -> None:
+    bench.microscope.stuck = {"Speed": 3.0}
+    response = bench.ask(PARAM, Parameter("scan-speed", "5", "um/s"))
+    assert response.code == PARAM_ERROR
+    assert "made 3 um/s of 5 um/s" in response.reason
+    bench.microscope.stuck = {"Speed": 5.00005}  # its precision
+    assert bench.ask(PARAM, Parameter("scan-speed", "5", "um/s")).code == OK
+
+
+def test_what_follows_in_the_rest_of_the_frame_is_refused_and_put_back(bench: Any, monkeypatch: Any) -> None:
+    plain, values = bench.microscope.set, bench.microscope.values
+
+    def square(given: Any) -> None:
+        plain(given)
+        if "H" not in given and "W" in given:
+            values["H"] = given["W"]
+
+    monkeypatch.setattr(bench.microscope, "set", square)
+    response = bench.ask(PARAM, Parameter("scan-size-x", "2", "um"))
+    assert response.code == PARAM_ERROR
+    assert response.reason == "scan-size-y: the controller made 2000 nm of 500 nm; nothing was changed"
+    assert (values["W"], values["H"]) == (1000.0, 500.0)
+
+
+def test_while_scanning_only_what_disturbs_is_refused(bench: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    assert bench.ask(ACTION, names.START_SCAN).code == NOT_FREE
+    assert bench.ask(ACTION, names.START_SPEC).code == NOT_FREE
+    assert bench.ask(FRAME, ScanParameters(shape=(4, 4))).code == NOT_FREE
+    assert bench.ask(PARAM, Parameter("scan-speed", "1", "um/s")).code == NOT_FREE
+    assert "SS_SCANNING" in bench.ask(PARAM, Parameter("zctrl-pgain", "1")).reason
+    assert bench.ask(PARAM, Parameter("scan-speed")).code == OK
+    assert bench.ask(SUPPORT, names.START_SPEC).code == OK
+    assert bench.ask(PARAM, Parameter("tip-bias-voltage", "1", "V")).code == OK  # the table allows it
+    assert bench.microscope.done == ["scan"]
+
+
+def test_unknown_names_are_refused_with_the_nearest(bench: Any) -> None:
+    unknown = bench.ask(PARAM, Parameter("scan-sped"))
+    assert unknown.code == ControlResponse.PARAM_NOT_SUPPORTED
+    assert "scan-speed" in unknown.reason
+    for kind in (ACTION, SUPPORT):
+        response = bench.ask(kind, "start-scam")
+        assert response.code == ControlResponse.ACTION_NOT_SUPPORTED
+        assert "start-scan" in response.reason
+    assert bench.ask(SUPPORT, names.STOP_SPEC).code == ControlResponse.ACTION_NOT_SUPPORTED
+
+
+@pytest.mark.parametrize(
+    ("frames", "code"),
+    [
+        ([], ControlResponse.FAILURE),
+        ([b""], ControlResponse.FAILURE),
+        ([b"\1\1"], ControlResponse.FAILURE),
+        ([b"\xfe"], ControlResponse.CMD_NOT_SUPPORTED),
+        ([b"\0"], ControlResponse.CMD_NOT_SUPPORTED),
+        ([b"\6", b"\1"], ControlResponse.CMD_NOT_SUPPORTED),
+        ([bytes([CLOCK_REQUEST])], ControlResponse.CMD_NOT_SUPPORTED),
+        ([b"\3", b"\x0a\xff"], ControlResponse.FAILURE),
+        ([b"\2"], PARAM_ERROR),
+        ([b"\1", b"x", b"y", b"z"], ControlResponse.FAILURE),
+    ],
+)
+def test_malformed_requests_are_answered(bench: Any, frames: list[bytes], code: ControlResponse) -> None:
+    response = bench.ask_frames(frames)
+    assert response.code == code
+    assert response.reason
+    assert bench.ask(PARAM, Parameter("scan-speed")).code == OK
+
+
+def test_errors_of_a_controller_become_responses_with_their_reason(bench: Any) -> None:
+    tune = bench.ask(ACTION, "x-tune")
+    assert (tune.code, tune.reason) == (ControlResponse.ACTION_ERROR, "no resonance was found")
+    assert "a bug" in bench.ask(ACTION, "x-explode").reason
+    bench.microscope.fails = RuntimeError("E42")
+    assert "E42" in bench.ask(PARAM, Parameter("scan-speed", "2", "um/s")).reason
+
+
+def test_a_controller_that_is_gone_is_said_and_found_again(bench: Any) -> None:
+    bench.microscope.lost = True
+    bench.look()
+    assert bench.heard() == ["UNDEFINED"]
+    response = bench.ask(PARAM, Parameter("scan-speed"))
+    assert (response.code, response.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.NOT_SENT)
+    bench.microscope.lost = False
+    bench.look(after_s=5.0)
+    assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
+
+
+def test_a_controller_that_was_never_there_is_said_once(make_bench: Any, tmp_path: Any) -> None:
+    bench = make_bench()
+    bench.microscope.lost = True
+    bench.start()
+    for _ in range(5):
+        bench.look(after_s=1.0)
+    assert bench.heard() == ["UNDEFINED"]
+    bench.microscope.lost = False
+    bench.look(after_s=1.0)
+    assert bench.heard()[-1] == "FREE"
+
+
+@pytest.mark.parametrize("error", [ValueError("0x1f"), KeyError("status"), WireError("a reply to another question")])
+def test_a_controller_that_says_what_cannot_be_is_not_trusted_until_it_makes_sense(bench: Any, error: Any) -> None:
+    bench.microscope.confused = error
+    bench.look()
+    assert bench.heard() == ["UNDEFINED"]
+    response = bench.ask(ACTION, names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    bench.microscope.confused = None
+    bench.look(after_s=1.0)
+    assert bench.heard()[-1] == "FREE"
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+def test_a_controller_found_confused_by_a_request_does_nothing_of_it(bench: Any) -> None:
+    bench.microscope.confused = ValueError("0x1f")
+    response = bench.ask(ACTION, names.START_SCAN)
+    assert (response.code, bench.microscope.done) == (ControlResponse.NO_RESPONSE, [])
+    assert "ValueError: 0x1f" in response.reason
+    assert bench.heard() == ["UNDEFINED"]
+
+
+def test_a_controller_that_starts_with_its_translator_is_waited_for_and_nothing_is_wrong(
+    bench: Any, caplog: Any
+) -> None:
+    caplog.set_level(logging.INFO)
+    bench.microscope.lost = True
+    bench.start()
+    bench.look(1.8)
+    assert caplog.records == []
+    bench.look(0.3)
+    (told,) = caplog.records
+    assert told.levelno == logging.ERROR
+    assert "unplugged" in told.message
+    bench.look(1.0)
+    bench.microscope.lost = False
+    bench.look(0.9)
+    assert len(caplog.records) == 1
+    bench.look(0.2)
+    assert caplog.records[-1].message == "the controller answers"
+
+
+def test_a_controller_that_starts_late_is_found_soon(bench: Any, caplog: Any) -> None:
+    caplog.set_level(logging.INFO)
+    bench.microscope.lost = True
+    bench.start()
+    assert bench.translator.wait_s() == pytest.approx(0.1)
+    bench.microscope.lost = False
+    bench.look(0.11)
+    assert "ScanParameters2d" in bench.heard()
+    assert caplog.records == []
+
+
+def test_a_request_that_was_done_before_the_controller_was_lost_stays_a_success(bench: Any) -> None:
+    def lost_afterwards(values: Any) -> None:
+        type(bench.microscope).set(bench.microscope, values)
+        bench.microscope.confused = ValueError("0x1f")
+
+    bench.microscope.set = lost_afterwards
+    replies = len(bench.port.replies)
+    assert bench.ask(POSITION, ProbePosition((1e-6, 0.0)), request_id="one").code == OK
+    assert len(bench.port.replies) == replies + 1
+    assert bench.heard()[-1] == "UNDEFINED"
+    bench.microscope.confused = None
+    assert bench.ask(POSITION, ProbePosition((1e-6, 0.0)), request_id="one").code == OK
+
+
+@pytest.mark.parametrize(("vendor", "value"), [("X", math.nan), ("P", math.inf), ("Loop", math.nan), ("W", "wide")])
+def test_a_value_that_cannot_be_is_never_published(bench: Any, vendor: str, value: Any) -> None:
+    bench.microscope.values[vendor] = value
+    bench.look()
+    assert bench.heard() == ["UNDEFINED"]
+
+
+def test_settings_with_which_it_can_never_be_connected_end_the_process(make_bench: Any) -> None:
+    bench = make_bench()
+    bench.microscope.connect = lambda: (_ for _ in ()).throw(ConfigError("no such release"))
+    with pytest.raises(ConfigError):
+        bench.start()
+
+
+def test_the_end_of_a_scan_is_looked_for_eagerly_by_its_state_alone(bench: Any, scan: Any) -> None:
+    def measure(number: int) -> list[float]:
+        """Looks as the translator wants to; returns the pauses between them."""
+        bench.ask(ACTION, names.START_SCAN)
+        waits = []
+        for _ in range(4000):
+            waits.append(bench.translator.wait_s())
+            if bench.clock.t_s >= bench.began_s + 30.0 and bench.microscope.state is ScopeState.SCANNING:
+                bench.microscope.files[f"{number}"] = [scan()]
+                bench.microscope.state = ScopeState.FREE
+                bench.late_s = bench.clock.t_s - bench.began_s - 30.0
+            bench.look(waits[-1])
+            if bench.heard()[-1:] == ["FREE"]:
+                return waits
+        raise AssertionError("it is never over")
+
+    bench.began_s = bench.clock.t_s
+    measure(1)
+    for number in (2, 3):
+        bench.began_s, bench.microscope.got = bench.clock.t_s, 0
+        waits = measure(number)
+        assert bench.late_s <= 0.02
+        assert max(waits) == pytest.approx(0.1)
+        assert len(waits) < 400
+        # 14 values at every tenth of a second, as at rest
+        assert bench.microscope.got < 15 * 320
+
+
+def test_actions_and_parameters_of_the_experiment_file(make_bench: Any) -> None:
+    bench = make_bench(
+        {
+            "parameters": {"x-gate": {"vendor": "Bias", "unit": "mV", "range": ["-1 V", "1 V"]}},
+            "actions": {
+                "x-to-force": {"set": {"x-mode": "force", "scan-speed": "2 um/s"}},
+                "x-beep": {"command": "BEEP 3"},
+            },
+        }
+    )
+    assert told(bench.ask(PARAM, Parameter("x-gate", "0.5", "V"))) == ("0.5", "V")
+    assert bench.ask(ACTION, "x-to-force").code == OK
+    assert (bench.microscope.values["Mode"], bench.microscope.values["Speed"]) == ("force", 2.0)
+    assert bench.ask(ACTION, "x-beep").code == OK
+    assert bench.microscope.done == ["BEEP 3"]
+
+
+def test_what_an_action_sets_is_published_before_it_is_answered(make_bench: Any) -> None:
+    bench = make_bench({"actions": {"x-soft": {"set": {"zctrl-setpoint": "2 nA"}}, "x-beep": {"command": "BEEP"}}})
+    bench.heard()
+    order: list[str] = []
+    publish, reply = bench.port.publish, bench.port.reply
+    bench.port.publish = lambda envelope, *rest, **kept: (order.append(envelope), publish(envelope, *rest, **kept))
+    bench.port.reply = lambda frames: (order.append("answer"), reply(frames))
+    assert bench.ask(ACTION, "x-soft").code == OK
+    assert order == ["ZCtrlParameters", "answer"]
+    assert bench.ask(ACTION, "x-beep").code == OK
+    assert order[2:] == ["answer"], "nothing has changed"
+
+
+BEEP = {"set": {"tip-bias-voltage": "4 V", "x-mode": "force"}, "command": "BEEP 3", "for": "50 ms"}
+
+
+def test_an_action_may_put_values_in_force_for_a_while(make_bench: Any) -> None:
+    bench = make_bench({"actions": {"x-pulse": BEEP}})
+    microscope, before = bench.microscope, dict(bench.microscope.values)
+    assert bench.ask(ACTION, "x-pulse").code == OK
+    assert (microscope.values["Bias"], microscope.values["Mode"]) == (4000.0, "force")
+    assert microscope.done == ["BEEP 3"]
+    assert bench.heard()[-1] == "BUSY_PARAM"
+    assert bench.ask(ACTION, names.START_SCAN).code == NOT_FREE
+    assert bench.translator.wait_s() <= 0.05
+    bench.clock.t_s += 0.049
+    bench.translator.look()
+    assert microscope.values["Bias"] == 4000.0
+    bench.clock.t_s += 0.002
+    bench.translator.look()
+    assert microscope.values == before
+    assert bench.heard() == ["FREE"]
+
+
+@pytest.mark.parametrize("how", ["killed", "lost", "ended", "orphaned"])
+def test_what_was_in_force_for_a_while_is_put_back_come_what_may(make_bench: Any, how: str) -> None:
+    bench = make_bench({"actions": {"x-pulse": BEEP}})
+    microscope, before = bench.microscope, dict(bench.microscope.values)
+    assert bench.ask(ACTION, "x-pulse").code == OK
+    if how == "killed":
+        bench.start()
+    elif how == "lost":
+        microscope.lost = True
+        bench.look(10.0)
+        assert microscope.values["Bias"] == 4000.0
+        microscope.lost = False
+        bench.look(10.0)
+    elif how == "ended":
+        bench.run_to_the_end(RequestReceived([wire.CLOSE]))
+    else:
+        bench.run_to_the_end(ParentGone())
+    assert microscope.values == before
+
+
+def test_an_action_that_can_not_be_set_changes_nothing_and_is_over(make_bench: Any) -> None:
+    bench = make_bench({"actions": {"x-pulse": BEEP}})
+    before = dict(bench.microscope.values)
+    bench.microscope.stuck = {"Bias": 100.0}
+    assert bench.ask(ACTION, "x-pulse").code == ControlResponse.PARAM_ERROR
+    assert bench.microscope.values == before
+    assert bench.microscope.done == []
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+@pytest.mark.parametrize(("name", "value"), [("x-serial", "007"), ("zctrl-pgain", "1000"), ("x-mode", "of the panel")])
+def test_an_unchanged_value_that_can_not_be_set_is_no_change(bench: Any, name: str, value: str) -> None:
+    """Read only, or put there at the panel beyond what may be asked for."""
+    vendor = {"x-serial": "Serial", "zctrl-pgain": "P", "x-mode": "Mode"}[name]
+    bench.microscope.values[vendor] = value if vendor != "P" else 1000.0
+    calls = bench.microscope.set_calls
+    assert told(bench.ask(PARAM, Parameter(name, value)))[0] == value
+    assert bench.microscope.set_calls == calls
+    assert bench.ask(PARAM, Parameter(name, value + "1")).code == ControlResponse.PARAM_ERROR
+
+
+def test_a_whole_message_may_be_sent_back_with_one_field_changed(make_bench: Any) -> None:
+    bench = make_bench({"parameters": {"x-feedback-on": {"read_only": True}}})
+    wanted = Feedback(on=True, proportional_gain=7.0, setpoint=1.0)
+    bench.microscope.values |= {"Loop": True, "Setpoint": 1.0}
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted).code == OK
+    assert bench.microscope.values["P"] == 7.0
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, replace(wanted, on=False)).code == ControlResponse.PARAM_ERROR
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"actions": {"x-a": {"set": {"scan-sped": 1}}}},
+        {"actions": {"x-a": {"set": {"scan-speed": "1 V"}}}},
+        {"actions": {"x-a": {"do": "it"}}},
+        {"actions": {"x-a": {"for": "1 s"}}},
+        {"actions": {"x-a": {"set": {"scan-speed": "1 um/s"}, "for": "1 V"}}},
+        {"actions": {"x-a": {"set": {"scan-speed": "1 um/s"}, "for": 0}}},
+        {"parameters": {"scan-speed": {"rang": [1, 2]}}},
+        {"parameters": {"scan-speed": {"range": [2, 1]}}},
+        {"parameters": {"scan-speed": {"unit": "V"}}},
+        {"parameters": {"scan-speed": {"type": "complex"}}},
+    ],
+)
+def test_settings_that_cannot_be_are_found_at_the_start(make_bench: Any, settings: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        make_bench(settings)
+
+
+def test_a_repeated_id_is_answered_and_not_carried_out_again(bench: Any) -> None:
+    first = bench.ask(PARAM, Parameter("scan-speed", "2", "um/s"), "me/1/1")
+    assert bench.microscope.set_calls == 1
+    again = bench.ask(PARAM, Parameter("scan-speed", "2", "um/s"), "me/1/1")
+    assert bench.microscope.set_calls == 1
+    assert again == first
+    other = bench.ask(PARAM, Parameter("scan-speed", "3", "um/s"), "me/1/1")
+    assert other.code == ControlResponse.FAILURE
+    assert bench.microscope.set_calls == 1
+
+
+def test_a_request_that_was_refused_may_be_asked_again(bench: Any) -> None:
+    bench.microscope.state = ScopeState.MOVING
+    assert bench.ask(ACTION, names.START_SCAN, "me/1/1").code == NOT_FREE
+    bench.microscope.state = ScopeState.FREE
+    assert bench.ask(ACTION, names.START_SCAN, "me/1/1").code == OK
+    assert bench.microscope.done == ["scan"]
+
+
+def test_a_restarted_translator_does_not_repeat_what_was_done(bench: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN, "me/1/1")
+    bench.start()
+    assert bench.ask(ACTION, names.START_SCAN, "me/1/1").code == OK
+    assert bench.microscope.done == ["scan"]
+
+
+def test_what_a_kill_left_half_done_is_not_done_again(bench: Any) -> None:
+    request = wire.decode_request(wire.encode_request(_request("me/1/1")))
+    bench.translator._about_to_act(request)  # killed right here
+    bench.start()
+    response = bench.ask(ACTION, names.START_SCAN, "me/1/1")
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "restarted" in response.reason
+    assert bench.microscope.done == []
+
+
+def _request(request_id: str) -> Any:
+    from afspm.model import Request
+
+    return Request(ACTION, names.START_SCAN, b"", request_id)
+
+
+def test_a_scan_that_ended_while_the_translator_was_down_is_delivered_once(bench: Any, scan: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.files["a"] = [scan()]
+    bench.microscope.state = ScopeState.FREE
+    bench.start()
+    assert bench.heard() == [
+        "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "SCANNING", "Scan2d", "FREE",
+    ]  # fmt: skip
+
+
+def test_after_a_kill_the_last_results_are_published_again_at_the_same_times(bench: Any, scan: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.files["a"] = [scan("Height"), scan("Phase")]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    before = [time_ns for name, _, time_ns in bench.port.packets if name == "Scan2d"]
+    bench.clock.t_s += 5
+    bench.start()
+    after = [time_ns for name, _, time_ns in bench.port.packets if name == "Scan2d"]
+    assert len(before) == 2
+    assert after == before
+
+
+def test_a_scan_that_did_not_survive_is_told_as_interrupted(bench: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.state = ScopeState.FREE
+    bench.start()
+    bench.look(after_s=20)
+    assert bench.heard()[-3:] == ["SCANNING", "INTERRUPTED", "FREE"]
+
+
+def test_files_from_before_the_experiment_are_none_of_its_results(make_bench: Any, scan: Any, tmp_path: Any) -> None:
+    bench = make_bench()
+    (tmp_path / "translator.json").unlink()
+    bench.microscope.files["yesterday"] = [scan()]
+    bench.start()
+    assert "Scan2d" not in bench.heard()
+
+
+def test_times_of_packets_increase_strictly(bench: Any, scan: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.microscope.files["a"] = [scan("Height"), scan("Phase")]
+    bench.microscope.state = ScopeState.FREE
+    bench.look(after_s=0.0)
+    times = [time_ns for _, _, time_ns in bench.port.packets]
+    assert times == sorted(set(times))
+    assert len(times) == 4
