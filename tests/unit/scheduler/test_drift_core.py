@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from drift_lab import HERE, NS, SHAPE, Lab, forecast, registered
@@ -198,7 +200,7 @@ def test_it_is_saved_before_it_is_published(lab: Lab) -> None:
     assert kinds.index("SaveState") < kinds.index("Publish")
     frame = lab.saved().frame
     assert frame is not None
-    beside = frame["beside"]
+    beside = json.loads(frame)["beside"]
     assert beside["knowledge"]["forecast"] == forecast(DRIFT)
     assert beside["scans"][0][0] == lab.worker.jobs[0].key
 
