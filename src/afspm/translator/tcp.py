@@ -18,22 +18,25 @@ T = TypeVar("T")
 class Receiver:
     """The bytes that come in reply to one question, until its deadline."""
 
-    def __init__(self, connected: socket.socket, monotonic_s: Callable[[], float], until_s: float) -> None:
+    def __init__(self, connected: socket.socket, monotonic_s: Callable[[], float], until_s: float, what: str) -> None:
         self._socket = connected
         self._monotonic_s = monotonic_s
         self._until_s = until_s
-        self._count = 0
+        self._what = what
 
-    def some(self, most: int = _AT_ONCE) -> bytes:
-        """Return at least one byte. Raises OSError: none came in time, or the connection was closed."""
+    def some(self, most: int = _AT_ONCE, after: str = "some") -> bytes:
+        """Return at least one byte.
+
+        Raises:
+            TimeoutError: none came in time. ControllerLost: the connection was closed. OSError.
+        """
         left_s = self._until_s - self._monotonic_s()
         if left_s <= 0.0:
             raise TimeoutError
         self._socket.settimeout(left_s)
         part = self._socket.recv(min(most, _AT_ONCE))
         if not part:
-            raise ConnectionError(f"it was closed after {self._count} bytes of the reply")
-        self._count += len(part)
+            raise ControllerLost(f"the connection was closed after {after} bytes of the reply to {self._what}")
         return part
 
     def exactly(self, size: int) -> bytearray:
@@ -41,7 +44,7 @@ class Receiver:
         self._until_s += size / _SLOWEST_BYTES_PER_S
         received = bytearray()
         while len(received) < size:
-            received += self.some(size - len(received))
+            received += self.some(size - len(received), f"{len(received)} of {size}")
         return received
 
 
@@ -83,7 +86,7 @@ class TcpConnection:
             ControllerLost: no answer, or none to be trusted; the connection is closed.
         """
         timeout_s = self._timeout_s + longer_s
-        receiver = Receiver(self._socket, self._monotonic_s, self._monotonic_s() + timeout_s)
+        receiver = Receiver(self._socket, self._monotonic_s, self._monotonic_s() + timeout_s, what)
         try:
             self._socket.settimeout(timeout_s)
             self._socket.sendall(message)
@@ -96,8 +99,9 @@ class TcpConnection:
             self.close()
             told = f"the connection was lost at {what}: {error}"
             raise ControllerLost(told, where=self.where, hint=self._silent_hint) from error
-        except ControllerLost:
+        except ControllerLost as error:
             self.close()
+            error.where = error.where or self.where
             raise
 
     def close(self) -> None:
