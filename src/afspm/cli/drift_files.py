@@ -26,7 +26,7 @@ from afspm.drift.stack import corrected
 from afspm.drift.trackers import tracker
 from afspm.errors import AfspmError, FileError, InvalidValue
 from afspm.files import FORMATS, FileContent, read
-from afspm.model.words import day_and_time
+from afspm.formatting import day_and_time
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.measured import SUFFIX as RECORDED
 from afspm.study.recorded import Series, series

@@ -79,7 +79,7 @@ def problems(
 def _list(where: Path) -> None:
     from afspm.cli.telling import flagged
     from afspm.clock import NS_PER_S
-    from afspm.model.words import lasting
+    from afspm.formatting import lasting
 
     with looking(where) as follower:
         now_ns, found = follower.clock.now_ns(), list(flagged(follower.overview))

@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from afspm.clock import NS_PER_S
+from afspm.formatting import area, day_and_time, lasting, time_of_day
 from afspm.model import JournalEntry, LogLine, ProcessCondition, ProcessState, Region, ScopeState
-from afspm.model.words import area, day_and_time, lasting, time_of_day
 from afspm.record.lanes import Span
 from afspm.record.overview import OLD_S, OVER, Overview
 

@@ -18,9 +18,9 @@ from afspm.components.notices import (
     Targets,
 )
 from afspm.errors import ConfigError
+from afspm.formatting import lasting
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
-from afspm.model.words import lasting
 from afspm.record.facts import name_in
 from afspm.runtime.component import Component
 from afspm.units import Duration

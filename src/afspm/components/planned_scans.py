@@ -11,8 +11,8 @@ from typing import Any
 from afspm.clock import NS_PER_S
 from afspm.components.plan import XY, Rhythm, ScanPlan, Step, grid_centers, rounds_within, squares
 from afspm.errors import ConfigError, InvalidValue
+from afspm.formatting import day_and_time
 from afspm.model import Region, names
-from afspm.model.words import day_and_time
 from afspm.runtime.component import Component
 from afspm.units import Angle, Duration, Length
 

@@ -12,8 +12,8 @@ from afspm.dashboard.sample_map import MapContent, map_html
 from afspm.dashboard.time_line import NOT_HEARD_OF, time_line_html
 from afspm.dashboard.watch import OLD_AFTER_S, Watch
 from afspm.dashboard.words import colour_class, date_and_clock, escape, position
+from afspm.formatting import lasting, time_of_day
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
-from afspm.model.words import lasting, time_of_day
 from afspm.record.overview import OVER, Overview
 
 ANEW_S = 0.4  # at most that often, however much is published

@@ -11,8 +11,8 @@ from afspm.clock import NS_PER_S
 from afspm.dashboard.plots import Array, Axis, Curve, plot
 from afspm.dashboard.time_line import time_ticks
 from afspm.dashboard.words import escape, position, quantity
+from afspm.formatting import time_of_day
 from afspm.model import Spectrum
-from afspm.model.words import time_of_day
 from afspm.record.overview import DriftPoint
 
 BEFORE = 6  # spectra that are shown faintly behind the newest

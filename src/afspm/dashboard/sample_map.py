@@ -10,8 +10,8 @@ import numpy as np
 from afspm.dashboard.levelling import Array
 from afspm.dashboard.plots import round_ticks
 from afspm.dashboard.words import area, escape, scale
+from afspm.formatting import time_of_day
 from afspm.model import Region
-from afspm.model.words import time_of_day
 from afspm.record.overview import ScanTaken, SpectrumTaken
 
 MOST_PLACES = 1500

@@ -15,8 +15,8 @@ from afspm.dashboard.content import Content
 from afspm.dashboard.steering import Act, Steering
 from afspm.dashboard.watch import Watch
 from afspm.dashboard.words import area, escape, position
+from afspm.formatting import time_of_day
 from afspm.model import ControlMode, Region, names
-from afspm.model.words import time_of_day
 
 PARAMETERS = tuple(names.BASE_PARAMETERS)
 

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from afspm.clock import NS_PER_S
 from afspm.dashboard.words import colour_class, escape
-from afspm.model.words import lasting, time_of_day
+from afspm.formatting import lasting, time_of_day
 from afspm.record.overview import Lane, Overview, Span
 
 NOT_HEARD_OF = "not heard of"

@@ -6,8 +6,8 @@ import html
 import math
 from datetime import datetime
 
+from afspm import formatting
 from afspm.clock import NS_PER_S
-from afspm.model import words
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
              (1e-12, "p"), (1e-15, "f"))  # fmt: skip
@@ -34,17 +34,17 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
 
 def position(xy_m: tuple[float, float]) -> str:
     """ "(1.2, −0.5) µm"."""
-    return words.typeset(words.place(xy_m))
+    return formatting.typeset(formatting.place(xy_m))
 
 
 def area(size_m: tuple[float, float]) -> str:
     """ "2 × 1 µm"."""
-    return words.typeset(words.area(size_m))
+    return formatting.typeset(formatting.area(size_m))
 
 
 def date_and_clock(time_ns: int) -> str:
     """Day and time, with the zone."""
-    return f"{words.day_and_time(time_ns)} {_local(time_ns):%Z}"
+    return f"{formatting.day_and_time(time_ns)} {_local(time_ns):%Z}"
 
 
 def escape(text: str) -> str:

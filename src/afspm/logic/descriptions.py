@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from afspm.formatting import area, lengths, place
 from afspm.logic.arbitration import ArbitrationState, ControlEvent, ControlInput, Rules, Transition
 from afspm.model import (
     RESTART_REQUEST,
@@ -23,7 +24,6 @@ from afspm.model import (
     ShapeChange,
     request_name,
 )
-from afspm.model.words import area, lengths, place
 
 
 def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_told: str | None) -> bool:

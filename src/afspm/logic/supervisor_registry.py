@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from afspm.formatting import lasting
 from afspm.logic.events import Codec, RequestIn
 from afspm.model import (
     LogLines,
@@ -19,7 +20,6 @@ from afspm.model import (
     is_process_name,
 )
 from afspm.model.journal import LONGEST_PROCESS_NAME, PERSON
-from afspm.model.words import lasting
 
 SUPERVISOR = "supervisor"
 """Whose key it takes, where there are keys, to speak of processes; each supervisor adds ":" and what tells it apart."""

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.formatting import from_to, time_of_day
 from afspm.model import names
-from afspm.model.words import from_to, time_of_day
 from afspm.record.night_record import BAD, Mark, NightRecord, Shot, Span
 
 if TYPE_CHECKING:

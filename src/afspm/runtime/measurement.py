@@ -10,9 +10,9 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import MeasurementFailed, NoResponse, Refused, WireError
+from afspm.formatting import day_and_time
 from afspm.logic.sessions import KEYED
 from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
-from afspm.model.words import day_and_time
 from afspm.runtime.asking import NOT_IN_CONTROL, Asker
 from afspm.runtime.cycle import Cycle, Outcome
 from afspm.runtime.holding import Holding

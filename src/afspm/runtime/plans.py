@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from afspm.errors import InvalidValue
+from afspm.formatting import area, place
 from afspm.model import (
     ControlRequest,
     Frame,
@@ -20,7 +21,6 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.model.words import area, place
 from afspm.runtime.asking import Asker
 from afspm.runtime.measurement import Plan
 from afspm.runtime.view import View

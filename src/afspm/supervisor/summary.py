@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
-from afspm.model.words import lasting
+from afspm.formatting import lasting
 from afspm.record.disk import DiskHangs, bounded
 from afspm.record.going_on import resume_command
 from afspm.record.run import open_run

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from afspm.clock import ExperimentClock
-from afspm.model.words import lasting
+from afspm.formatting import lasting
 
 PARTED_S = 5.0
 

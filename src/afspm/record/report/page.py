@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 
 from afspm.clock import NS_PER_S
-from afspm.model.words import area, day, from_to, lasting, time_of_day, typeset
+from afspm.formatting import area, day, from_to, lasting, time_of_day, typeset
 from afspm.record.lanes import Lane
 from afspm.record.report import time_line
 from afspm.record.report.pictures import Small

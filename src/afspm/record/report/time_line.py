@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC
 from html import escape
 
-from afspm.model.words import day_and_time, time_of_day
+from afspm.formatting import day_and_time, time_of_day
 from afspm.record.lanes import Span
 from afspm.record.report.story import Story, in_trouble, states_in_words
 

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
 
-from afspm.model import words
+from afspm import formatting
 
 NS_PER_S = 1_000_000_000
 EVENING = round(datetime(2026, 11, 20, 22, 4, 31, tzinfo=UTC).timestamp()) * NS_PER_S
@@ -32,7 +32,7 @@ HOUR_NS = 3600 * NS_PER_S
     ],
 )
 def test_durations_are_told_as_exactly_as_it_matters(seconds: float, told: str) -> None:
-    assert words.lasting(seconds) == told
+    assert formatting.lasting(seconds) == told
 
 
 @pytest.mark.parametrize(
@@ -47,26 +47,26 @@ def test_durations_are_told_as_exactly_as_it_matters(seconds: float, told: str) 
     ],
 )
 def test_lengths_are_in_the_unit_of_the_largest(values_m: tuple[float, ...], told: str) -> None:
-    assert words.lengths(values_m) == told
+    assert formatting.lengths(values_m) == told
 
 
 def test_areas_and_places_and_the_same_for_pages() -> None:
-    assert words.area((2e-6, 1e-6)) == "2 x 1 um"
-    assert words.place((1.2e-6, -5e-7)) == "(1.2, -0.5) um"
-    assert words.typeset("2 x 1 um at (1.2, -0.5) um") == "2 × 1 µm at (1.2, −0.5) µm"
+    assert formatting.area((2e-6, 1e-6)) == "2 x 1 um"
+    assert formatting.place((1.2e-6, -5e-7)) == "(1.2, -0.5) um"
+    assert formatting.typeset("2 x 1 um at (1.2, -0.5) um") == "2 × 1 µm at (1.2, −0.5) µm"
 
 
 def test_times_are_those_of_the_zone_that_is_given_and_utc_is_named() -> None:
     there = timezone(timedelta(hours=9))
-    assert words.time_of_day(EVENING, UTC) == "22:04:31"
-    assert words.time_of_day(EVENING, there, seconds=False) == "07:04"
-    assert words.day_and_time(EVENING, UTC) == "2026-11-20 22:04:31 UTC"
-    assert words.day_and_time(EVENING, there) == "2026-11-21 07:04:31"
-    assert words.day(EVENING, there) == "2026-11-21"
+    assert formatting.time_of_day(EVENING, UTC) == "22:04:31"
+    assert formatting.time_of_day(EVENING, there, seconds=False) == "07:04"
+    assert formatting.day_and_time(EVENING, UTC) == "2026-11-20 22:04:31 UTC"
+    assert formatting.day_and_time(EVENING, there) == "2026-11-21 07:04:31"
+    assert formatting.day(EVENING, there) == "2026-11-21"
     here = datetime.fromtimestamp(EVENING / NS_PER_S, UTC).astimezone()
-    assert words.day_and_time(EVENING) == f"{here:%Y-%m-%d %H:%M:%S}"
+    assert formatting.day_and_time(EVENING) == f"{here:%Y-%m-%d %H:%M:%S}"
 
 
 def test_the_day_of_an_end_is_told_where_it_is_another() -> None:
-    assert words.from_to(EVENING, EVENING + HOUR_NS, UTC) == "2026-11-20 22:04 to 23:04 UTC"
-    assert words.from_to(EVENING, EVENING + 3 * HOUR_NS, UTC) == "2026-11-20 22:04 to 2026-11-21 01:04 UTC"
+    assert formatting.from_to(EVENING, EVENING + HOUR_NS, UTC) == "2026-11-20 22:04 to 23:04 UTC"
+    assert formatting.from_to(EVENING, EVENING + 3 * HOUR_NS, UTC) == "2026-11-20 22:04 to 2026-11-21 01:04 UTC"
