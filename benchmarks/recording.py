@@ -21,8 +21,8 @@ from afspm import wire
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record import ahead, journal
 from afspm.record.journal import SCHEDULER
-from afspm.record.measured import write_synced
-from afspm.record.store import About, Store
+from afspm.record.measured_files import write_synced
+from afspm.record.store import RecordSettings, RecordStore
 from benchmarks.codec import scan
 from benchmarks.control import Client
 from benchmarks.processes import roles
@@ -206,7 +206,7 @@ def _write(folder: Path) -> None:
     values = np.random.default_rng(1).normal(size=(16, 16))
     region = Region((0.0, 0.0), (1e-6, 1e-6))
     control = ControlState(ControlMode.AUTOMATED, "series")
-    store = Store(folder, About({"experiment": "long"}))
+    store = RecordStore(folder, RecordSettings({"experiment": "long"}))
     with mock.patch.object(os, "fsync"):  # only to be quick: nobody cuts the power here
         for number in range(SCANS):
             time_ns = START_NS + number * 60_000_000_000

@@ -107,7 +107,7 @@ def _people_in(file: Path) -> dict[str, str]:
 def _running_here(where: Path) -> Path | None:
     """The folder of the run that is meant; None: the file is of one that was started elsewhere."""
     from afspm.errors import FileError
-    from afspm.record.facts import ENDED, read_facts
+    from afspm.record.run_json import ENDED, read_run_json
     from afspm.runtime.connect import find_run
 
     try:
@@ -116,7 +116,7 @@ def _running_here(where: Path) -> Path | None:
         if where.suffix == ".toml" and where.is_file():
             return None
         raise
-    if not read_facts(folder).get(ENDED):
+    if not read_run_json(folder).get(ENDED):
         return folder
     if where.suffix == ".toml":
         return None
@@ -132,9 +132,9 @@ def _join(folder: Path, settings: dict[str, Any]) -> int:
     from afspm.dashboard.joining import join, url_in
     from afspm.exit_codes import ExitCode
     from afspm.experiment.known import DASHBOARD
-    from afspm.record.facts import read_facts
+    from afspm.record.run_json import read_run_json
 
-    url = url_in(read_facts(folder).get("processes"), folder, DASHBOARD)
+    url = url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
     if url is not None:
         typer.echo(f"this run has a dashboard already: {url}")
         return 0

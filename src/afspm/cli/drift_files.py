@@ -28,8 +28,8 @@ from afspm.errors import AfspmError, FileError, InvalidValue
 from afspm.files import FORMATS, FileContent, read
 from afspm.formatting import day_and_time
 from afspm.record.journal import JOURNAL_FILE
-from afspm.record.measured import SUFFIX as RECORDED
-from afspm.study.recorded import Series, series
+from afspm.record.measured_files import SUFFIX as RECORDED
+from afspm.study.scan_series import Series, series
 from afspm.study.workers import on_cores, processes
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from afspm.study import Grid, NightSettings, Outcome, Summary, night, on_cluster, on_cores, summarised
+from afspm.study import NightSettings, SettingsGrid, Summary, TaskOutcome, night, on_cluster, on_cores, summarised
 from afspm.study.summary import BY
 from afspm.study.workers import processes
 
@@ -39,7 +39,7 @@ def metrics_of(settings: NightSettings, seed: int) -> Mapping[str, float]:
 
 def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int | None) -> None:
     """Do a study and print it."""
-    combinations = dict(Grid.of(given).settings())
+    combinations = dict(SettingsGrid.of(given).settings())
     tasks = [(settings, seed + k) for k in range(nights) for settings in combinations.values()]
     here = processes(jobs, sum(settings.scans * settings.pixels**2 for settings, _ in tasks))
     labels = list(combinations)
@@ -55,7 +55,7 @@ def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int | 
     show(summarised(labels, metrics, failed), Console(file=sys.stdout, highlight=False))
 
 
-def _shown(outcomes: Iterator[Outcome], total: int) -> Iterator[Outcome]:
+def _shown(outcomes: Iterator[TaskOutcome], total: int) -> Iterator[TaskOutcome]:
     columns = (TextColumn("nights"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("nights", total=total)

@@ -71,11 +71,11 @@ def acting(where: Path) -> Iterator[Scope]:
 def about(follower: Follower, *, fancy: bool = True) -> About:
     """What is known of the run besides what it publishes."""
     from afspm.cli.telling import About
-    from afspm.record.facts import read_facts
+    from afspm.record.run_json import read_run_json
 
     clock = follower.launch.clock
     return About(
-        name=str(read_facts(follower.folder).get("name", follower.folder.name)),
+        name=str(read_run_json(follower.folder).get("name", follower.folder.name)),
         folder=str(follower.folder),
         simulated=follower.launch.simulated,
         began_ns=round(float(clock["start_s"]) * 1e9) if clock else None,
@@ -102,14 +102,14 @@ def say_nothing_runs(why: str) -> NoReturn:
 def _running(where: Path) -> Path:
     """The folder of the run that is meant, as far as it is not known to have ended."""
     from afspm.errors import FileError
-    from afspm.record.facts import ENDED, read_facts
+    from afspm.record.run_json import ENDED, read_run_json
     from afspm.runtime.connect import find_run
 
     try:
         folder = find_run(where)
     except FileError as error:
         say_nothing_runs(str(error))
-    ended = read_facts(folder).get(ENDED)
+    ended = read_run_json(folder).get(ENDED)
     if ended:
         say_nothing_runs(f"{folder.resolve().name} has ended ({ended})")
     return folder
@@ -118,17 +118,17 @@ def _running(where: Path) -> Path:
 @contextmanager
 def _only_if_running(folder: Path) -> Iterator[None]:
     from afspm.errors import ExperimentEnded, NoResponse
-    from afspm.record.facts import known_facts
-    from afspm.record.going_on import cut_off
+    from afspm.record.run_json import run_json_or_empty
+    from afspm.record.run_lock import cut_off_message
 
     try:
         yield
     except ExperimentEnded as error:
         say_nothing_runs(str(error))
     except NoResponse:
-        if told := cut_off(folder):
+        if told := cut_off_message(folder):
             say_nothing_runs(f"nobody answers in {folder.resolve().name}; {told}")
         said = f"nobody answers in {folder.resolve().name}, though it has not ended"
-        if (known_facts(folder).get("guest") or {}).get("keys"):
+        if (run_json_or_empty(folder).get("guest") or {}).get("keys"):
             said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
         say_nothing_runs(said)

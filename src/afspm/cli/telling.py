@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from afspm.clock import NS_PER_S
 from afspm.formatting import area, day_and_time, lasting, time_of_day
 from afspm.model import JournalEntry, LogLine, ProcessCondition, ProcessState, Region, ScopeState
-from afspm.record.lanes import Span
 from afspm.record.overview import OLD_S, OVER, Overview
+from afspm.record.timeline import Span
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -112,7 +112,7 @@ def _control(seen: Overview, now_ns: int) -> Text:
 def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
     """(number, name, since when and by whom) of each problem that is flagged."""
     for number in seen.control.problems if seen.control else ():
-        yield number, seen.problems.name(number), seen.problem_lanes[number].now
+        yield number, seen.problems.name(number), seen.problem_timelines[number].now
 
 
 def _problems(seen: Overview, now_ns: int) -> Iterator[Text]:

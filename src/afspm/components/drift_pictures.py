@@ -209,7 +209,7 @@ class DriftPictures(DriftTable):
     def _scan(self, told: Told) -> DriftScan:
         """As the microscope saved it, in tip coordinates."""
         from afspm.files import read
-        from afspm.study.recorded import drift_scan
+        from afspm.study.scan_series import drift_scan
 
         content = read(told.file)
         for scan in content.scans:

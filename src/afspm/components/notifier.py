@@ -21,7 +21,7 @@ from afspm.errors import ConfigError
 from afspm.formatting import lasting
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
-from afspm.record.facts import name_in
+from afspm.record.run_json import experiment_name
 from afspm.runtime.component import Component
 from afspm.units import Duration
 
@@ -117,7 +117,7 @@ class Notifier(Component):
             return
         self.log.warning("%s", text)
         run = Path(self.run_dir)
-        notice = Notice(what, name_in(run, run.name), str(run), self.clock.now_ns(), text, self.simulated)
+        notice = Notice(what, experiment_name(run, run.name), str(run), self.clock.now_ns(), text, self.simulated)
         new = [{"notice": dict(vars(notice)), "way": way, "tries": 0} for way in self.targets.ways]
         self.memory["waiting"] = [*self.memory["waiting"], *new][-MOST_WAITING:]
         self.memory["told"] = [*self.memory["told"], key][-MOST_TOLD:]

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from afspm.exit_codes import ExitCode
 from afspm.model import Frame
-from afspm.record.facts import EXPERIMENT_FILE, name_in
+from afspm.record.run_json import EXPERIMENT_FILE, experiment_name
 from afspm.runtime.component import Component
 from afspm.runtime.priority import step_back
 from afspm.transport.port import CaughtUp, Killed, PacketReceived, ParentGone
 
 if TYPE_CHECKING:
-    from afspm.record.store import About
+    from afspm.record.store import RecordSettings
     from afspm.runtime.process import Context
 
 REST_S = 0.5
@@ -86,19 +86,19 @@ class Recorder(Component):
             port.close()
 
 
-def _about(context: Context, run_dir: Path, *, scans: bool) -> About:
-    from afspm.record.store import About
+def _about(context: Context, run_dir: Path, *, scans: bool) -> RecordSettings:
+    from afspm.record.store import RecordSettings
 
     launch = context.launch
     frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
     facts: dict[str, Any] = {
-        "experiment": name_in(run_dir),
+        "experiment": experiment_name(run_dir),
         "run": run_dir.resolve().name,
         "simulated": launch.simulated,
         "seeds": _seeds(run_dir / EXPERIMENT_FILE),
         "frame": frame.value,
     }
-    return About(facts, context.problems, frame, measured=scans)
+    return RecordSettings(facts, context.problems, frame, measured=scans)
 
 
 def _seeds(file: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from afspm.errors import FileError
 from afspm.model import Packet
 from afspm.record import ahead
 from afspm.record.journal import JOURNAL_FILE, SCHEDULER, damaged, is_damage
-from afspm.record.store import About, Store
+from afspm.record.store import RecordSettings, RecordStore
 
 MOST_BYTES = 256 << 20
 """So much waits to be written at most; beyond it all is dropped, and taken from what others keep once there is room."""
@@ -58,7 +58,7 @@ class Writer:
         self,
         folder: Path,
         state: Path | None,
-        about: About,
+        about: RecordSettings,
         clock: Clock,
         log: logging.Logger,
         *,
@@ -152,7 +152,7 @@ class Writer:
             self._error = error
             self._wake()
 
-    def _record_all(self, store: Store) -> FileError | None:
+    def _record_all(self, store: RecordStore) -> FileError | None:
         """Record until it is over, or the journal turns out to be damaged: then it is said how."""
         try:
             while self._go_on(store):
@@ -166,11 +166,11 @@ class Writer:
                 store.close()
         return None
 
-    def _opened(self) -> Store | None:
+    def _opened(self) -> RecordStore | None:
         while True:
             try:
                 with self._step():
-                    return Store(self._folder, self._about)
+                    return RecordStore(self._folder, self._about)
             except DISK_ERRORS as error:
                 if not self._put_off(error):
                     return None
@@ -186,7 +186,7 @@ class Writer:
                 file.replace(self._folder / f"{JOURNAL_FILE}.damaged-{number}{suffix}")
         self._log.critical("%s; it is put aside, and a new one is begun", error)
 
-    def _go_on(self, store: Store) -> bool:
+    def _go_on(self, store: RecordStore) -> bool:
         """Record what has come; False: it is over."""
         batch, ending = self._next()
         if batch:
@@ -219,7 +219,7 @@ class Writer:
                 self._log.info("everything is recorded again")
             return batch, self._ending
 
-    def _record(self, store: Store, batch: list[_Item]) -> None:
+    def _record(self, store: RecordStore, batch: list[_Item]) -> None:
         for is_packet, items in groupby(batch, lambda item: item.packet is not None):
             if not is_packet:
                 held, self._held = self._held or [], None
@@ -229,7 +229,7 @@ class Writer:
             else:
                 self._take(store, list(items))
 
-    def _take_missed(self, store: Store, held: Iterable[_Item]) -> None:
+    def _take_missed(self, store: RecordStore, held: Iterable[_Item]) -> None:
         """What was published while nobody listened: written ahead by the scheduler, or kept by it."""
         found = heapq.merge(self._written_ahead(), sorted(held, key=_time), key=_time)
         for items in _some_at_a_time(found):
@@ -243,7 +243,7 @@ class Writer:
         found = (ahead.written_ahead(folder, since_ns) for folder in ahead.folders(self._state))
         return (_Item(written.packet) for written in chain.from_iterable(found))
 
-    def _take(self, store: Store, items: list[_Item]) -> None:
+    def _take(self, store: RecordStore, items: list[_Item]) -> None:
         self._safely(lambda: store.take((item.packet, item.source) for item in items if item.packet))
 
     def _safely(self, do: Callable[[], None]) -> None:
@@ -276,7 +276,7 @@ class Writer:
             self._changed.wait_for(lambda: False, AGAIN_S if self._ending is None else AGAIN_S / 10)
             return self._ending is None or self._clock.monotonic_s() < self._until_s
 
-    def _end(self, store: Store, *, ended: bool) -> None:
+    def _end(self, store: RecordStore, *, ended: bool) -> None:
         self._record(store, [_Item(None)])
         self._safely(store.finish if ended else store.flush)
         if ended:
@@ -285,7 +285,7 @@ class Writer:
         if ended:
             store.settle()
 
-    def _say(self, store: Store, *, now: bool) -> None:
+    def _say(self, store: RecordStore, *, now: bool) -> None:
         """Say up to when everything is recorded, to those who keep it until then."""
         if self._state is None or self._held is not None or self._missed:
             return

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from afspm.errors import FileError
-from afspm.record.whole import ToldOnce
+from afspm.storage.atomic import OutageLog
 
 _log = logging.getLogger("afspm.records")
 
@@ -29,7 +29,7 @@ class LineFile:
         self._header = header
         self._is_open = False
         self._waiting = ""
-        self._told = ToldOnce("lines wait to be written", _log)
+        self._told = OutageLog("lines wait to be written", _log)
 
     def lines(self) -> list[str]:
         """What is there, the header not counted; without a last line that is not whole.

@@ -8,7 +8,7 @@ from typing import Any
 
 from afspm.errors import AfspmError
 from afspm.model import Region
-from afspm.record.facts import EXPERIMENT_FILE
+from afspm.record.run_json import EXPERIMENT_FILE
 from afspm.units import si
 
 

@@ -203,7 +203,7 @@ def _problems(overview: Overview) -> tuple[tuple[int, str, str], ...]:
     flagged = overview.control.problems if overview.control else ()
     found = []
     for number in flagged:
-        now = overview.problem_lanes[number].now if number in overview.problem_lanes else None
+        now = overview.problem_timelines[number].now if number in overview.problem_timelines else None
         found.append((number, overview.problems.name(number), now.by if now else ""))
     return tuple(found)
 

@@ -15,8 +15,8 @@ from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
 from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.watch import Watch
 from afspm.errors import ConfigError
-from afspm.record.facts import name_in
-from afspm.record.going_on import cut_off
+from afspm.record.run_json import experiment_name
+from afspm.record.run_lock import cut_off_message
 from afspm.runtime.component import Component
 from afspm.runtime.priority import step_back
 
@@ -80,14 +80,14 @@ class Dashboard(Component):
         bound = listening(self._host, self._port or None, self._usual_ports())
         archive = Archive(self.run_dir if launch.run_dir else None)
         problems = self._context.problems
-        self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off(self.run_dir))
+        self._watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
         self._steering = Steering(launch, self.clock, self._watch, access)
         app, self._farewell = application(
             self._watch,
             self._steering,
             access,
             archive,
-            title=name_in(self.run_dir, "afspm"),
+            title=experiment_name(self.run_dir, "afspm"),
             limits=allowed_region(self.run_dir),
             simulated=self.simulated,
             host=self._host,

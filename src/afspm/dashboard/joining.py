@@ -13,7 +13,7 @@ from types import FrameType
 from afspm.clock import ExperimentClock
 from afspm.dashboard.dashboard import Dashboard
 from afspm.errors import FileError
-from afspm.record.facts import STATE_DIR
+from afspm.record.run_json import STATE_DIR
 from afspm.runtime.connect import guest_of
 from afspm.runtime.memory import Memory
 from afspm.runtime.messages import register_all

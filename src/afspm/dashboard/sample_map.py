@@ -12,7 +12,7 @@ from afspm.dashboard.plots import round_ticks
 from afspm.dashboard.words import area, escape, scale
 from afspm.formatting import time_of_day
 from afspm.model import Region
-from afspm.record.overview import ScanTaken, SpectrumTaken
+from afspm.record.overview import ScanSummary, SpectrumSummary
 
 MOST_PLACES = 1500
 _MARGIN = 0.06
@@ -31,8 +31,8 @@ class MapContent:
         shown: (time, channel) of the scan in the image; None: the newest.
     """
 
-    scans: Sequence[ScanTaken] = ()
-    spectra: Sequence[SpectrumTaken] = ()
+    scans: Sequence[ScanSummary] = ()
+    spectra: Sequence[SpectrumSummary] = ()
     current: Region | None = None
     limits: Region | None = None
     tip_to_sample: Array | None = None
@@ -69,9 +69,9 @@ def map_html(content: MapContent, *, whole: bool = True) -> str:
     )
 
 
-def places_of(scans: Sequence[ScanTaken]) -> tuple[list[tuple[ScanTaken, int]], int]:
+def places_of(scans: Sequence[ScanSummary]) -> tuple[list[tuple[ScanSummary, int]], int]:
     """([(newest scan, how many there are) for each place], how many older places are left out); large ones first."""
-    found: dict[tuple[int, ...], tuple[ScanTaken, int]] = {}
+    found: dict[tuple[int, ...], tuple[ScanSummary, int]] = {}
     seen: dict[tuple[int, ...], int] = {}
     for scan in scans:
         key = _place(scan.region)
@@ -107,8 +107,8 @@ class _Frame:
 
 def _frame(
     content: MapContent,
-    places: Sequence[tuple[ScanTaken, int]],
-    spectra: Sequence[SpectrumTaken],
+    places: Sequence[tuple[ScanSummary, int]],
+    spectra: Sequence[SpectrumSummary],
     *,
     whole: bool,
 ) -> _Frame | None:
@@ -150,7 +150,7 @@ def _polygon(frame: _Frame, corners_m: Array, style: str, inside: str = "", data
     return f'<polygon class="{style}" points="{points}"{data}>{inside}</polygon>'
 
 
-def _scan(frame: _Frame, one: ScanTaken, count: int, shown: tuple[int, str] | None) -> str:
+def _scan(frame: _Frame, one: ScanSummary, count: int, shown: tuple[int, str] | None) -> str:
     often = f", {count} scans" if count > 1 else ""
     cut = ", interrupted" if one.interrupted else ""
     who = f" by {one.holder}" if one.holder else ""
@@ -160,7 +160,7 @@ def _scan(frame: _Frame, one: ScanTaken, count: int, shown: tuple[int, str] | No
     return _polygon(frame, one.region.corners_m(), style, f"<title>{escape(title)}</title>", data)
 
 
-def _spectrum(frame: _Frame, one: SpectrumTaken) -> str:
+def _spectrum(frame: _Frame, one: SpectrumSummary) -> str:
     assert one.position_m is not None
     x, y = frame.at(one.position_m)
     title = escape(f"{one.kind or 'spectrum'} at {time_of_day(one.time_ns)}")
@@ -186,7 +186,7 @@ def _ticks(frame: _Frame) -> str:
     return f'{"".join(parts)}<span class="map-unit">{unit}</span>'
 
 
-def _keys(content: MapContent, spectra: Sequence[SpectrumTaken], *, whole: bool) -> str:
+def _keys(content: MapContent, spectra: Sequence[SpectrumSummary], *, whole: bool) -> str:
     keys = {
         "scan": ("scans; click one to see it", bool(content.scans)),
         "current": ("set now", content.current is not None),

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from afspm.record.whole import replace
+from afspm.storage.atomic import replace_file
 
 COOKIE = "afspm_dashboard"
 REMEMBERED_S = 30 * 24 * 3600
@@ -90,7 +90,7 @@ class Sessions:
         if self._file is not None:
             text = json.dumps([asdict(session) for session in self._sessions.values()])
             with contextlib.suppress(OSError):  # on a full disk they end with this process
-                replace(self._file, [text.encode()], mode=0o600)
+                replace_file(self._file, [text.encode()], mode=0o600)
 
 
 def _read(file: Path | None) -> dict[str, Session]:

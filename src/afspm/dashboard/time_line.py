@@ -9,7 +9,7 @@ from types import MappingProxyType
 from afspm.clock import NS_PER_S
 from afspm.dashboard.words import colour_class, escape
 from afspm.formatting import lasting, time_of_day
-from afspm.record.overview import Lane, Overview, Span
+from afspm.record.overview import Overview, Span, Timeline
 
 NOT_HEARD_OF = "not heard of"
 COLUMNS = 720  # stretches narrower than this part of the run are put together
@@ -32,16 +32,16 @@ def rows_of(overview: Overview, unheard: Mapping[str, int]) -> list[Row]:
         Row("mode", overview.modes.spans, lambda label: f"mode-{label}"),
         Row("microscope", overview.states.spans, lambda label: f"state-{label.replace('_', '-')}"),
     ]
-    for number, lane in sorted(overview.problem_lanes.items()):
+    for number, lane in sorted(overview.problem_timelines.items()):
         if lane.spans:
             rows.append(Row(overview.problems.name(number), lane.spans, lambda label: "problem"))
-    for name, lane in overview.process_lanes.items():
+    for name, lane in overview.process_timelines.items():
         spans = _as_last_told(lane, overview.processes_told_ns[name]) if name in unheard else lane.spans
         rows.append(Row(name, spans, lambda label: f"process-{label.replace(' ', '-')}"))
     return rows
 
 
-def _as_last_told(lane: Lane, told_ns: int) -> Iterator[Span]:
+def _as_last_told(lane: Timeline, told_ns: int) -> Iterator[Span]:
     """What was so until it was told of last; since then nobody knows."""
     for span in lane.spans:
         yield replace(span, end_ns=max(told_ns, span.start_ns)) if span.end_ns is None else span

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from afspm.model import Packet
 from afspm.record.segments import SUFFIX, Segment, Written, number_of, read, segments
-from afspm.record.whole import replace
+from afspm.storage.atomic import replace_file
 
 __all__ = ["Ahead", "Written", "expect_record", "folders", "recorded_until", "say_recorded", "written_ahead"]
 
@@ -139,7 +139,7 @@ def expect_record(state_dir: Path) -> None:
 
 def say_recorded(file: Path, time_ns: int) -> None:
     """Everything up to that time is in the record, and on disk. Raises OSError."""
-    replace(file, [f"{time_ns}\n".encode("ascii")], synced=False)
+    replace_file(file, [f"{time_ns}\n".encode("ascii")], synced=False)
 
 
 def written_ahead(folder: Path, since_ns: int = -1) -> Iterator[Written]:

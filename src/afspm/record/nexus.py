@@ -36,7 +36,7 @@ _SHOWN = ("in_control", "mode", "interrupted", "number", "run")
 
 
 @dataclass(frozen=True)
-class Circumstances:
+class FileProvenance:
     """How things stood, as far as that is known.
 
     Attributes:
@@ -51,7 +51,7 @@ class Circumstances:
     header: Mapping[str, Any] = field(default_factory=dict)
 
 
-def encode_scan(scans: Sequence[Scan], circumstances: Circumstances) -> bytes:
+def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
     """All channels of one scan, of the same region and shape, as a file. Needs h5py."""
     first, fields = scans[0], field_names((scan.channel for scan in scans), ("x", "y"))
     region = first.region
@@ -82,7 +82,7 @@ def encode_scan(scans: Sequence[Scan], circumstances: Circumstances) -> bytes:
     return _encoded(about, circumstances, fill)
 
 
-def encode_spectrum(spectrum: Spectrum, circumstances: Circumstances) -> bytes:
+def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
     """One spectrum as a file. Needs h5py."""
     fields = field_names(spectrum.names)
     about = _about("spectrum", spectrum.filename, circumstances) | {
@@ -120,7 +120,7 @@ def facts_of(path: Path) -> dict[str, Any]:
         return about_of(file)
 
 
-def _encoded(about: dict[str, Any], circumstances: Circumstances, fill: Any) -> bytes:
+def _encoded(about: dict[str, Any], circumstances: FileProvenance, fill: Any) -> bytes:
     """Made in memory: whatever is wrong with the disk is then found in one place, where the bytes are written."""
     import h5py
 
@@ -150,7 +150,7 @@ def _encoded(about: dict[str, Any], circumstances: Circumstances, fill: Any) -> 
     return image
 
 
-def _about(content: str, filename: str, circumstances: Circumstances) -> dict[str, Any]:
+def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[str, Any]:
     return {
         **circumstances.facts,
         "content": content,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from afspm.formatting import from_to, time_of_day
 from afspm.model import names
-from afspm.record.night_record import BAD, Mark, NightRecord, Shot, Span
+from afspm.record.night_record import BAD, NightMark, NightRecord, Shot, Span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -190,7 +190,7 @@ def flagged_by(record: NightRecord, span: Span) -> str:
 
 def _actions(ax: Axes, record: NightRecord, lanes: Mapping[str, int], limits: tuple[int, int]) -> None:
     for action, marker in ((names.PULSE, "v"), (names.CRASH, "X")):
-        done: list[Mark] = [m for m in record.marks if m.what == action and limits[0] <= m.time_ns <= limits[1]]
+        done: list[NightMark] = [m for m in record.marks if m.what == action and limits[0] <= m.time_ns <= limits[1]]
         if done:
             at = [lanes.get(m.by, 0) for m in done]
             label = action.removeprefix("x-")

@@ -38,7 +38,7 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Mark:
+class NightMark:
     """Something that a component did or said at a moment: an action, or a verdict on the scan of `of_ns`."""
 
     time_ns: int
@@ -58,7 +58,7 @@ class NightRecord:
 
     shots: list[Shot] = field(default_factory=list)
     control: list[tuple[int, ControlState]] = field(default_factory=list)
-    marks: list[Mark] = field(default_factory=list)
+    marks: list[NightMark] = field(default_factory=list)
     interruptions: list[int] = field(default_factory=list)
     end_ns: int = 0
     scans_taken: int | None = None
@@ -89,7 +89,7 @@ class NightRecord:
             state = ControlState(ControlMode(entry["mode"]), entry["holder"], tuple(entry["problems"]))
             self.control.append((time_ns, state))
         elif kind == "mark":
-            self.marks.append(Mark(time_ns, entry["by"], entry["what"], entry["score"], entry["of_ns"]))
+            self.marks.append(NightMark(time_ns, entry["by"], entry["what"], entry["score"], entry["of_ns"]))
         elif kind == "interrupted":
             self.interruptions.append(time_ns)
         else:

@@ -36,10 +36,19 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.model.geometry import XY
-from afspm.record.lanes import Lane, Span
-from afspm.record.running import DoneScan, RunningScan
+from afspm.record.running_scan import DoneScan, RunningScan
+from afspm.record.timeline import Span, Timeline
 
-__all__ = ["DriftPoint", "Lane", "Overview", "Restart", "RunningScan", "ScanTaken", "Span", "SpectrumTaken"]
+__all__ = [
+    "DriftPoint",
+    "Timeline",
+    "Overview",
+    "ProcessRestart",
+    "RunningScan",
+    "ScanSummary",
+    "Span",
+    "SpectrumSummary",
+]
 
 MOST_LINES = 2_000
 MOST_ENTRIES = 5_000
@@ -53,7 +62,7 @@ NOBODY = None
 
 
 @dataclass(frozen=True, slots=True)
-class ScanTaken:
+class ScanSummary:
     """One channel of a scan, without its values.
 
     Attributes:
@@ -76,7 +85,7 @@ class ScanTaken:
 
 
 @dataclass(frozen=True, slots=True)
-class SpectrumTaken:
+class SpectrumSummary:
     """A spectrum, without its values. `position_m` is (x, y) in `frame`; None if it is not known."""
 
     time_ns: int
@@ -111,7 +120,7 @@ class DriftPoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Restart:
+class ProcessRestart:
     """A process was started anew: the `starts`-th time, after it had ended as `last_exit` says."""
 
     time_ns: int
@@ -135,7 +144,7 @@ class Overview:
         processes, told_progress: by name; `processes_told_ns`: when each process was told of last.
         log, entries, refusals: newest last, bounded.
         controls: lane of who was in control; `modes`, `states`: lanes of mode and scope state, in lower case.
-        problem_lanes: by number; `process_lanes`: by name. A process that is busy counts as alive.
+        problem_timelines: by number; `process_timelines`: by name. A process that is busy counts as alive.
         running: the scan that is being taken; None if none is.
     """
 
@@ -153,24 +162,24 @@ class Overview:
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
         self.refusals: deque[JournalEntry] = deque(maxlen=most_entries)
-        self.controls, self.modes, self.states = Lane(), Lane(), Lane()
-        self.problem_lanes: defaultdict[int, Lane] = defaultdict(Lane)
-        self.process_lanes: defaultdict[str, Lane] = defaultdict(Lane)
-        self.restarts: deque[Restart] = deque(maxlen=most_entries)
+        self.controls, self.modes, self.states = Timeline(), Timeline(), Timeline()
+        self.problem_timelines: defaultdict[int, Timeline] = defaultdict(Timeline)
+        self.process_timelines: defaultdict[str, Timeline] = defaultdict(Timeline)
+        self.restarts: deque[ProcessRestart] = deque(maxlen=most_entries)
         self.running: RunningScan | None = None
         self._done: deque[DoneScan] = deque(maxlen=20)
-        self._scans: dict[tuple[object, ...], ScanTaken] = {}
-        self._spectra: dict[tuple[object, ...], SpectrumTaken] = {}
+        self._scans: dict[tuple[object, ...], ScanSummary] = {}
+        self._spectra: dict[tuple[object, ...], SpectrumSummary] = {}
         self._drift: dict[int, DriftPoint] = {}
         self._taken_ns: dict[str, int] = {}
 
     @property
-    def scans(self) -> Sequence[ScanTaken]:
+    def scans(self) -> Sequence[ScanSummary]:
         """One for each channel of each scan, in the order in which they came."""
         return tuple(self._scans.values())
 
     @property
-    def spectra(self) -> Sequence[SpectrumTaken]:
+    def spectra(self) -> Sequence[SpectrumSummary]:
         """In the order in which they came."""
         return tuple(self._spectra.values())
 
@@ -241,7 +250,7 @@ class Overview:
     def _take_interrupted(self, running: RunningScan, time_ns: int) -> None:
         for channel, lines in running.channels.items():
             self._add_scan(
-                ScanTaken(
+                ScanSummary(
                     time_ns, running.began_ns, channel, lines.unit, lines.region, lines.shape,
                     holder=running.holder, interrupted=True,
                 )
@@ -256,18 +265,18 @@ class Overview:
         if self.running is not None:
             began_ns, holder = self.running.began_ns, self.running.holder
         self._add_scan(
-            ScanTaken(
+            ScanSummary(
                 scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename,
                 holder,
             )
         )  # fmt: skip
 
-    def _add_scan(self, taken: ScanTaken) -> None:
+    def _add_scan(self, taken: ScanSummary) -> None:
         _keep(self._scans, (taken.time_ns, taken.channel, taken.region, taken.interrupted), taken)
 
     def _take_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
         taken_ns, holder = spectrum.time_ns or time_ns, self.control.holder if self.control else None
-        taken = SpectrumTaken(
+        taken = SpectrumSummary(
             taken_ns, spectrum.kind, spectrum.position_m, spectrum.frame, spectrum.names, spectrum.units,
             spectrum.filename, holder,
         )  # fmt: skip
@@ -277,8 +286,8 @@ class Overview:
         self.control = control
         self.controls.change(control.holder or NOBODY, time_ns)
         self.modes.change(control.mode.name.lower() if control.mode is not ControlMode.UNDEFINED else None, time_ns)
-        for number in {*control.problems, *self.problem_lanes}:
-            lane = self.problem_lanes[number]
+        for number in {*control.problems, *self.problem_timelines}:
+            lane = self.problem_timelines[number]
             if number in control.problems and lane.now is None:
                 lane.change(self.problems.name(number), time_ns, by=self._flagger(number, time_ns))
             elif number not in control.problems:
@@ -305,7 +314,7 @@ class Overview:
                 continue
             if entry.kind == "control":
                 self._take_change(entry)
-            for number, lane in self.problem_lanes.items():
+            for number, lane in self.problem_timelines.items():
                 # the batch comes a moment after the control state that it explains
                 is_near = bool(lane.spans) and abs(lane.spans[-1].start_ns - entry.time_ns) <= SOON_NS
                 if is_near and self._flags(entry, number):
@@ -322,7 +331,7 @@ class Overview:
             self.modes.change(rest.lower(), entry.time_ns)
         elif verb in ("flagged", "cleared") and rest in self.problems:
             label = self.problems.name(self.problems[rest]) if verb == "flagged" else None
-            self.problem_lanes[self.problems[rest]].change(label, entry.time_ns, by=entry.who)
+            self.problem_timelines[self.problems[rest]].change(label, entry.time_ns, by=entry.who)
 
     def _take_processes(self, states: ProcessStates, time_ns: int) -> None:
         for state in states.processes:
@@ -331,10 +340,10 @@ class Overview:
             condition = state.condition
             if condition is ProcessCondition.BUSY:
                 condition = ProcessCondition.ALIVE
-            lane = self.process_lanes[state.name]
+            lane = self.process_timelines[state.name]
             lane.change(condition.name.lower().replace("_", " "), max(state.since_ns, lane.changed_ns or 0))
             if state.starts > (before.starts if before else 1):
-                self.restarts.append(Restart(state.since_ns, state.name, state.starts, state.last_exit))
+                self.restarts.append(ProcessRestart(state.since_ns, state.name, state.starts, state.last_exit))
 
     def _take_progress(self, progress: Progress, time_ns: int) -> None:
         self.told_progress[progress.name] = progress

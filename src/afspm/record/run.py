@@ -26,8 +26,8 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record import journal
-from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, REPLAY_OF, known_facts
 from afspm.record.packets import packets, without_reading_files
+from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, REPLAY_OF, run_json_or_empty
 from afspm.record.tables import ControlRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class Run:
     @property
     def problems(self) -> Table[ProblemRow]:
         """Each time that a problem was flagged."""
-        lanes = self.overview().problem_lanes
+        lanes = self.overview().problem_timelines
         rows = [
             ProblemRow(span.label, number, span.start_ns, span.end_ns, span.by)
             for number, lane in lanes.items()
@@ -213,7 +213,7 @@ class Run:
     @property
     def facts(self) -> dict[str, Any]:
         """run.json: clock, addresses, how it ended. Empty if it can't be read."""
-        return known_facts(self.folder)
+        return run_json_or_empty(self.folder)
 
     @property
     def name(self) -> str:
@@ -297,7 +297,7 @@ def _folder(path: Path) -> Path:
     latest = path / LATEST_FILE
     if not (path / journal.JOURNAL_FILE).is_file() and latest.is_file():
         path = path / latest.read_text(encoding="utf-8").strip()
-    replayed = None if (path / journal.JOURNAL_FILE).is_file() else known_facts(path).get(REPLAY_OF)
+    replayed = None if (path / journal.JOURNAL_FILE).is_file() else run_json_or_empty(path).get(REPLAY_OF)
     return Path(replayed) if isinstance(replayed, str) else path
 
 

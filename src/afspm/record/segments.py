@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from afspm.model import Packet
-from afspm.record.disk import SYNCER
+from afspm.storage.disk import SYNCER
 
 SUFFIX = ".packets"
 _HEAD = struct.Struct("<4sQIIqqBQ")

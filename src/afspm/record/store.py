@@ -1,4 +1,4 @@
-"""`Store`: writes the record of a run: the journal, and a file for each scan and spectrum.
+"""`RecordStore`: writes the record of a run: the journal, and a file for each scan and spectrum.
 
 What is given in one call is recorded as a whole or not at all, and nothing is there twice, however often it is given:
 files are written aside and renamed before the journal names them, in one transaction.
@@ -29,11 +29,11 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
-from afspm.record import circumstances, journal
-from afspm.record.disk import sync_file, sync_folder
-from afspm.record.gathering import Gathering, Taken
+from afspm.record import journal, provenance
 from afspm.record.journal import SCHEDULER
-from afspm.record.measured import MeasuredFiles, insert_packet
+from afspm.record.measured_files import MeasuredFiles, insert_packet
+from afspm.record.scan_assembler import Assembled, ScanAssembler
+from afspm.storage.disk import sync_file, sync_folder
 from afspm.wire.values import without_values
 
 _log = logging.getLogger("afspm.record")
@@ -43,7 +43,7 @@ _PROCESS = "SELECT role, condition, since_ns, starts, pid, last_exit FROM proces
 
 
 @dataclass(frozen=True)
-class About:
+class RecordSettings:
     """What is so of the whole run.
 
     Attributes:
@@ -58,7 +58,7 @@ class About:
     measured: bool = True
 
 
-class Store:
+class RecordStore:
     """The record of one run.
 
     Args:
@@ -69,7 +69,7 @@ class Store:
         sqlite3.OperationalError: the disk is full …
     """
 
-    def __init__(self, folder: Path, about: About = About()) -> None:
+    def __init__(self, folder: Path, about: RecordSettings = RecordSettings()) -> None:
         self._folder = folder
         self._about = about
         self._journal = journal.open_to_write(folder)
@@ -81,9 +81,9 @@ class Store:
                 raise journal.damaged(folder / journal.JOURNAL_FILE, error) from error
             raise
 
-    def _begin(self, about: About) -> None:
+    def _begin(self, about: RecordSettings) -> None:
         self._files = MeasuredFiles(self._folder, self._journal, about.facts, about.problems)
-        self._gathering = Gathering(circumstances.last_state(self._journal))
+        self._gathering = ScanAssembler(provenance.last_state(self._journal))
         newest = self._journal.execute("SELECT max(time_ns) FROM packets WHERE source = ?", (SCHEDULER,)).fetchone()[0]
         self._newest_ns = -1 if newest is None else int(newest)
         for name, value in about.facts.items():
@@ -188,7 +188,7 @@ class Store:
             case LogLines():
                 self._add_log(thing)
 
-    def _write(self, taken: Iterable[Taken]) -> None:
+    def _write(self, taken: Iterable[Assembled]) -> None:
         for one in taken:
             self._journal.execute("SAVEPOINT measured")
             try:
@@ -201,7 +201,7 @@ class Store:
                 _log.error("no file can be made of what was measured, its packets are kept as they are: %s", error)
             self._journal.execute("RELEASE measured")
 
-    def _keep(self, taken: Taken) -> None:
+    def _keep(self, taken: Assembled) -> None:
         """Packets whole, with their values, since there is no file that has them."""
         for packet in taken.packets():
             insert_packet(self._journal, packet, wire.message_of(packet.envelope), bytes(packet.payload))

@@ -12,8 +12,8 @@ from typing import Any
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError, FileError, NoResponse
 from afspm.model import Frame, ProblemNames
-from afspm.record.facts import LATEST_FILE, RUN_FILE, STATE_DIR, known_facts, read_facts
-from afspm.record.going_on import cut_off
+from afspm.record.run_json import LATEST_FILE, RUN_FILE, STATE_DIR, read_run_json, run_json_or_empty
+from afspm.record.run_lock import cut_off_message
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link
 from afspm.runtime.messages import register_all
@@ -60,7 +60,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     )
     try:
         if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
-            hint = cut_off(folder) or "is the experiment still running?"
+            hint = cut_off_message(folder) or "is the experiment still running?"
             raise NoResponse("nobody is there", where=str(folder), hint=hint)
         frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
         scope = Scope(link, ProblemNames(launch.problems), folder / STATE_DIR, frame=frame)
@@ -88,7 +88,7 @@ def guest_of(folder: Path, name: str) -> Launch:
     """
     if not (folder / RUN_FILE).exists():
         raise FileError("there is no run in this folder", where=str(folder), hint="name a folder with a run.json")
-    guest = read_facts(folder).get(GUEST)
+    guest = read_run_json(folder).get(GUEST)
     if not isinstance(guest, dict):
         raise ConfigError(
             "this part of the experiment has no component that could be joined",
@@ -138,13 +138,13 @@ def find_run(where: Path) -> Path:
 def _newest(runs: Path, name: str, file: Path) -> Path | None:
     """The newest run of the experiment `name` in the folder `runs`."""
     name = _name_in(file) or name
-    found = [run for run in runs.glob(f"*/{RUN_FILE}") if known_facts(run.parent).get("name") == name]
+    found = [run for run in runs.glob(f"*/{RUN_FILE}") if run_json_or_empty(run.parent).get("name") == name]
     return max(found, key=_started).parent if found else None
 
 
 def _started(run: Path) -> tuple[float, int]:
     """By what the newest run is found: when its clock was set, else when its facts were written."""
-    clock = known_facts(run.parent).get("clock") or {}
+    clock = run_json_or_empty(run.parent).get("clock") or {}
     return float(clock.get("origin_s", 0.0)), run.stat().st_mtime_ns
 
 

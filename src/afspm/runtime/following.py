@@ -11,8 +11,8 @@ from afspm import wire
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import Packet, ProblemNames
-from afspm.record.going_on import cut_off
 from afspm.record.overview import Overview
+from afspm.record.run_lock import cut_off_message
 from afspm.runtime.connect import guest_of
 from afspm.runtime.launch import Launch
 from afspm.runtime.link import Link
@@ -95,7 +95,7 @@ class Follower:
 
     def cut_off(self) -> str:
         """What to say if nobody runs it any more; empty if somebody does, or it has ended."""
-        return cut_off(self.folder)
+        return cut_off_message(self.folder)
 
     def close(self) -> None:
         """Look away."""

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import InvalidValue
-from afspm.record.disk import DEADLINE_S, Disk
-from afspm.record.whole import Generations, ToldOnce, load, write_whole
+from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint, write_atomic
+from afspm.storage.disk import DEADLINE_S, DiskThread
 
 SYNCED_WITHIN_S = 5.0
 """So long a disk is waited for, whose every answer matters. One that hangs is full for all that one knows."""
@@ -35,13 +35,13 @@ class Memory(MutableMapping[str, Any]):
 
     def __init__(self, path: Path | None, *, synced: bool = True) -> None:
         self._path = path
-        self._generations = Generations(path) if path and not synced else None
-        self._disk = Disk(SYNCED_WITHIN_S if synced else DEADLINE_S)
-        self._told = ToldOnce("a restart would not know what was done until now", _log)
+        self._generations = CheckpointFile(path) if path and not synced else None
+        self._disk = DiskThread(SYNCED_WITHIN_S if synced else DEADLINE_S)
+        self._told = OutageLog("a restart would not know what was done until now", _log)
         self.damage = ""
         self._values: dict[str, Any] = {}
         if path is not None:
-            values, self.damage = load(path, _read)
+            values, self.damage = load_checkpoint(path, _read)
             self._values = values or {}
         self._saved = json.dumps(self._values, ensure_ascii=False)
 
@@ -69,7 +69,7 @@ class Memory(MutableMapping[str, Any]):
             if (generations := self._generations) is not None:
                 self._disk.run(lambda: generations.save(text.encode()))
             elif (path := self._path) is not None:
-                self._disk.run(lambda: write_whole(path, [text.encode(), b"\n"]))
+                self._disk.run(lambda: write_atomic(path, [text.encode(), b"\n"]))
             self._saved = text
             return True
         return False

@@ -14,8 +14,8 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
-from afspm.record.whole import ToldOnce, write_whole
 from afspm.runtime.memory import Memory
+from afspm.storage.atomic import OutageLog, write_atomic
 
 _log = logging.getLogger("afspm.memory")
 _MAGIC = b"afspm-result-1\n"
@@ -46,7 +46,7 @@ class Results:
 
     def __init__(self, folder: Path | None, name: str) -> None:
         self._folder = folder / f"{name}.results" if folder else None
-        self._told = ToldOnce("what is measured can't be kept", _log)
+        self._told = OutageLog("what is measured can't be kept", _log)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
     @property
@@ -87,7 +87,7 @@ class Results:
                 message, payload = wire.encode(thing)
                 parts += [*_framed(message.encode()), *_framed(payload)]
             with self._told.trying():
-                write_whole(path, parts)
+                write_atomic(path, parts)
         self._memory.pop("pending", None)
         self._memory.save()
 

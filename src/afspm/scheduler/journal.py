@@ -16,7 +16,7 @@ from pathlib import Path
 from afspm.clock import Clock
 from afspm.model import Packet
 from afspm.record.ahead import FOLDER_SUFFIX, RECORDED_FILE, Ahead, written_ahead
-from afspm.record.whole import replace
+from afspm.storage.atomic import replace_file
 
 _PERIOD_S = 0.05
 _TIDY_S = 2.0  # where all is written, and only what is no longer cached is still to be deleted
@@ -191,7 +191,7 @@ def _store(file: Path, packet: Packet, source_ns: int | None) -> None:
         "source_ns": source_ns,
         "bytes": len(packet.payload),
     }
-    replace(file, [json.dumps(about).encode() + b"\n", packet.payload], synced=False)
+    replace_file(file, [json.dumps(about).encode() + b"\n", packet.payload], synced=False)
 
 
 def _read(file: Path) -> Entry | None:

@@ -12,8 +12,8 @@ from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
 from afspm.model import HAS_ENDED, TELL_REQUEST, ControlRequest, ControlResponse, Packet, Request, Response
-from afspm.record.disk import DEADLINE_S, SYNCER, Disk
-from afspm.record.whole import ToldOnce
+from afspm.storage.atomic import OutageLog
+from afspm.storage.disk import DEADLINE_S, SYNCER, DiskThread
 from afspm.transport.fair_queue import FairQueue
 from afspm.transport.hold_back import STATE, HoldBack
 from afspm.transport.polling import milliseconds
@@ -77,8 +77,8 @@ class SchedulerShell:
         self._clock = clock
         self._state = state
         self._journal = journal
-        self._disk = Disk()
-        self._told = ToldOnce("what is told now would be lost in a crash", log)
+        self._disk = DiskThread()
+        self._told = OutageLog("what is told now would be lost in a crash", log)
         self._problems: frozenset[str] = frozenset()
         self._complaints = complaints
         self._log = log

@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from afspm.record.whole import Generations, ToldOnce, load
+from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint
 
 
 class StateFile:
@@ -19,9 +19,9 @@ class StateFile:
 
     def __init__(self, path: Path | None, log: logging.Logger) -> None:
         self.path = path
-        self._generations = None if path is None else Generations(path)
+        self._generations = None if path is None else CheckpointFile(path)
         self._log = log
-        self._told = ToldOnce("a restart would not know what is in force now", log)
+        self._told = OutageLog("a restart would not know what is in force now", log)
 
     def load(self) -> dict[str, Any]:
         """What was saved last; empty if nothing was.
@@ -34,7 +34,7 @@ class StateFile:
         """
         if self.path is None:
             return {}
-        state, damage = load(self.path, _read)
+        state, damage = load_checkpoint(self.path, _read)
         if state is None:
             return {}
         if damage:

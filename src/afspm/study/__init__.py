@@ -6,10 +6,20 @@ metrics = night(settings, seed=1)
 
 from __future__ import annotations
 
-from afspm.study.grid import Grid
-from afspm.study.night import Night, night
+from afspm.study.grid import SettingsGrid
+from afspm.study.night import SimulatedNight, night
 from afspm.study.settings import NightSettings
 from afspm.study.summary import Summary, summarised
-from afspm.study.workers import Outcome, on_cluster, on_cores
+from afspm.study.workers import TaskOutcome, on_cluster, on_cores
 
-__all__ = ["Grid", "Night", "NightSettings", "Outcome", "Summary", "night", "on_cluster", "on_cores", "summarised"]
+__all__ = [
+    "SettingsGrid",
+    "SimulatedNight",
+    "NightSettings",
+    "TaskOutcome",
+    "Summary",
+    "night",
+    "on_cluster",
+    "on_cores",
+    "summarised",
+]

@@ -14,7 +14,7 @@ from afspm.study.settings import PARTS, NightSettings
 
 
 @dataclass(frozen=True)
-class Grid:
+class SettingsGrid:
     """Every combination of the values.
 
     Attributes:
@@ -25,7 +25,7 @@ class Grid:
     values: Mapping[str, tuple[Any, ...]]
 
     @classmethod
-    def of(cls, given: Sequence[str]) -> Grid:
+    def of(cls, given: Sequence[str]) -> SettingsGrid:
         """From a command line: files ending in .toml, and NAME=VALUE[,VALUE…], which go on top of them.
 
         Raises:

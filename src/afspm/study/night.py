@@ -26,7 +26,7 @@ _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two co
 
 
 @dataclass(frozen=True, eq=False)
-class Night:
+class SimulatedNight:
     """What came of it. "Misplaced" is how far off its place on the sample a scan was taken.
 
     Attributes:
@@ -70,7 +70,7 @@ class Night:
         }
 
 
-def night(settings: NightSettings, seed: int) -> Night:
+def night(settings: NightSettings, seed: int) -> SimulatedNight:
     """A night of those settings. The same seed is the same sample, drift and noise for all settings.
 
     Raises:
@@ -95,7 +95,7 @@ def night(settings: NightSettings, seed: int) -> Night:
             updates.append(update)
     truth = np.array([world.drift_m(scan.mid_s)[:2] for scan in scans])
     lost = any(update.lost for update in updates)
-    return Night(DriftRecord.of(scans, updates), truth - truth[0], rescans, lost)
+    return SimulatedNight(DriftRecord.of(scans, updates), truth - truth[0], rescans, lost)
 
 
 def _taken(

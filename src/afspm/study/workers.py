@@ -18,7 +18,7 @@ _MOST_DEATHS = 3  # of workers one after the other while nothing gets done
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskOutcome:
     """Of one task.
 
     Attributes:
@@ -39,7 +39,7 @@ def processes(asked: int | None, pixels: int) -> int:
     return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
 
 
-def on_cores(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, jobs: int) -> Iterator[Outcome]:
+def on_cores(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, jobs: int) -> Iterator[TaskOutcome]:
     """The outcomes of `function(*task)`, as they come, from `jobs` processes (1: in this one)."""
     if jobs <= 1:
         for index, task in enumerate(tasks):
@@ -55,11 +55,13 @@ def on_cores(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, 
         deaths = 0 if len(left) < before else deaths + 1
         if deaths >= _MOST_DEATHS:
             died = f"worker processes died {deaths} times one after the other (too little memory?)"
-            yield from (Outcome(index, error=died) for index in left)
+            yield from (TaskOutcome(index, error=died) for index in left)
             return
 
 
-def on_cluster(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, address: str) -> Iterator[Outcome]:
+def on_cluster(
+    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, address: str
+) -> Iterator[TaskOutcome]:
     """As `on_cores`, on the workers of a Dask cluster, which need the same afspm installed. What a worker was at when
     it died is done by another.
 
@@ -81,7 +83,7 @@ def on_cluster(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *
             future.release()
 
 
-def _until_one_dies(function: Callable[..., Any], left: dict[int, tuple[Any, ...]], jobs: int) -> Iterator[Outcome]:
+def _until_one_dies(function: Callable[..., Any], left: dict[int, tuple[Any, ...]], jobs: int) -> Iterator[TaskOutcome]:
     """All outcomes that come before a worker dies, which ends them all."""
     # spawn: the same on all systems, and none of the threads of numpy are copied half
     with ProcessPoolExecutor(min(jobs, len(left)), mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -95,21 +97,21 @@ def _until_one_dies(function: Callable[..., Any], left: dict[int, tuple[Any, ...
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _result(future: Any, index: int) -> Outcome:
+def _result(future: Any, index: int) -> TaskOutcome:
     """Of a task on a cluster; done again, if the worker that had it died before it was fetched."""
     try:
-        outcome: Outcome = future.result()
+        outcome: TaskOutcome = future.result()
     except Exception as error:  # of the cluster: a task tells its own
-        return Outcome(index, error=_told(error))
+        return TaskOutcome(index, error=_told(error))
     return outcome
 
 
-def _done(function: Callable[..., Any], index: int, task: tuple[Any, ...]) -> Outcome:
+def _done(function: Callable[..., Any], index: int, task: tuple[Any, ...]) -> TaskOutcome:
     """One task, in whatever process. Errors go back as text: not every exception survives the way."""
     try:
-        return Outcome(index, function(*task))
+        return TaskOutcome(index, function(*task))
     except Exception as error:
-        return Outcome(index, error=_told(error))
+        return TaskOutcome(index, error=_told(error))
 
 
 def _told(error: BaseException | None) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, load
-from afspm.record.going_on import quoted, resume_command
+from afspm.record.run_lock import quoted, resume_command
 
 
 def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> None:

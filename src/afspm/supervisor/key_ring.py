@@ -13,10 +13,10 @@ from typing import Any
 from afspm.addresses import connectable, reaches
 from afspm.experiment import Experiment, Role, Start
 from afspm.logic.supervisor_registry import SUPERVISOR
-from afspm.record.disk import bounded
-from afspm.record.facts import STATE_DIR
-from afspm.record.whole import replace as write
+from afspm.record.run_json import STATE_DIR
 from afspm.runtime.connect import GUEST_KEYS
+from afspm.storage.atomic import replace_file as write
+from afspm.storage.disk import run_bounded
 from afspm.transport import keys
 from afspm.transport.keys import GUEST, Keys
 
@@ -43,12 +43,12 @@ class Handed:
         if self.guest is not None:
             text = json.dumps(self.guest).encode()
             with contextlib.suppress(OSError):
-                bounded(lambda: write(file, [text], mode=0o600), WRITTEN_WITHIN_S)
+                run_bounded(lambda: replace_file(file, [text], mode=0o600), WRITTEN_WITHIN_S)
         try:
             yield
         finally:
             with contextlib.suppress(OSError):
-                bounded(lambda: file.unlink(missing_ok=True), WRITTEN_WITHIN_S)
+                run_bounded(lambda: file.unlink(missing_ok=True), WRITTEN_WITHIN_S)
 
 
 def hand_over(experiment: Experiment, starts: Sequence[Start]) -> Handed:

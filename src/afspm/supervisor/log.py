@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, TextIO
 from afspm.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.formatting import day_and_time, time_of_day
 from afspm.logic.supervisor_registry import LOGGED_AS
-from afspm.record.disk import DEADLINE_S
+from afspm.storage.disk import DEADLINE_S
 
 if TYPE_CHECKING:
     from rich.console import Console

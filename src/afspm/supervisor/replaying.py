@@ -17,9 +17,9 @@ from afspm.addresses import is_address
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.model import Frame, Packet
-from afspm.record.facts import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
-from afspm.record.going_on import locked
 from afspm.record.run import Run, open_run
+from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
+from afspm.record.run_lock import lock_run
 from afspm.runtime.connect import GUEST
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.messages import register_all
@@ -154,7 +154,7 @@ def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish
         "processes": {"replay": {"role": "scheduler", "publish": publish, "serve": serve}},
         GUEST: json.loads(joined.to_json()),
     }
-    with locked(folder):
+    with lock_run(folder):
         run_folder.write_run(folder, facts)
         try:
             yield folder

@@ -16,11 +16,11 @@ from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load_expanded
 from afspm.record import ahead
-from afspm.record.facts import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_facts
-from afspm.record.going_on import locked
 from afspm.record.journal import open_to_read
-from afspm.record.whole import load
+from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
+from afspm.record.run_lock import lock_run
 from afspm.runtime.connect import find_run
+from afspm.storage.atomic import load_checkpoint
 from afspm.supervisor import edited
 from afspm.supervisor import run as running
 from afspm.supervisor.common_clock import Common, new_identity
@@ -75,7 +75,7 @@ def find(where: Path) -> Resumable:
         ConfigError: it has ended, or the experiment file that names it was edited since it was begun.
     """
     folder = find_run(where).resolve()
-    facts = read_facts(folder)
+    facts = read_run_json(folder)
     if REPLAY_OF in facts:
         raise ConfigError("this is a replay, and not a run", where=str(folder), hint=f"it is of {facts[REPLAY_OF]}")
     if facts.get(HOW) in _OVER:
@@ -99,7 +99,7 @@ def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -
     experiment, folder, facts = found.experiment, found.folder, found.facts
     experiment.require_valid()
     options = found.options(options)
-    with locked(folder):
+    with lock_run(folder):
         _wait_until_gone(facts, folder)
         common = _common(experiment, options, facts, folder)
         require_free(running.addresses_of(running.dry_run(experiment, options)))
@@ -128,7 +128,7 @@ def last_seen_ns(folder: Path) -> int:
         seen += [one.packet.time_ns or 0 for one in ahead.written_ahead(written)]
     for file in state.glob("*.json"):
         try:
-            kept, _ = load(file, json.loads)
+            kept, _ = load_checkpoint(file, json.loads)
         except FileError:
             continue
         translator = kept.get("translator", {}) if isinstance(kept, dict) else {}

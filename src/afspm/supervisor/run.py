@@ -15,11 +15,11 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record import ahead
-from afspm.record.disk import bounded
-from afspm.record.facts import ENDED, STATE_DIR, known_facts
-from afspm.record.going_on import locked
+from afspm.record.run_json import ENDED, STATE_DIR, run_json_or_empty
+from afspm.record.run_lock import lock_run
 from afspm.runtime.connect import GUEST, guest_facts
 from afspm.runtime.launch import Launch, Sockets
+from afspm.storage.disk import run_bounded
 from afspm.supervisor import aftermath, common_clock, key_ring, reporting, run_folder
 from afspm.supervisor.aftermath import Ended
 from afspm.supervisor.common_clock import Common
@@ -82,7 +82,7 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     require_free(addresses_of(first))
     common = _common(experiment, first, own, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, now())
-    with locked(folder):
+    with lock_run(folder):
         run_folder.write_experiment(folder, experiment.expanded(secrets=False))
         return go(experiment, options, common, folder, experiment.name, terminal, names)
 
@@ -107,7 +107,7 @@ def go(
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     try:
         starts = _starts(experiment, options, common, FreePorts(), folder)
-        files = known_facts(folder).get(FILES) or list(map(str, experiment.files))  # one that is resumed has it
+        files = run_json_or_empty(folder).get(FILES) or list(map(str, experiment.files))  # one that is resumed has it
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
         run_folder.write_run(folder, facts)
         if {start.launch.name for start in starts} & set(experiment.recorders):
@@ -121,7 +121,7 @@ def go(
             outcome = supervisor.run()
         try:
             ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}
-            bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
+            run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
         except OSError as error:  # a full disk must not keep people from being told of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
         ended = Ended(name, folder, outcome, common.simulated)

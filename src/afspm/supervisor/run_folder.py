@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from afspm.errors import FileError
-from afspm.record.disk import sync_folder
-from afspm.record.facts import EXPERIMENT_FILE, LATEST_FILE, RUN_FILE, STATE_DIR
-from afspm.record.whole import replace
+from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, RUN_FILE, STATE_DIR
+from afspm.storage.atomic import replace_file
+from afspm.storage.disk import sync_folder
 
 LOG_FILE = "log.txt"
 MOST_RUNS_A_SECOND = 1000
@@ -63,4 +63,4 @@ def _new_folder(runs: Path, stamp: str) -> Path:
 
 def _replace(file: Path, text: str) -> None:
     """Write so that a reader sees the old or the new text, never half of it; after a power cut, too."""
-    replace(file, [text.encode()])
+    replace_file(file, [text.encode()])

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
 from afspm.formatting import lasting
-from afspm.record.disk import DiskHangs, bounded
-from afspm.record.going_on import resume_command
 from afspm.record.run import open_run
+from afspm.record.run_lock import resume_command
+from afspm.storage.disk import DiskTimeout, run_bounded
 from afspm.supervisor.ending import Why
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ def lines(outcome: Outcome, folder: Path) -> list[str]:
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     try:
-        told += bounded(lambda: _recorded(folder) or _tabled(folder / TABLE), COUNTED_WITHIN_S)
-    except DiskHangs as error:
+        told += run_bounded(lambda: _recorded(folder) or _tabled(folder / TABLE), COUNTED_WITHIN_S)
+    except DiskTimeout as error:
         told.append(f"what was measured can't be counted: {error}")
     told.append(f"everything is in {folder}")
     if outcome.why is Why.STOPPED:

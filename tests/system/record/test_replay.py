@@ -17,7 +17,7 @@ import afspm
 from afspm import wire
 from afspm.errors import ConfigError, RequestError, TransportError
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
-from afspm.record.store import About, Store
+from afspm.record.store import RecordSettings, RecordStore
 from afspm.runtime.following import Follower
 from afspm.supervisor import replaying, resuming
 
@@ -30,7 +30,7 @@ SCANS = 30
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Half an hour, with a scan every minute."""
     folder = tmp_path_factory.mktemp("recorded")
-    store = Store(folder, About({"experiment": "night", "simulated": True, "frame": "tip"}))
+    store = RecordStore(folder, RecordSettings({"experiment": "night", "simulated": True, "frame": "tip"}))
     things: list[tuple[str, object]] = [
         ("ControlState", ControlState(ControlMode.AUTOMATED, "series", ())),
         ("ScopeStateMsg", ScopeStatus(ScopeState.FREE)),

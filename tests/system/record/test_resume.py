@@ -13,8 +13,8 @@ import pytest
 from afspm.cli.dashboard import resumed_with_dashboard
 from afspm.clock import NS_PER_S
 from afspm.errors import ConfigError, FileError
-from afspm.record.facts import STATE_DIR
-from afspm.record.going_on import locked
+from afspm.record.run_json import STATE_DIR
+from afspm.record.run_lock import lock_run
 from afspm.supervisor import resuming
 from afspm.supervisor.run import Options
 
@@ -160,9 +160,9 @@ def test_a_damaged_journal_does_not_keep_a_run_from_going_on(tmp_path: Path, con
 
 def test_a_lock_is_given_back_by_who_leaves(tmp_path: Path) -> None:
     (tmp_path / STATE_DIR).mkdir()
-    with locked(tmp_path), pytest.raises(FileError, match="still going on"):
-        locked(tmp_path).__enter__()
-    with locked(tmp_path):
+    with lock_run(tmp_path), pytest.raises(FileError, match="still going on"):
+        lock_run(tmp_path).__enter__()
+    with lock_run(tmp_path):
         pass
 
 

@@ -12,7 +12,7 @@ import typer
 from afspm.cli.joining import NOT_RUNNING, acting, looking
 from afspm.cli.status import _console
 from afspm.errors import NoResponse
-from afspm.record.going_on import locked
+from afspm.record.run_lock import lock_run
 
 
 @pytest.mark.parametrize("runs", [False, True], ids=["cut off", "it runs"])
@@ -37,9 +37,9 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on_and_one_that_runs_what_may_b
     monkeypatch.setattr("afspm.runtime.following.Follower.__init__", lambda *_: None)
     monkeypatch.setattr("afspm.runtime.following.Follower.close", lambda *_: None)
     monkeypatch.setattr("afspm.runtime.following.Follower.catch_up", nobody)
-    with locked(tmp_path / "night-1"):
+    with lock_run(tmp_path / "night-1"):
         pass
-    held = locked(tmp_path / "night-1") if runs else nullcontext()
+    held = lock_run(tmp_path / "night-1") if runs else nullcontext()
     with held, pytest.raises(typer.Exit), command(tmp_path / "night-1"):
         pass
     said = capsys.readouterr().err

@@ -26,7 +26,7 @@ from afspm.model import ControlMode, ControlState, Packet
 from afspm.record import ahead
 from afspm.record.ahead import Ahead, expect_record, recorded_until
 from afspm.record.journal import JOURNAL_FILE
-from afspm.record.store import About, Store
+from afspm.record.store import RecordSettings, RecordStore
 from afspm.runtime.launch import Launch
 from afspm.runtime.process import Activity, Context
 from afspm.transport.port import Incoming, ParentGone
@@ -54,7 +54,7 @@ class Bench:
         writer = Writer(
             self.folder,
             self.state,
-            About(),
+            RecordSettings(),
             ExperimentClock.real(),
             logging.getLogger("recorder"),
             step=contextlib.nullcontext,
@@ -209,7 +209,7 @@ def test_what_ends_the_writing_is_raised_where_it_is_noticed(bench: Bench, monke
     def broken(*_: Any) -> None:
         raise RuntimeError("a mistake of ours")
 
-    monkeypatch.setattr(Store, "take", broken)
+    monkeypatch.setattr(RecordStore, "take", broken)
     writer = bench.writer()
     writer.caught_up()
     writer.put(control(1), "")
@@ -276,15 +276,15 @@ class _Disk:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.is_full = False
         self.refused = 0
-        take = Store.take
+        take = RecordStore.take
 
-        def taken(store: Store, packets: Any) -> None:
+        def taken(store: RecordStore, packets: Any) -> None:
             if self.is_full:
                 self.refused += 1
                 raise OSError(errno.ENOSPC, "No space left on device")
             take(store, packets)
 
-        monkeypatch.setattr(Store, "take", taken)
+        monkeypatch.setattr(RecordStore, "take", taken)
 
 
 def _until(condition: Callable[[], bool]) -> None:

@@ -29,9 +29,9 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.record.facts import REPLAY_OF
 from afspm.record.journal import SCHEDULER
-from afspm.record.store import About, Store
+from afspm.record.run_json import REPLAY_OF
+from afspm.record.store import RecordSettings, RecordStore
 
 S = 1_000_000_000
 
@@ -42,7 +42,7 @@ def test_where_nothing_is_recorded_nothing_is_found(tmp_path: Path) -> None:
 
 
 def test_the_past_is_what_was_recorded(tmp_path: Path) -> None:
-    store = Store(tmp_path, About())
+    store = RecordStore(tmp_path, RecordSettings())
     region = Region((0.0, 0.0), (1e-6, 1e-6))
     things: list[tuple[str, object]] = [
         ("ControlState", ControlState(ControlMode.AUTOMATED, "series")),
@@ -56,7 +56,7 @@ def test_the_past_is_what_was_recorded(tmp_path: Path) -> None:
     past = Archive(tmp_path).past(ProblemNames({"drop-on-the-table": 9}))
     store.close()
     assert past is not None
-    assert [(span.label, span.start_ns // S) for span in past.process_lanes["series"].spans] == [
+    assert [(span.label, span.start_ns // S) for span in past.process_timelines["series"].spans] == [
         ("alive", 3), ("ended", 6),
     ]  # fmt: skip
     assert [span.label for span in past.states.spans] == ["scanning", "free"]
@@ -73,7 +73,7 @@ def test_of_a_run_without_a_record_and_of_a_replay_no_past_is_known(tmp_path: Pa
     recorded, replay = tmp_path / "recorded", tmp_path / "replay"
     for folder in (recorded, replay):
         folder.mkdir()
-    Store(recorded, About()).close()
+    RecordStore(recorded, RecordSettings()).close()
     (replay / "run.json").write_text(json.dumps({REPLAY_OF: str(recorded)}))
     assert Archive(recorded).past(ProblemNames()) is not None
     assert Archive(replay).past(ProblemNames()) is None

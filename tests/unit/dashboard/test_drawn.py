@@ -31,14 +31,14 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
-from afspm.record.overview import DriftPoint, Overview, ScanTaken, Span, SpectrumTaken
+from afspm.record.overview import DriftPoint, Overview, ScanSummary, Span, SpectrumSummary
 
 S = 1_000_000_000
 HERE = Region((0.0, 0.0), (1e-6, 1e-6))
 
 
-def taken(time_s: float, region: Region = HERE, channel: str = "Height", **more: bool) -> ScanTaken:
-    return ScanTaken(round(time_s * S), None, channel, "m", region, (8, 8), holder="series", **more)
+def taken(time_s: float, region: Region = HERE, channel: str = "Height", **more: bool) -> ScanSummary:
+    return ScanSummary(round(time_s * S), None, channel, "m", region, (8, 8), holder="series", **more)
 
 
 def shapes(html: str, style: str) -> list[ElementTree.Element]:
@@ -85,7 +85,7 @@ def test_ten_thousand_places_are_drawn_as_far_as_that_makes_sense_and_the_rest_i
 
 
 def test_what_is_set_the_limits_the_probe_and_spectra_are_on_it() -> None:
-    spectrum = SpectrumTaken(5 * S, "IV", (1e-7, 2e-7), Frame.TIP, ("V",), ("V",))
+    spectrum = SpectrumSummary(5 * S, "IV", (1e-7, 2e-7), Frame.TIP, ("V",), ("V",))
     limits = Region((0.0, 0.0), (20e-6, 20e-6))
     html = map_html(MapContent([taken(1)], [spectrum], HERE.moved_to((1e-6, 0.0)), limits, probe_m=(0.0, 0.0)))
     assert [len(shapes(html, style)) for style in ("current", "limits", "spectrum", "probe")] == [1, 1, 1, 1]

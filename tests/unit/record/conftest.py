@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from record_lab import ABOUT, Night
 
-from afspm.record.store import Store
+from afspm.record.store import RecordStore
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def night() -> Night:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(tmp_path, ABOUT)
+def store(tmp_path: Path) -> Iterator[RecordStore]:
+    opened = RecordStore(tmp_path, ABOUT)
     yield opened
     opened.close()

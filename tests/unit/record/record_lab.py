@@ -20,11 +20,11 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record.journal import SCHEDULER
-from afspm.record.store import About
+from afspm.record.store import RecordSettings
 
 START_NS = 1_773_518_400_000_000_000
 REGION = Region((1e-6, -2e-6), (1e-6, 0.5e-6), 0.25)
-ABOUT = About({"experiment": "night", "simulated": True, "seeds": {"microscope": 7}, "frame": "tip"})
+ABOUT = RecordSettings({"experiment": "night", "simulated": True, "seeds": {"microscope": 7}, "frame": "tip"})
 Given = tuple[Packet, str]
 
 

@@ -16,11 +16,11 @@ from afspm.errors import FileError, InvalidValue
 from afspm.model import ScopeState
 from afspm.record.export import chosen, export
 from afspm.record.run import Run
-from afspm.record.store import Store
+from afspm.record.store import RecordStore
 
 
 @pytest.fixture
-def run(night: Night, store: Store, tmp_path: Path) -> Run:
+def run(night: Night, store: RecordStore, tmp_path: Path) -> Run:
     store.take([night.control(), *night.whole_scan(1), *night.whole_scan(2)])
     store.take([night.state(ScopeState.SCANNING), night.lines(2), night.state(ScopeState.INTERRUPTED)])
     store.take([night.state(ScopeState.SPEC), night.spectrum(), night.state(ScopeState.FREE)])
@@ -195,7 +195,7 @@ def test_packets_of_a_damaged_file_are_left_out_if_wanted(run: Run, tmp_path: Pa
         list(run.packets())
 
 
-def test_what_was_not_seen_is_told_and_left_out(night: Night, store: Store, tmp_path: Path) -> None:
+def test_what_was_not_seen_is_told_and_left_out(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])
     told: list[str] = []
     assert list(export(afspm.open_run(tmp_path), "gwy", tmp_path / "out", tell=told.append)) == []

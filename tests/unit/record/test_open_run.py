@@ -19,10 +19,10 @@ from afspm.errors import FileError
 from afspm.model import ScopeState
 from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
 from afspm.record.run import Run
-from afspm.record.store import Store
+from afspm.record.store import RecordStore
 
 
-def test_a_run_that_goes_on_is_read_as_far_as_it_is(night: Night, store: Store, tmp_path: Path) -> None:
+def test_a_run_that_goes_on_is_read_as_far_as_it_is(night: Night, store: RecordStore, tmp_path: Path) -> None:
     run = afspm.open_run(tmp_path)
     assert len(run.scans) == 0
     store.take(night.whole_scan(1))
@@ -30,7 +30,7 @@ def test_a_run_that_goes_on_is_read_as_far_as_it_is(night: Night, store: Store, 
     assert run.scan(-1).first.filename == "scan-0001.nc"
 
 
-def test_a_killed_run_is_read_from_what_it_left(night: Night, store: Store, tmp_path: Path) -> None:
+def test_a_killed_run_is_read_from_what_it_left(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     left = tmp_path / "left"
     left.mkdir()
@@ -40,7 +40,7 @@ def test_a_killed_run_is_read_from_what_it_left(night: Night, store: Store, tmp_
 
 
 def test_the_copy_of_a_journal_on_a_disk_that_is_only_read_goes_when_it_is_closed_or_forgotten(
-    night: Night, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    night: Night, store: RecordStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store.take(night.whole_scan(1))
     copies = tmp_path / "copies"
@@ -72,7 +72,7 @@ def test_the_copy_of_a_journal_on_a_disk_that_is_only_read_goes_when_it_is_close
 
 
 def test_reading_changes_nothing(night: Night, tmp_path: Path) -> None:
-    store = Store(tmp_path, ABOUT)
+    store = RecordStore(tmp_path, ABOUT)
     store.take(night.whole_scan(1))
     store.close()
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
@@ -83,7 +83,7 @@ def test_reading_changes_nothing(night: Night, tmp_path: Path) -> None:
 
 
 def test_a_run_that_has_ended_is_one_file_and_reading_makes_no_other(
-    night: Night, store: Store, tmp_path: Path
+    night: Night, store: RecordStore, tmp_path: Path
 ) -> None:
     store.take(night.whole_scan(1))
     store.settle()
@@ -91,13 +91,13 @@ def test_a_run_that_has_ended_is_one_file_and_reading_makes_no_other(
     with afspm.open_run(tmp_path) as run:
         assert len(run.scans) == 1
     assert [file.name for file in tmp_path.iterdir() if file.is_file()] == [JOURNAL_FILE]
-    again = Store(tmp_path, ABOUT)  # as a run that is resumed all the same
+    again = RecordStore(tmp_path, ABOUT)  # as a run that is resumed all the same
     again.take(night.whole_scan(2))
     assert len(afspm.open_run(tmp_path).scans) == 2
     again.close()
 
 
-def test_who_reads_while_it_ends_is_not_disturbed(night: Night, store: Store, tmp_path: Path) -> None:
+def test_who_reads_while_it_ends_is_not_disturbed(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     with afspm.open_run(tmp_path) as run:
         rows = run._journal.execute("SELECT * FROM packets")
@@ -109,7 +109,7 @@ def test_who_reads_while_it_ends_is_not_disturbed(night: Night, store: Store, tm
 
 def test_the_newest_of_a_folder_of_runs_is_meant(night: Night, tmp_path: Path) -> None:
     (tmp_path / "night-2").mkdir()
-    Store(tmp_path / "night-2", ABOUT).close()
+    RecordStore(tmp_path / "night-2", ABOUT).close()
     (tmp_path / "latest").write_text("night-2\n")
     assert afspm.open_run(tmp_path).folder == tmp_path / "night-2"
 
@@ -143,7 +143,7 @@ def test_a_damaged_journal_is_named(tmp_path: Path, content: bytes) -> None:
         afspm.open_run(tmp_path)
     assert JOURNAL_FILE in str(caught.value)
     with pytest.raises((FileError, sqlite3.OperationalError)) if content else _nothing():
-        Store(tmp_path, ABOUT).close()
+        RecordStore(tmp_path, ABOUT).close()
 
 
 class _nothing:  # noqa: N801 - an empty file is a new journal to whoever writes
@@ -152,7 +152,7 @@ class _nothing:  # noqa: N801 - an empty file is a new journal to whoever writes
 
 
 def test_a_journal_whose_tables_are_named_by_no_text_is_damaged_to_readers_and_writers(tmp_path: Path) -> None:
-    Store(tmp_path, ABOUT).close()
+    RecordStore(tmp_path, ABOUT).close()
     data = (tmp_path / JOURNAL_FILE).read_bytes()
     (tmp_path / JOURNAL_FILE).write_bytes(data.replace(b"CREATE TABLE packets", b"CREATE TABL\x98 packets"))
     with pytest.raises(FileError, match="is damaged"):
@@ -172,7 +172,7 @@ READINGS: dict[str, Callable[[Run], object]] = {
 def test_a_journal_that_is_damaged_inside_is_named_when_that_is_read(
     night: Night, tmp_path: Path, reading: Callable[[Run], object]
 ) -> None:
-    store = Store(tmp_path, ABOUT)
+    store = RecordStore(tmp_path, ABOUT)
     for number in range(1, 40):
         store.take(night.whole_scan(number))
     store.close()
@@ -189,7 +189,7 @@ def _open_and_read(folder: Path, reading: Callable[[Run], object]) -> None:
 
 
 def test_the_journal_of_a_version_to_come_is_refused(tmp_path: Path) -> None:
-    Store(tmp_path, ABOUT).close()
+    RecordStore(tmp_path, ABOUT).close()
     with sqlite3.connect(tmp_path / JOURNAL_FILE) as connection:
         connection.execute("UPDATE about SET value = 'afspm record 2' WHERE name = 'format'")
     connection.close()
@@ -207,7 +207,7 @@ def test_a_database_of_others_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [None, b"", b"\x89HDF\r\n\x1a\n" + bytes(100)])
 def test_a_damaged_or_missing_file_of_a_scan_is_named(
-    night: Night, store: Store, tmp_path: Path, content: bytes | None
+    night: Night, store: RecordStore, tmp_path: Path, content: bytes | None
 ) -> None:
     store.take([*night.whole_scan(1), *night.whole_scan(2)])
     run = afspm.open_run(tmp_path)
@@ -224,7 +224,7 @@ def test_a_damaged_or_missing_file_of_a_scan_is_named(
         list(run.packets())
 
 
-def test_half_a_file_is_named(night: Night, store: Store, tmp_path: Path) -> None:
+def test_half_a_file_is_named(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     run = afspm.open_run(tmp_path)
     file = tmp_path / run.scans[0].file
@@ -237,7 +237,7 @@ def test_half_a_file_is_named(night: Night, store: Store, tmp_path: Path) -> Non
     assert len(run.scan(0)) == 2
 
 
-def test_there_is_no_scan_beyond_the_last(night: Night, store: Store, tmp_path: Path) -> None:
+def test_there_is_no_scan_beyond_the_last(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     run = afspm.open_run(tmp_path)
     for index in (1, -2):
@@ -245,7 +245,7 @@ def test_there_is_no_scan_beyond_the_last(night: Night, store: Store, tmp_path: 
             run.scan(index)
 
 
-def test_tables_become_arrays_and_datasets(night: Night, store: Store, tmp_path: Path) -> None:
+def test_tables_become_arrays_and_datasets(night: Night, store: RecordStore, tmp_path: Path) -> None:
     xarray = pytest.importorskip("xarray")
     store.take([night.control(), *night.whole_scan(1)])
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])
@@ -261,7 +261,7 @@ def test_tables_become_arrays_and_datasets(night: Night, store: Store, tmp_path:
     assert [row.number for row in run.scans.where(lambda row: row.interrupted)] == [2]
 
 
-def test_the_overview_comes_without_reading_files(night: Night, store: Store, tmp_path: Path) -> None:
+def test_the_overview_comes_without_reading_files(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([night.control("series", (4,)), *night.whole_scan(1)])
     run = afspm.open_run(tmp_path)
     (tmp_path / run.scans[0].file).unlink()

@@ -88,7 +88,7 @@ def test_mode_is_a_lane_too_and_the_present_has_no_end() -> None:
 
 
 def test_a_problem_is_told_with_who_flagged_it() -> None:
-    (span,) = seen(*NIGHT).problem_lanes[TIP].spans
+    (span,) = seen(*NIGHT).problem_timelines[TIP].spans
     assert (span.label, span.start_ns, span.end_ns) == ("tip-shape-changed", 22 * S, 35 * S)
     assert span.by == "classifier"
 
@@ -126,7 +126,13 @@ def test_what_was_taken_before_changes_nothing() -> None:
 
 
 def facts(night: Overview) -> list[object]:
-    lanes = [night.controls, night.modes, night.states, *night.problem_lanes.values(), *night.process_lanes.values()]
+    lanes = [
+        night.controls,
+        night.modes,
+        night.states,
+        *night.problem_timelines.values(),
+        *night.process_timelines.values(),
+    ]
     told = [night.scans, night.spectra, night.drift, list(night.log), list(night.entries), list(night.refusals)]
     return [*told, night.control, night.status, night.processes, [list(lane.spans) for lane in lanes]]
 
@@ -150,7 +156,7 @@ def test_busy_is_alive_in_the_time_line_but_not_in_the_present() -> None:
         ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.ALIVE, 1),)), 1),
         ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.BUSY, 3),)), 3),
     )
-    assert [span.label for span in night.process_lanes["series"].spans] == ["alive"]
+    assert [span.label for span in night.process_timelines["series"].spans] == ["alive"]
     assert night.processes["series"].condition is ProcessCondition.BUSY
 
 
@@ -245,7 +251,7 @@ def test_who_comes_late_has_the_past_from_the_journal() -> None:
     late = seen(*STORY, ("ControlState", control(None, mode=ControlMode.MANUAL), 41))
     assert [(s.label, s.start_ns // S) for s in late.controls.spans] == [("series", 2), ("corrector", 26)]
     assert late.control_since_ns == 36 * S
-    (flagged,) = late.problem_lanes[TIP].spans
+    (flagged,) = late.problem_timelines[TIP].spans
     assert (flagged.by, flagged.start_ns, flagged.end_ns) == ("classifier", 22 * S, 35 * S)
     assert late.modes.now is not None
     assert late.modes.now.start_ns == 40 * S

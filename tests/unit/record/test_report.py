@@ -14,10 +14,10 @@ import pytest
 from afspm import model, wire
 from afspm.errors import FileError
 from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
-from afspm.record.lanes import Span
 from afspm.record.report import REPORT_FILE, pictures, story, time_line, write
 from afspm.record.run import open_run
-from afspm.record.store import About, Store
+from afspm.record.store import RecordSettings, RecordStore
+from afspm.record.timeline import Span
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -91,7 +91,7 @@ def recorded(into: Path) -> Path:
     folder.mkdir()
     facts = {"name": "night", "clock": {"origin_s": 0.0, "start_s": START / S, "speed": 60.0}, "ended": "all is done"}
     (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
-    store = Store(folder, About({"experiment": "night", "simulated": True}))
+    store = RecordStore(folder, RecordSettings({"experiment": "night", "simulated": True}))
     packets = []
     for at_s, thing in night():
         name, payload = wire.encode(thing)
@@ -103,7 +103,7 @@ def recorded(into: Path) -> Path:
     return folder
 
 
-def told(run: Path) -> story.Story:
+def told(run: Path) -> story.RunStory:
     with open_run(run) as opened:
         return story.read(opened)
 
@@ -227,7 +227,7 @@ def test_a_problem_is_told_with_who_repaired_it(run: Path) -> None:
 
 
 def test_times_of_more_than_a_day_have_the_day(tmp_path: Path) -> None:
-    store = Store(tmp_path, About({"experiment": "days"}))
+    store = RecordStore(tmp_path, RecordSettings({"experiment": "days"}))
     for at_s in (0, 30 * 3600):
         thing = scan(at_s)
         store.take([(model.Packet("Scan2d_1_x", wire.encode(thing)[1], START + at_s * S), "")])
@@ -268,7 +268,7 @@ def test_what_can_not_be_told_apart_is_one_bar(run: Path) -> None:
 
 
 def test_a_run_of_which_nothing_is_recorded_has_a_report(tmp_path: Path) -> None:
-    Store(tmp_path, About({"experiment": "empty"})).close()
+    RecordStore(tmp_path, RecordSettings({"experiment": "empty"})).close()
     text = write(tmp_path).read_text(encoding="utf-8")
     assert Page(text).open == []
     assert "0 scans" in text

@@ -30,10 +30,12 @@ from afspm.model import (
     Scan,
     ScopeState,
 )
-from afspm.record.store import _PROCESS, About, Store
+from afspm.record.store import _PROCESS, RecordSettings, RecordStore
 
 
-def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(night: Night, store: Store, tmp_path: Path) -> None:
+def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
     given = [night.control("series", (1,)), night.feedback(), *night.whole_scan(1)]
     store.take(given)
     run = afspm.open_run(tmp_path)
@@ -51,7 +53,7 @@ def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(night: Night
     assert (about["experiment"], about["seeds"], about["simulated"]) == ("night", {"microscope": 7}, True)
 
 
-def test_the_file_follows_nexus(night: Night, store: Store, tmp_path: Path) -> None:
+def test_the_file_follows_nexus(night: Night, store: RecordStore, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     store.take(night.whole_scan(1))
     with h5py.File(tmp_path / afspm.open_run(tmp_path).scans[0].file) as file:
@@ -72,11 +74,11 @@ def test_the_file_follows_nexus(night: Night, store: Store, tmp_path: Path) -> N
         assert entry["experiment_description"].asstr()[()] == "SIMULATED"
 
 
-def test_what_is_given_again_changes_nothing(night: Night, store: Store, tmp_path: Path) -> None:
+def test_what_is_given_again_changes_nothing(night: Night, store: RecordStore, tmp_path: Path) -> None:
     given = [night.control(), *night.whole_scan(1), night.state(ScopeState.SPEC), night.spectrum()]
     for _ in range(3):
         store.take(given)
-    again = Store(tmp_path, ABOUT)  # in another life
+    again = RecordStore(tmp_path, ABOUT)  # in another life
     again.take(given)
     again.close()
     run = afspm.open_run(tmp_path)
@@ -85,7 +87,7 @@ def test_what_is_given_again_changes_nothing(night: Night, store: Store, tmp_pat
     assert same(list(run.packets()), given)
 
 
-def test_everything_comes_out_as_it_was_published(night: Night, store: Store, tmp_path: Path) -> None:
+def test_everything_comes_out_as_it_was_published(night: Night, store: RecordStore, tmp_path: Path) -> None:
     given = [night.control(), night.feedback(), night.state(ScopeState.SCANNING), night.lines(2), night.lines(4, 2)]
     given += [*night.scans(1), night.state(ScopeState.FREE), night.state(ScopeState.SPEC), night.spectrum()]
     # what lines show is part of the scan that comes
@@ -101,7 +103,7 @@ def test_everything_comes_out_as_it_was_published(night: Night, store: Store, tm
     assert same(list(run.packets(since_ns=given[6][0].time_ns or 0)), given[7:])
 
 
-def test_a_scan_without_values_comes_out_as_it_was_published(night: Night, store: Store, tmp_path: Path) -> None:
+def test_a_scan_without_values_comes_out_as_it_was_published(night: Night, store: RecordStore, tmp_path: Path) -> None:
     """There is nothing to make a file of; the journal has what it was taken with."""
     bare = Scan(REGION, "Topo", "m", np.empty((0, 0)), pixels=(6, 8))
     given = [night.state(ScopeState.SCANNING), night.packet(bare, "Scan2d_1000.0_Topo"), *night.scans(1)]
@@ -113,7 +115,9 @@ def test_a_scan_without_values_comes_out_as_it_was_published(night: Night, store
     assert next(wire.decode("Scan2d", p.payload) for p in run.packets(messages=["Scan2d"])).shape == (6, 8)
 
 
-def test_lines_of_a_channel_that_the_end_came_before_are_there(night: Night, store: Store, tmp_path: Path) -> None:
+def test_lines_of_a_channel_that_the_end_came_before_are_there(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
     given = [night.state(ScopeState.SCANNING), night.lines(2), night.scans(1)[1]]
     store.take(given)
     store.finish()
@@ -126,7 +130,7 @@ def _fields(lines: Any) -> dict[str, Any]:
     return {name: getattr(lines, name) for name in ("region", "shape", "channel", "unit", "first_row", "began_ns")}
 
 
-def test_channels_in_files_of_their_own_are_one_scan(night: Night, store: Store, tmp_path: Path) -> None:
+def test_channels_in_files_of_their_own_are_one_scan(night: Night, store: RecordStore, tmp_path: Path) -> None:
     given = [night.scan_in_files(number) for number in (1, 2)]
     store.take([*given[0], *given[1], night.state(ScopeState.FREE)])
     run = afspm.open_run(tmp_path)
@@ -137,11 +141,11 @@ def test_channels_in_files_of_their_own_are_one_scan(night: Night, store: Store,
 
 def test_channels_in_files_of_their_own_find_their_scan_after_a_kill(night: Night, tmp_path: Path) -> None:
     given = night.scan_in_files(1)
-    store = Store(tmp_path, ABOUT)
+    store = RecordStore(tmp_path, ABOUT)
     store.take(given[:1])
     store.flush()
     store.close()
-    again = Store(tmp_path, ABOUT)
+    again = RecordStore(tmp_path, ABOUT)
     again.take(given[1:])
     again.take([night.state(ScopeState.FREE)])
     again.close()
@@ -150,7 +154,7 @@ def test_channels_in_files_of_their_own_find_their_scan_after_a_kill(night: Nigh
     assert list(run.scan(0)) == ["Topo", "Current", "Phase"]
 
 
-def test_scans_of_one_time_in_several_files_are_not_mixed(night: Night, store: Store, tmp_path: Path) -> None:
+def test_scans_of_one_time_in_several_files_are_not_mixed(night: Night, store: RecordStore, tmp_path: Path) -> None:
     """A controller whose clock has seconds may take two scans in one."""
     scans = [*night.scans(1, ("Height",), START_NS), *night.scans(2, ("Height",), START_NS)]
     store.take([*scans, night.state(ScopeState.FREE)])
@@ -158,7 +162,7 @@ def test_scans_of_one_time_in_several_files_are_not_mixed(night: Night, store: S
     assert [row.filename for row in run.scans] == ["scan-0001.nc", "scan-0002.nc"]
 
 
-def test_packets_of_unknown_messages_are_kept_as_they_are(store: Store, tmp_path: Path) -> None:
+def test_packets_of_unknown_messages_are_kept_as_they_are(store: RecordStore, tmp_path: Path) -> None:
     strange = (Packet("Peaks_of_mine", b"\x01\x02", START_NS), "")
     store.take([strange])
     assert same(list(afspm.open_run(tmp_path).packets()), [strange])
@@ -166,11 +170,11 @@ def test_packets_of_unknown_messages_are_kept_as_they_are(store: Store, tmp_path
 
 def test_a_channel_that_comes_after_a_kill_joins_the_others(night: Night, tmp_path: Path) -> None:
     scanning, first, second, free = night.whole_scan(1)
-    store = Store(tmp_path, ABOUT)
+    store = RecordStore(tmp_path, ABOUT)
     store.take([scanning, first])
     store.flush()
     store.close()
-    again = Store(tmp_path, ABOUT)
+    again = RecordStore(tmp_path, ABOUT)
     again.take([scanning, first, second, free])
     again.close()
     run = afspm.open_run(tmp_path)
@@ -180,7 +184,7 @@ def test_a_channel_that_comes_after_a_kill_joins_the_others(night: Night, tmp_pa
     assert same(list(run.packets()), [scanning, first, second, free])
 
 
-def test_an_interrupted_scan_is_kept_as_far_as_it_was_seen(night: Night, store: Store, tmp_path: Path) -> None:
+def test_an_interrupted_scan_is_kept_as_far_as_it_was_seen(night: Night, store: RecordStore, tmp_path: Path) -> None:
     given = [night.control(), night.state(ScopeState.SCANNING), night.lines(2, 0), night.lines(1, 2)]
     given += [night.state(ScopeState.INTERRUPTED), night.state(ScopeState.FREE)]
     store.take(given)
@@ -193,7 +197,9 @@ def test_an_interrupted_scan_is_kept_as_far_as_it_was_seen(night: Night, store: 
     assert same(list(run.packets()), given)
 
 
-def test_an_interrupted_scan_of_which_nothing_was_seen_has_a_row(night: Night, store: Store, tmp_path: Path) -> None:
+def test_an_interrupted_scan_of_which_nothing_was_seen_has_a_row(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED), night.state(ScopeState.FREE)])
     run = afspm.open_run(tmp_path)
     (row,) = run.scans
@@ -202,13 +208,13 @@ def test_an_interrupted_scan_of_which_nothing_was_seen_has_a_row(night: Night, s
         run.scan(0)
 
 
-def test_a_scan_that_vanished_is_kept_when_the_next_begins(night: Night, store: Store, tmp_path: Path) -> None:
+def test_a_scan_that_vanished_is_kept_when_the_next_begins(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([night.state(ScopeState.SCANNING), night.lines(), night.state(ScopeState.UNDEFINED)])
     store.take(night.whole_scan(2))
     assert [row.interrupted for row in afspm.open_run(tmp_path).scans] == [True, False]
 
 
-def test_what_waits_for_the_rest_of_its_scan_is_not_recorded_yet(night: Night, store: Store) -> None:
+def test_what_waits_for_the_rest_of_its_scan_is_not_recorded_yet(night: Night, store: RecordStore) -> None:
     scanning, first, _, _ = night.whole_scan(1)
     store.take([scanning, first])
     assert store.recorded_ns == (first[0].time_ns or 0) - 1
@@ -217,7 +223,7 @@ def test_what_waits_for_the_rest_of_its_scan_is_not_recorded_yet(night: Night, s
 
 
 def test_a_full_disk_leaves_nothing_behind_and_all_is_recorded_later(
-    night: Night, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    night: Night, store: RecordStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = [night.control(), *night.whole_scan(1)]
     real = os.fsync
@@ -238,14 +244,14 @@ def test_a_full_disk_leaves_nothing_behind_and_all_is_recorded_later(
 
 def test_a_file_that_was_written_right_before_a_kill_is_not_there_twice(night: Night, tmp_path: Path) -> None:
     given = night.whole_scan(1)
-    store = Store(tmp_path, ABOUT)
+    store = RecordStore(tmp_path, ABOUT)
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])  # it gets number 1
     store.close()
     stamp = "20260314T200000.001000Z"
     (tmp_path / "scans").mkdir()
     (tmp_path / "scans" / f"{stamp}-00001.h5").write_bytes(b"of a transaction that was not committed")
     (tmp_path / "scans" / f"{stamp}-00002.h5.part").write_bytes(b"half")
-    again = Store(tmp_path, ABOUT)
+    again = RecordStore(tmp_path, ABOUT)
     again.take(given)
     again.close()
     assert [file.name for file in (tmp_path / "scans").iterdir()] == [f"{stamp}-00002.h5"]
@@ -253,7 +259,7 @@ def test_a_file_that_was_written_right_before_a_kill_is_not_there_twice(night: N
 
 
 def test_sample_coordinates_are_named(night: Night, tmp_path: Path) -> None:
-    store = Store(tmp_path, About({"frame": "sample"}, ProblemNames(), Frame.SAMPLE))
+    store = RecordStore(tmp_path, RecordSettings({"frame": "sample"}, ProblemNames(), Frame.SAMPLE))
     store.take([*night.whole_scan(1), night.spectrum()])
     store.close()
     run = afspm.open_run(tmp_path)
@@ -263,7 +269,7 @@ def test_sample_coordinates_are_named(night: Night, tmp_path: Path) -> None:
 
 
 def test_without_scans_there_is_the_journal_alone(night: Night, tmp_path: Path) -> None:
-    store = Store(tmp_path, About(measured=False))
+    store = RecordStore(tmp_path, RecordSettings(measured=False))
     store.take([night.control(), *night.whole_scan(1)])
     store.close()
     run = afspm.open_run(tmp_path)
@@ -271,7 +277,9 @@ def test_without_scans_there_is_the_journal_alone(night: Night, tmp_path: Path) 
     assert len(list(run.packets())) == 5
 
 
-def test_the_controllers_header_is_kept_where_its_file_can_be_read(night: Night, store: Store, tmp_path: Path) -> None:
+def test_the_controllers_header_is_kept_where_its_file_can_be_read(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
     head = b"Gwyddion Simple Field 1.0\nXRes = 2\nYRes = 2\nXReal = 1e-6\nYReal = 1e-6\nTitle = Mine\n"
     (tmp_path / "scan-0001.gsf").write_bytes(head + bytes(4 - len(head) % 4) + bytes(4 * 4))
     scanning, *channels, free = night.whole_scan(1)
@@ -284,7 +292,7 @@ def test_the_controllers_header_is_kept_where_its_file_can_be_read(night: Night,
 
 @pytest.mark.parametrize("filename", ["no-such-disk/" + 300 * "x", 5000 * "x", "a\0b"])
 def test_a_controllers_file_that_can_not_be_looked_for_costs_its_header_alone(
-    night: Night, store: Store, tmp_path: Path, filename: str
+    night: Night, store: RecordStore, tmp_path: Path, filename: str
 ) -> None:
     scanning, *channels, free = night.whole_scan(1)
     store.take([scanning, *((_with(packet, filename=filename), source) for packet, source in channels), free])
@@ -292,7 +300,7 @@ def test_a_controllers_file_that_can_not_be_looked_for_costs_its_header_alone(
 
 
 def test_what_no_file_can_be_made_of_is_kept_and_all_else_recorded(
-    night: Night, store: Store, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    night: Night, store: RecordStore, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     scanning, *channels, free = night.whole_scan(1)
     wrong = [(_with(packet, unit="m\0"), source) for packet, source in channels]  # HDF5 has no such texts
@@ -317,7 +325,7 @@ def _with(packet: Packet, **changes: Any) -> Packet:
     return Packet(packet.envelope, wire.encode(replace(scan, **changes))[1], packet.time_ns)
 
 
-def test_requests_processes_and_log_lines_have_their_tables(night: Night, store: Store, tmp_path: Path) -> None:
+def test_requests_processes_and_log_lines_have_their_tables(night: Night, store: RecordStore, tmp_path: Path) -> None:
     entries = (
         JournalEntry(1, "request", "series", "start-scan", 0, "", 0.01),
         JournalEntry(2, "request", "dashboard:Ada", "start-scan", 6, "the series is in control", 0.02),
@@ -342,13 +350,13 @@ def test_requests_processes_and_log_lines_have_their_tables(night: Night, store:
     assert [line.text for line in run.log] == ["scan 1 of 3"]
 
 
-def test_whether_a_process_has_changed_is_not_looked_for_in_the_whole_night(store: Store) -> None:
+def test_whether_a_process_has_changed_is_not_looked_for_in_the_whole_night(store: RecordStore) -> None:
     ((*_, plan),) = store._journal.execute(f"EXPLAIN QUERY PLAN {_PROCESS}", ("series",)).fetchall()
     assert "processes_by_name" in plan
 
 
 def test_only_one_transaction_is_written_at_a_time_and_readers_never_wait(
-    night: Night, store: Store, tmp_path: Path
+    night: Night, store: RecordStore, tmp_path: Path
 ) -> None:
     run = afspm.open_run(tmp_path)
     with store._all_or_nothing():
@@ -359,6 +367,6 @@ def test_only_one_transaction_is_written_at_a_time_and_readers_never_wait(
         run._journal.execute("DELETE FROM packets")
 
 
-def test_the_journal_is_on_the_disk_before_its_write_ahead_log_is_begun_anew(store: Store) -> None:
+def test_the_journal_is_on_the_disk_before_its_write_ahead_log_is_begun_anew(store: RecordStore) -> None:
     """SQLite syncs by itself, and says whether it does: 0 is never."""
     assert store._journal.execute("PRAGMA synchronous").fetchone()[0] >= 1

@@ -10,7 +10,7 @@ from test_study_command import SMALL, told
 from test_workers import by_index, doubled, doubled_by_the_next
 
 from afspm.errors import ConfigError
-from afspm.study.workers import Outcome, on_cluster
+from afspm.study.workers import TaskOutcome, on_cluster
 
 pytestmark = pytest.mark.timeout(60)
 NEEDED = {"modname": "distributed", "reason": "needs Dask, the extra `study`"}
@@ -37,7 +37,7 @@ def test_it_loses_no_task_with_a_worker(cluster: str, tmp_path: Path) -> None:
     failed = list(on_cluster(doubled, [(-1,)], address=cluster))
     assert [outcome.value for outcome in done] == [2 * n for n in range(6)]
     assert (tmp_path / "died").exists()
-    assert failed == [Outcome(0, error="below zero")]
+    assert failed == [TaskOutcome(0, error="below zero")]
 
 
 def test_the_same_study_says_the_same(cluster: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import InvalidValue
-from afspm.study.workers import Outcome, on_cores, processes
+from afspm.study.workers import TaskOutcome, on_cores, processes
 
 
 def doubled(number: int) -> int:
@@ -30,14 +30,14 @@ def deadly(number: int) -> int:
     os._exit(9)
 
 
-def by_index(outcomes: list[Outcome]) -> list[Outcome]:
+def by_index(outcomes: list[TaskOutcome]) -> list[TaskOutcome]:
     return sorted(outcomes, key=lambda outcome: outcome.index)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_every_task_is_done_and_an_error_is_told_for_its_task_alone(jobs: int) -> None:
     done = by_index(list(on_cores(doubled, [(1,), (-1,), (3,)], jobs=jobs)))
-    assert done == [Outcome(0, 2), Outcome(1, error="below zero"), Outcome(2, 6)]
+    assert done == [TaskOutcome(0, 2), TaskOutcome(1, error="below zero"), TaskOutcome(2, 6)]
 
 
 def test_as_many_processes_as_asked_for_else_one_where_they_do_not_pay() -> None:

@@ -14,7 +14,7 @@ from afspm.components import notices
 from afspm.components.notices import OCCASIONS, Targets
 from afspm.experiment import load
 from afspm.record.report import REPORT_FILE
-from afspm.record.store import Store
+from afspm.record.store import RecordStore
 from afspm.supervisor import aftermath
 from afspm.supervisor.aftermath import Ended
 from afspm.supervisor.ending import Why
@@ -89,7 +89,7 @@ def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.M
 
 
 def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
-    Store(tmp_path).close()
+    RecordStore(tmp_path).close()
     log = Log()
     aftermath.report(tmp_path, log)  # type: ignore[arg-type]
     assert (tmp_path / REPORT_FILE).is_file()

@@ -8,7 +8,7 @@ import numpy as np
 from afspm import wire
 from afspm.model import Packet, Region, Scan, ScopeState, ScopeStatus, Spectrum
 from afspm.record.journal import SCHEDULER
-from afspm.record.store import About, Store
+from afspm.record.store import RecordSettings, RecordStore
 from afspm.supervisor.ending import Why
 from afspm.supervisor.summary import lines
 from afspm.supervisor.supervisor import Outcome, Report
@@ -40,7 +40,7 @@ def test_a_scan_of_two_channels_is_one_scan(tmp_path: Path) -> None:
 
 
 def test_without_a_table_the_record_is_counted(tmp_path: Path) -> None:
-    store = Store(tmp_path, About({}))
+    store = RecordStore(tmp_path, RecordSettings({}))
     region = Region((0.0, 0.0), (1e-6, 1e-6))
     scans = [Scan(region, channel, "m", np.zeros((2, 2)), 2, "a.nc") for channel in ("Height", "Phase")]
     published: list[Any] = [ScopeStatus(ScopeState.SCANNING), *scans, ScopeStatus(ScopeState.FREE)]

@@ -14,7 +14,7 @@ from afspm.errors import ConfigError, FileError
 from afspm.microscopes.nanonis.session import CurveEnded
 from afspm.microscopes.nanonis.settings import Ask
 from afspm.model import Region, Scan, ScanLines, Spectrum
-from afspm.record.whole import write_whole
+from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
 ROWS: Final = ("top-first", "recorded")
@@ -121,4 +121,4 @@ def write(path: Path, content: Sequence[Scan | Spectrum], end_ns: int) -> None:
         channels = {name: (scan.unit, scan.values) for name, scan in zip(told_apart, scans, strict=True)}
         encoded = encode_scan(one.region, channels, facts)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, [encoded])
+    write_atomic(path, [encoded])

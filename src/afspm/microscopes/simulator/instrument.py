@@ -22,8 +22,8 @@ from afspm.errors import AfspmError, FileError, Refused
 from afspm.microscopes.simulator.faults import Faults
 from afspm.microscopes.simulator.truth import Truth
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
-from afspm.record.whole import write_whole
 from afspm.simulation import SimulatedScan, World
+from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.settings import feedback, frame
@@ -332,9 +332,9 @@ class Instrument:
         path = self._folder / name
         whole_after_s = self._faults.strikes("half-file")
         if whole_after_s is None:
-            write_whole(path, [content])
+            write_atomic(path, [content])
         else:
-            write_whole(_hidden(path), [content])
+            write_atomic(_hidden(path), [content])
             path.write_bytes(content[: len(content) // 2])
             self._kept["half"] = [str(path), end_s + whole_after_s]
         self._kept["results"] = [*self._kept["results"], str(path)][-LISTED_RESULTS:]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from afspm.record.disk import Disk, DiskHangs
+from afspm.storage.disk import DiskThread, DiskTimeout
 
 
 class Truth:
@@ -26,13 +26,13 @@ class Truth:
     def __init__(self, path: Path, kept: dict[str, Any]) -> None:
         self._path = path
         self._kept = kept
-        self._disk = Disk()
+        self._disk = DiskThread()
 
     def note(self, time_s: float, event: str, facts: Mapping[str, Any]) -> None:
         """Write down what happened."""
         self._kept["truth_lines"] = number = int(self._kept.get("truth_lines", 0)) + 1
         line = json.dumps({"n": number, "time_s": time_s, "event": event, **facts}, default=_plain)
-        with contextlib.suppress(DiskHangs):
+        with contextlib.suppress(DiskTimeout):
             self._disk.run(lambda: self._append(line), len(line))
 
     def _append(self, line: str) -> None:

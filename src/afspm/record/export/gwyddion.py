@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from afspm.model import Scan, Spectrum
 from afspm.record.export.file_names import stem
-from afspm.record.measured import write_synced
+from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 

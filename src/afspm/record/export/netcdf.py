@@ -12,7 +12,7 @@ import numpy as np
 from afspm.files.netcdf import Attributes, Variable, encoded
 from afspm.model import ScanSet, Spectrum
 from afspm.record.export.file_names import stem
-from afspm.record.measured import write_synced
+from afspm.record.measured_files import write_synced
 from afspm.record.nexus import field_names
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow

@@ -10,7 +10,7 @@ from typing import Any
 
 from afspm.clock import iso_utc
 from afspm.record.export.file_names import stem
-from afspm.record.measured import write_synced
+from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow, Table
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from afspm.clock import NS_PER_S
 from afspm.formatting import area, day, from_to, lasting, time_of_day, typeset
-from afspm.record.lanes import Lane
 from afspm.record.report import time_line
 from afspm.record.report.pictures import Small
-from afspm.record.report.story import MOST_ROWS, Story, sentence, states_in_words
+from afspm.record.report.story import MOST_ROWS, RunStory, sentence, states_in_words
 from afspm.record.report.style import CSS
+from afspm.record.timeline import Timeline
 
 _DAY_NS = 86_400_000_000_000
 _LEGEND = (
@@ -22,7 +22,7 @@ _LEGEND = (
 )
 
 
-def html(story: Story, shown: Sequence[Small], figures: Sequence[Path]) -> str:
+def html(story: RunStory, shown: Sequence[Small], figures: Sequence[Path]) -> str:
     """The whole page."""
     title = f"{escape(story.name)}, {day(story.start_ns, UTC)}"
     badge = '<span class="badge">SIMULATED</span>' if story.simulated else ""
@@ -49,14 +49,14 @@ def html(story: Story, shown: Sequence[Small], figures: Sequence[Path]) -> str:
     )
 
 
-def _when(story: Story) -> str:
+def _when(story: RunStory) -> str:
     told = f"{from_to(story.start_ns, story.end_ns, UTC)}, {lasting(story.lasted_ns / NS_PER_S)}"
     if story.speed != 1.0:
         told += f" ({lasting(story.lasted_ns / NS_PER_S / story.speed)} real)"
     return f"{told}; {story.ended}"
 
 
-def _cards(story: Story) -> str:
+def _cards(story: RunStory) -> str:
     interrupted = f"and {story.interrupted} interrupted" if story.interrupted else ""
     flags = len(story.problems)
     unsolved = sum(span.end_ns is None for span in story.problems)
@@ -74,7 +74,7 @@ def _cards(story: Story) -> str:
     return f'<p class="lead">{escape(sentence(story))}</p><div class="cards">{"".join(made)}</div>'
 
 
-def _shares(story: Story) -> str:
+def _shares(story: RunStory) -> str:
     seen, styles = story.overview, time_line.colours(story)
     return '<div class="shares">' + "".join(
         [
@@ -85,7 +85,7 @@ def _shares(story: Story) -> str:
     ) + "</div>"  # fmt: skip
 
 
-def _share_table(story: Story, heading: str, lane: Lane, styles: dict[str, str]) -> str:
+def _share_table(story: RunStory, heading: str, lane: Timeline, styles: dict[str, str]) -> str:
     rows = []
     for label, ns in story.shares(lane):
         part = 100.0 * ns / max(1, story.lasted_ns)
@@ -97,7 +97,7 @@ def _share_table(story: Story, heading: str, lane: Lane, styles: dict[str, str])
     return _table([heading, "", "", ""], rows) if rows else ""
 
 
-def _problems(story: Story) -> str:
+def _problems(story: RunStory) -> str:
     rows = []
     for span in story.problems:
         end_ns = story.end_ns if span.end_ns is None else span.end_ns
@@ -118,7 +118,7 @@ def _problems(story: Story) -> str:
     )
 
 
-def _sheet(story: Story, shown: Sequence[Small]) -> str:
+def _sheet(story: RunStory, shown: Sequence[Small]) -> str:
     if not shown:
         return "<p>None.</p>"
     styles = time_line.colours(story)
@@ -128,7 +128,7 @@ def _sheet(story: Story, shown: Sequence[Small]) -> str:
     return f'<div class="sheet">{"".join(_thumb(small, story, styles) for small in shown)}</div>{note}'
 
 
-def _thumb(small: Small, story: Story, styles: dict[str, str]) -> str:
+def _thumb(small: Small, story: RunStory, styles: dict[str, str]) -> str:
     row = small.row
     width, height = row.region.size_m if row.region else (1.0, 1.0)
     picture = (
@@ -155,7 +155,7 @@ def _figure(path: Path) -> str:
     )
 
 
-def _refusals(story: Story) -> str:
+def _refusals(story: RunStory) -> str:
     rows = [
         [
             _clock(story, one.first_ns) + (f" … {_clock(story, one.last_ns)}" if one.count > 1 else ""),
@@ -171,7 +171,7 @@ def _refusals(story: Story) -> str:
     return (_table(["when", "times", "who", "asked for", "refused because"], rows) or "<p>None.</p>") + more
 
 
-def _restarts(story: Story) -> str:
+def _restarts(story: RunStory) -> str:
     rows = [
         [_clock(story, one.time_ns), escape(one.name), str(one.starts), escape(one.last_exit)]
         for one in story.restarts[:MOST_ROWS]
@@ -204,7 +204,7 @@ def _data(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
-def _clock(story: Story, time_ns: int) -> str:
+def _clock(story: RunStory, time_ns: int) -> str:
     """With the day, where there are several."""
     several = story.lasted_ns > _DAY_NS
     return f"{day(time_ns, UTC)} {time_of_day(time_ns, UTC)}" if several else time_of_day(time_ns, UTC)

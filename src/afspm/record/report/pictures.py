@@ -16,8 +16,8 @@ from afspm import wire
 from afspm.errors import AfspmError
 from afspm.model import ControlMode, ControlState, ScanSet, names
 from afspm.model.picture import png
-from afspm.record.night_record import Mark, NightRecord, Shot, thumbnail
-from afspm.record.report.story import Story
+from afspm.record.night_record import NightMark, NightRecord, Shot, thumbnail
+from afspm.record.report.story import RunStory
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow
 
@@ -77,7 +77,7 @@ def topography(scans: ScanSet) -> str:
     return next((c for name in _TOPOGRAPHY for c in scans if c.lower().startswith(name)), scans.first.channel)
 
 
-def draw(run: Run, story: Story, shown: Sequence[Small]) -> None:
+def draw(run: Run, story: RunStory, shown: Sequence[Small]) -> None:
     """Draw the night and drift against time, where no component has, as far as matplotlib is there."""
     if importlib.util.find_spec("matplotlib") is None:
         return
@@ -102,7 +102,7 @@ def _is_ours(folder: Path, own: str, components: str) -> bool:
     return True
 
 
-def night_of(run: Run, story: Story, shown: Sequence[Small]) -> NightRecord:
+def night_of(run: Run, story: RunStory, shown: Sequence[Small]) -> NightRecord:
     """What the picture of the night shows."""
     record = NightRecord(end_ns=story.end_ns, scans_taken=len(story.scans))
     record.shots = [
@@ -114,7 +114,7 @@ def night_of(run: Run, story: Story, shown: Sequence[Small]) -> NightRecord:
         (story.start_ns, ControlState(ControlMode.UNDEFINED))
     ]
     record.marks = [
-        Mark(entry.time_ns, entry.who, entry.what)
+        NightMark(entry.time_ns, entry.who, entry.what)
         for entry in run.journal
         if entry.what in (names.PULSE, names.CRASH) and entry.response == 0
     ]

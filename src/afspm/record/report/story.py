@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from afspm.model import JournalEntry, ProcessCondition, ScopeState, names
-from afspm.record.going_on import standing
-from afspm.record.lanes import Lane, Span
-from afspm.record.overview import Overview, Restart
+from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.run import Run
+from afspm.record.run_lock import describe_state
 from afspm.record.tables import ScanRow
+from afspm.record.timeline import Span, Timeline
 
 MOST_ROWS = 200
 _PROCESS_TROUBLE = frozenset({ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP})
@@ -30,7 +30,7 @@ class Refusals:
 
 
 @dataclass(frozen=True)
-class Story:
+class RunStory:
     """A run, reckoned up. Times in ns of experiment time since the Unix epoch.
 
     Attributes:
@@ -53,7 +53,7 @@ class Story:
     scans: Sequence[ScanRow]
     spectra: int
     refusals: Sequence[Refusals]
-    restarts: Sequence[Restart]
+    restarts: Sequence[ProcessRestart]
     given_up: Sequence[str]
     actions: Sequence[JournalEntry]
 
@@ -68,10 +68,10 @@ class Story:
 
     @property
     def problems(self) -> list[Span]:
-        spans = [span for lane in self.overview.problem_lanes.values() for span in lane.spans]
+        spans = [span for lane in self.overview.problem_timelines.values() for span in lane.spans]
         return sorted(spans, key=lambda span: span.start_ns)
 
-    def shares(self, lane: Lane) -> list[tuple[str, int]]:
+    def shares(self, lane: Timeline) -> list[tuple[str, int]]:
         """For how long altogether, in ns, each thing of a lane was so: the longest first."""
         return sorted(lane.lasted_ns(self.end_ns).items(), key=lambda share: -share[1])
 
@@ -92,21 +92,21 @@ class Story:
         return list(dict.fromkeys(during))
 
 
-def read(run: Run) -> Story:
+def read(run: Run) -> RunStory:
     """The story of a run. Raises FileError: the record is damaged."""
     overview, scans = run.overview(), run.scans
     clock = run.facts.get("clock") or {}
     # the clock of a run that was resumed is that of its last part
     starts_ns = [*_first_ns(overview, scans), *([round(float(clock["start_s"]) * 1e9)] if clock else [])]
     start_ns = min(starts_ns, default=0)
-    return Story(
+    return RunStory(
         name=run.name,
         folder=run.folder.name,
         simulated=run.simulated,
         start_ns=start_ns,
         end_ns=max(overview.newest_ns, start_ns),
         speed=float(clock.get("speed", 1.0)),
-        ended=standing(run.folder),
+        ended=describe_state(run.folder),
         overview=overview,
         scans=list(scans),
         spectra=len(run.spectra),
@@ -125,7 +125,7 @@ def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
     return [Refusals(*key, len(times), min(times), max(times)) for key, times in groups.items()]
 
 
-def sentence(story: Story) -> str:
+def sentence(story: RunStory) -> str:
     """The run in one sentence."""
     parts = [_counted(len(story.scans) - story.interrupted, "scan", "scans")]
     if story.interrupted:
@@ -160,7 +160,7 @@ def states_in_words(label: str) -> str:
     return known.get(label, label.replace("_", " "))
 
 
-def in_trouble(lane: Lane) -> list[Span]:
+def in_trouble(lane: Timeline) -> list[Span]:
     """When a process was not well."""
     labels = {condition.name.lower().replace("_", " ") for condition in _PROCESS_TROUBLE}
     return [span for span in lane.spans if span.label in labels]

@@ -9,8 +9,8 @@ from datetime import UTC
 from html import escape
 
 from afspm.formatting import day_and_time, time_of_day
-from afspm.record.lanes import Span
-from afspm.record.report.story import Story, in_trouble, states_in_words
+from afspm.record.report.story import RunStory, in_trouble, states_in_words
+from afspm.record.timeline import Span
 
 WIDTH, LABELS, LANE, BAR = 1000, 170, 22, 14
 LEAST = 1.2  # what is too short to be seen is drawn so wide that it is
@@ -21,7 +21,7 @@ COLOURS = 5  # of those in control, in turn: the classes c0 to c4 of the page
 
 
 @dataclass(frozen=True)
-class Row:
+class TimelineRow:
     """A lane as it is drawn; `style` is a class of the page."""
 
     label: str
@@ -29,7 +29,7 @@ class Row:
     spans: Sequence[Span]
 
 
-def draw(story: Story) -> str:
+def draw(story: RunStory) -> str:
     """An `<svg>` with a row for each in control, mode, problem, state, and process that was not well."""
     rows = list(_rows(story))
     height = LANE * len(rows) + 30
@@ -45,35 +45,37 @@ def draw(story: Story) -> str:
     return "".join([*parts, "</svg>"])
 
 
-def colours(story: Story) -> dict[str, str]:
+def colours(story: RunStory) -> dict[str, str]:
     """The class of each who was in control."""
     holders = dict.fromkeys(span.label for span in story.overview.controls.spans)
     return {holder: f"c{number % COLOURS}" for number, holder in enumerate(holders)}
 
 
-def _rows(story: Story) -> Iterator[Row]:
+def _rows(story: RunStory) -> Iterator[TimelineRow]:
     seen = story.overview
     for holder, style in colours(story).items():
-        yield Row(holder, style, [span for span in seen.controls.spans if span.label == holder])
+        yield TimelineRow(holder, style, [span for span in seen.controls.spans if span.label == holder])
     manual = [span for span in seen.modes.spans if span.label == "manual"]
     if manual:
-        yield Row("MANUAL", "manual", manual)
-    for lane in seen.problem_lanes.values():
+        yield TimelineRow("MANUAL", "manual", manual)
+    for lane in seen.problem_timelines.values():
         if lane.spans:
-            yield Row(lane.spans[0].label, "problem", lane.spans)
+            yield TimelineRow(lane.spans[0].label, "problem", lane.spans)
     for label in dict.fromkeys(span.label for span in seen.states.spans):
         if label not in ("free", "undefined"):
             style = "problem" if label == "interrupted" else "state"
-            yield Row(states_in_words(label), style, [span for span in seen.states.spans if span.label == label])
-    for name, lane in seen.process_lanes.items():
+            yield TimelineRow(
+                states_in_words(label), style, [span for span in seen.states.spans if span.label == label]
+            )
+    for name, lane in seen.process_timelines.items():
         if trouble := in_trouble(lane):
-            yield Row(f"{name} not well", "problem", trouble)
+            yield TimelineRow(f"{name} not well", "problem", trouble)
     again = [Span(f"{one.name} started again: {one.last_exit}", one.time_ns, one.time_ns) for one in story.restarts]
     if again:
-        yield Row("restarts", "problem", again)
+        yield TimelineRow("restarts", "problem", again)
 
 
-def _bars(story: Story, row: Row, y: float) -> Iterator[str]:
+def _bars(story: RunStory, row: TimelineRow, y: float) -> Iterator[str]:
     for span in _merged(row.spans, story):
         x0, x1 = (_x(story, time_ns) for time_ns in (span.start_ns, _end(span, story)))
         until = f"{day_and_time(span.start_ns, UTC)} to {day_and_time(_end(span, story), UTC)}"
@@ -84,7 +86,7 @@ def _bars(story: Story, row: Row, y: float) -> Iterator[str]:
         )
 
 
-def _merged(spans: Iterable[Span], story: Story) -> Iterator[Span]:
+def _merged(spans: Iterable[Span], story: RunStory) -> Iterator[Span]:
     """What can't be told apart at this width as one: a week of short scans must not be a page of megabytes."""
     near_ns = story.lasted_ns / (WIDTH - LABELS) * 0.4
     last: Span | None = None
@@ -99,7 +101,7 @@ def _merged(spans: Iterable[Span], story: Story) -> Iterator[Span]:
         yield last
 
 
-def _axis(story: Story, bottom: float) -> Iterator[str]:
+def _axis(story: RunStory, bottom: float) -> Iterator[str]:
     span_h = story.lasted_ns / HOUR_NS
     step_h = next((step for step in STEPS_H if span_h / step <= MOST_TICKS), STEPS_H[-1])
     for number in range(math.floor(span_h / step_h) + 1):
@@ -111,10 +113,10 @@ def _axis(story: Story, bottom: float) -> Iterator[str]:
         yield f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="{anchor}">{told}</text>'
 
 
-def _x(story: Story, time_ns: int) -> float:
+def _x(story: RunStory, time_ns: int) -> float:
     part = (time_ns - story.start_ns) / max(1, story.lasted_ns)
     return LABELS + (WIDTH - LABELS) * min(1.0, max(0.0, part))
 
 
-def _end(span: Span, story: Story) -> int:
+def _end(span: Span, story: RunStory) -> int:
     return story.end_ns if span.end_ns is None else span.end_ns

@@ -7,7 +7,7 @@ from pathlib import Path
 from afspm.errors import FileError
 from afspm.record.report import page, pictures, story
 from afspm.record.run import open_run
-from afspm.record.whole import replace
+from afspm.storage.atomic import replace_file
 
 REPORT_FILE = "report.html"
 
@@ -29,7 +29,7 @@ def write(folder: str | Path) -> Path:
         target = run.folder / REPORT_FILE
         try:
             pictures.draw(run, told, shown)
-            replace(target, [page.html(told, shown, pictures.figures(run.folder)).encode()], synced=False)
+            replace_file(target, [page.html(told, shown, pictures.figures(run.folder)).encode()], synced=False)
         except OSError as error:
             raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
     return target

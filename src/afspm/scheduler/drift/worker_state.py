@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from afspm.errors import FileError
-from afspm.record.whole import write_whole
+from afspm.storage.atomic import write_atomic
 
 _JSON = "json"
 _ARRAY = "array"
@@ -38,7 +38,7 @@ class WorkerStateFile:
         text = json.dumps(_without_arrays(state, arrays))
         file = io.BytesIO()
         np.savez(file, **{_JSON: np.frombuffer(text.encode(), np.uint8)}, **arrays)  # type: ignore[arg-type]
-        write_whole(self.path, [file.getbuffer()], synced=True)
+        write_atomic(self.path, [file.getbuffer()], synced=True)
 
     def load(self) -> dict[str, Any] | None:
         """What was saved last; None if nothing was.

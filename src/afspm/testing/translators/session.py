@@ -18,7 +18,7 @@ from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Frame
-from afspm.record.facts import STATE_DIR
+from afspm.record.run_json import STATE_DIR
 from afspm.runtime.component import Component
 from afspm.runtime.launch import Launch, Sockets
 from afspm.runtime.link import Link

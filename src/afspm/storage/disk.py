@@ -27,7 +27,7 @@ MOST_BYTES = 256 << 20
 MOST_TASKS = 10_000
 
 
-class DiskHangs(OSError):
+class DiskTimeout(OSError):
     """The disk has not answered in time."""
 
     def __init__(self, within_s: float = DEADLINE_S) -> None:
@@ -47,7 +47,7 @@ class _Task:
         self.done.acquire()
 
 
-class Disk:
+class DiskThread:
     """Does one thing after the other in a thread.
 
     Attributes:
@@ -70,13 +70,13 @@ class Disk:
             size: bytes that it keeps in memory until then.
 
         Raises:
-            DiskHangs: not in time; it is done later, or if too much waits, never.
+            DiskTimeout: not in time; it is done later, or if too much waits, never.
             Exception: what `work` raises.
         """
         task = self._put(work, size)
         if task is None or not task.done.acquire(timeout=0.0 if self.hangs else self._deadline_s):
             self.hangs = True
-            raise DiskHangs(self._deadline_s)
+            raise DiskTimeout(self._deadline_s)
         if task.error is not None:
             raise task.error
 
@@ -115,15 +115,15 @@ class Disk:
             task.done.release()
 
 
-def bounded(work: Callable[[], T], within_s: float) -> T:
+def run_bounded(work: Callable[[], T], within_s: float) -> T:
     """Do something that takes a disk, once.
 
     Raises:
-        DiskHangs: not in time; what becomes of it then is not known.
+        DiskTimeout: not in time; what becomes of it then is not known.
         Exception: what `work` raises.
     """
     found: list[T] = []
-    Disk(within_s).run(lambda: found.append(work()))
+    DiskThread(within_s).run(lambda: found.append(work()))
     return found[0]
 
 
@@ -158,7 +158,7 @@ class Syncer:
         """All that was written until now is on the disk.
 
         Raises:
-            DiskHangs: not in time.
+            DiskTimeout: not in time.
         """
         with self._changed:
             if self._thread is None:
@@ -167,7 +167,7 @@ class Syncer:
             asked, self._urgent = self._asked, True
             self._changed.notify_all()
             if not self._changed.wait_for(lambda: self._done >= asked, within_s):
-                raise DiskHangs
+                raise DiskTimeout
 
     def _run(self) -> None:
         while True:

@@ -29,7 +29,7 @@ class Span:
         return max(0, end_ns - self.start_ns)
 
 
-class Lane:
+class Timeline:
     """One thing after the other, with gaps where nothing was. Where there are too many, the oldest are forgotten."""
 
     def __init__(self, most: int = MOST_SPANS) -> None:

@@ -16,7 +16,7 @@ from afspm.errors import InvalidValue
 from afspm.files import FileContent
 from afspm.model import Region, Scan
 from afspm.simulation import World
-from afspm.study.recorded import series
+from afspm.study.scan_series import series
 from afspm.translator.own_files import FileFacts, encode_scan
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))

@@ -12,11 +12,12 @@ from typing import Any
 from afspm import wire
 from afspm.clock import iso_utc
 from afspm.model import Packet, ProblemNames, Scan, ScopeState
-from afspm.record import circumstances, nexus, whole
-from afspm.record.circumstances import Stood
-from afspm.record.gathering import ScanTaken, SpectrumTaken, Taken
+from afspm.record import nexus, provenance
 from afspm.record.journal import SCHEDULER
-from afspm.record.nexus import Circumstances
+from afspm.record.nexus import FileProvenance
+from afspm.record.provenance import ControlAtStart
+from afspm.record.scan_assembler import Assembled, AssembledScan, AssembledSpectrum
+from afspm.storage import atomic
 from afspm.wire.values import without_values
 
 SCANS, SPECTRA = "scans", "spectra"
@@ -44,9 +45,9 @@ class MeasuredFiles:
             for half in (folder / kind).glob(f"*{SUFFIX}{PART}"):  # of a process that was killed
                 half.unlink(missing_ok=True)
 
-    def write(self, taken: Taken) -> None:
+    def write(self, taken: Assembled) -> None:
         """Write the file, and the rows of the journal. Raises OSError, sqlite3.OperationalError: the disk is full …"""
-        if isinstance(taken, SpectrumTaken):
+        if isinstance(taken, AssembledSpectrum):
             self._write_spectrum(taken)
         elif taken.interrupted_ns is None:
             self._write_scan(taken)
@@ -55,7 +56,7 @@ class MeasuredFiles:
 
     # --- scans ---
 
-    def _write_scan(self, taken: ScanTaken) -> None:
+    def _write_scan(self, taken: AssembledScan) -> None:
         packet, first = taken.channels[0]
         published_ns = packet.time_ns or 0
         measured_ns = published_ns if first.time_ns is None else first.time_ns
@@ -64,7 +65,7 @@ class MeasuredFiles:
             new.setdefault(scan.channel, scan)
         known = self._known(new, measured_ns)
         if known is None:
-            stood = circumstances.stood(self._journal, published_ns, ScopeState.SCANNING, measured_ns)
+            stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SCANNING, measured_ns)
             number = self._add_scan(list(new.values()), measured_ns, stood, published_ns, interrupted=False)
         else:
             number = known[0]
@@ -89,23 +90,23 @@ class MeasuredFiles:
             message: Any = wire.message_type("Scan2d").FromString(payload)
             yield message.channel, message.filename
 
-    def _write_interrupted(self, taken: ScanTaken, time_ns: int) -> None:
+    def _write_interrupted(self, taken: AssembledScan, time_ns: int) -> None:
         scans = taken.as_seen()
-        stood = circumstances.stood(self._journal, time_ns, ScopeState.SCANNING)
+        stood = provenance.control_at_start(self._journal, time_ns, ScopeState.SCANNING)
         number = self._add_scan(scans, time_ns, stood, time_ns, interrupted=True)
         self._insert_scan_packets(taken, number)
 
     def _add_scan(
-        self, scans: Sequence[Scan], time_ns: int, stood: Stood, published_ns: int, *, interrupted: bool
+        self, scans: Sequence[Scan], time_ns: int, stood: ControlAtStart, published_ns: int, *, interrupted: bool
     ) -> int:
         filename = scans[0].filename if scans else ""
         number, name = self._next(SCANS, time_ns)
         facts = {**self._facts, **stood.facts(self._problems), "number": number, "interrupted": interrupted}
         filenames = {scan.filename for scan in scans}  # some controllers write one for each channel
-        mapping = circumstances.drift(self._journal, published_ns, stood.began_ns, filenames)
+        mapping = provenance.drift(self._journal, published_ns, stood.began_ns, filenames)
         if mapping is not None:
             facts["drift"] = mapping
-        at = Circumstances(time_ns, stood.began_ns, facts, header_of(filename, self._folder))
+        at = FileProvenance(time_ns, stood.began_ns, facts, header_of(filename, self._folder))
         if scans:
             write_synced(self._folder / name, nexus.encode_scan(scans, at))
         region, shape = (scans[0].region, scans[0].shape) if scans else (None, (None, None))
@@ -129,12 +130,12 @@ class MeasuredFiles:
             return
         scans = [*content.scans, *(scan for channel, scan in new.items() if channel not in there)]
         about = nexus.facts_of(path)
-        at = Circumstances(about["time_ns"], about["began_ns"], about, header_of(scans[0].filename, self._folder))
+        at = FileProvenance(about["time_ns"], about["began_ns"], about, header_of(scans[0].filename, self._folder))
         write_synced(path, nexus.encode_scan(scans, at))
         channels = json.dumps([[scan.channel, scan.unit] for scan in scans], ensure_ascii=False)
         self._journal.execute("UPDATE scans SET channels = ? WHERE number = ?", (channels, number))
 
-    def _insert_scan_packets(self, taken: ScanTaken, number: int) -> None:
+    def _insert_scan_packets(self, taken: AssembledScan, number: int) -> None:
         (channels,) = self._journal.execute("SELECT channels FROM scans WHERE number = ?", (number,)).fetchone()
         in_file = {channel for channel, _ in json.loads(channels)}
         for packet, lines in taken.lines:
@@ -150,7 +151,7 @@ class MeasuredFiles:
 
     # --- spectra ---
 
-    def _write_spectrum(self, taken: SpectrumTaken) -> None:
+    def _write_spectrum(self, taken: AssembledSpectrum) -> None:
         packet, spectrum = taken.packet, taken.spectrum
         published_ns = packet.time_ns or 0
         time_ns = published_ns if spectrum.time_ns is None else spectrum.time_ns
@@ -159,10 +160,10 @@ class MeasuredFiles:
             (time_ns, spectrum.filename, spectrum.kind),
         ).fetchone()
         if known is None:
-            stood = circumstances.stood(self._journal, published_ns, ScopeState.SPEC, time_ns)
+            stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SPEC, time_ns)
             number, name = self._next(SPECTRA, time_ns)
             facts = {**self._facts, **stood.facts(self._problems), "number": number}
-            at = Circumstances(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))
+            at = FileProvenance(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))
             write_synced(self._folder / name, nexus.encode_spectrum(spectrum, at))
             place = (None, None) if spectrum.position_m is None else spectrum.position_m
             names, units = (json.dumps(texts, ensure_ascii=False) for texts in (spectrum.names, spectrum.units))
@@ -187,7 +188,7 @@ class MeasuredFiles:
             orphan.unlink()  # written right before a kill, under a number that it did not get
         return number, name
 
-    def _control(self, stood: Stood) -> tuple[str | None, str | None, str]:
+    def _control(self, stood: ControlAtStart) -> tuple[str | None, str | None, str]:
         facts = stood.facts(self._problems)
         problems = json.dumps(facts.get("problems", []), ensure_ascii=False)
         return facts.get("in_control"), facts.get("mode"), problems
@@ -233,7 +234,7 @@ def header_of(filename: str, folder: Path) -> Mapping[str, Any]:
 
 def write_synced(path: Path, data: bytes) -> None:
     """Write a file so that it is there as a whole or not at all, after a power cut too. Raises OSError."""
-    whole.replace(path, [data], aside=path.with_name(path.name + PART))
+    atomic.replace_file(path, [data], aside=path.with_name(path.name + PART))
 
 
 def _stamp(time_ns: int) -> str:

@@ -16,7 +16,7 @@ _BACK = 20
 
 
 @dataclass(frozen=True)
-class Stood:
+class ControlAtStart:
     """How things stood when a measurement began; None: not known."""
 
     began_ns: int | None
@@ -42,14 +42,16 @@ class Stood:
         return facts
 
 
-def stood(journal: sqlite3.Connection, time_ns: int, doing: ScopeState, measured_ns: int | None = None) -> Stood:
+def control_at_start(
+    journal: sqlite3.Connection, time_ns: int, doing: ScopeState, measured_ns: int | None = None
+) -> ControlAtStart:
     """How things stood when that began which was published at `time_ns`, and finished at `measured_ns`."""
     began_ns = _began(journal, time_ns, doing)
     if began_ns is not None and measured_ns is not None and began_ns > measured_ns:
         began_ns = None  # its beginning was not seen: this is when a microscope that was started anew told of it
     at_ns = time_ns if began_ns is None else began_ns
     control, feedback = _last(journal, "ControlState", at_ns), _last(journal, "ZCtrlParameters", at_ns)
-    return Stood(
+    return ControlAtStart(
         began_ns,
         control if isinstance(control, ControlState) else None,
         feedback if isinstance(feedback, Feedback) else None,

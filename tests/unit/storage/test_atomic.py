@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import FileError
-from afspm.record import whole
-from afspm.record.whole import Generations, former, load
 from afspm.runtime.memory import Memory
 from afspm.scheduler.state_file import StateFile
+from afspm.storage import atomic
+from afspm.storage.atomic import CheckpointFile, load_checkpoint, previous_generation
 
 CUT = [b"", b"\0" * 40, b'{"control": {"mo']
 """What a power cut may leave of a file that was not synced."""
@@ -23,7 +23,7 @@ CUT = [b"", b"\0" * 40, b'{"control": {"mo']
 def saved(path: Path, *contents: bytes) -> None:
     """Saved one after the other, each made sure of."""
     for content in contents:
-        kept = Generations(path)
+        kept = CheckpointFile(path)
         kept.save(content)
         kept.close()
 
@@ -35,49 +35,49 @@ def number(content: bytes) -> int:
 def test_what_was_saved_last_is_read(tmp_path: Path) -> None:
     path = tmp_path / "state" / "x"
     saved(path, b"1", b"2")
-    assert load(path, number) == (2, "")
+    assert load_checkpoint(path, number) == (2, "")
 
 
 def test_what_was_closed_is_there_twice(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    kept = Generations(path)
+    kept = CheckpointFile(path)
     for n in range(50):
         kept.save(b"%d" % n)
     kept.close()
     kept.close()
-    assert (path.read_bytes().splitlines()[-1], former(path).read_bytes()) == (b"49", b"49\n")
+    assert (path.read_bytes().splitlines()[-1], previous_generation(path).read_bytes()) == (b"49", b"49\n")
 
 
 def test_a_file_that_has_grown_long_is_begun_anew(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    kept = Generations(path, longest=10)
+    kept = CheckpointFile(path, longest=10)
     for n in range(10, 50):
         kept.save(b"%d" % n)
-        assert load(path, number) == (n, "")
+        assert load_checkpoint(path, number) == (n, "")
         assert path.stat().st_size <= 10
     kept.close()
 
 
 def test_where_a_kill_left_a_part_of_a_generation_that_before_is_read(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    kept = Generations(path, period_s=100.0)
+    kept = CheckpointFile(path, period_s=100.0)
     for text in (b"{}", b'{"a": 1}', b'{"a": 2}'):
         kept.save(text)
     kept.close()
     path.write_bytes(path.read_bytes()[:-4])
-    value, damage = load(path, json.loads)
+    value, damage = load_checkpoint(path, json.loads)
     assert value == {"a": 1}
     assert damage
 
 
 def test_a_file_that_is_removed_meanwhile_is_there_again_with_the_next_generation(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    kept = Generations(path)
+    kept = CheckpointFile(path)
     kept.save(b"1")
     path.unlink()
     kept.save(b"2")
     kept.close()
-    assert load(path, number) == (2, "")
+    assert load_checkpoint(path, number) == (2, "")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
@@ -86,11 +86,11 @@ def test_on_a_full_disk_what_was_saved_before_is_still_the_last(tmp_path: Path) 
 import resource, signal, sys
 from pathlib import Path
 from afspm.errors import FileError
-from afspm.record.whole import Generations, load
+from afspm.storage.atomic import CheckpointFile, load
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 path = Path(sys.argv[1])
-kept = Generations(path)
+kept = CheckpointFile(path)
 saved = failed = 0
 while failed < 3:
     try:
@@ -107,9 +107,9 @@ print(saved)
 
 def test_while_it_is_saved_the_generation_before_is_made_sure_of_by_itself(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    kept = Generations(path, period_s=0.001)
+    kept = CheckpointFile(path, period_s=0.001)
     n = 0
-    while not former(path).exists() or int(former(path).read_bytes()) < 5:
+    while not previous_generation(path).exists() or int(previous_generation(path).read_bytes()) < 5:
         n += 1
         kept.save(b"%d" % n)
     kept.close()
@@ -129,15 +129,15 @@ class Reader:
             return rename(source, target)
 
         monkeypatch.setattr(Path, "replace", replace)
-        monkeypatch.setattr(whole, "_AGAIN_S", 0.0)
-        monkeypatch.setattr(whole.sys, "platform", "win32")
+        monkeypatch.setattr(atomic, "_AGAIN_S", 0.0)
+        monkeypatch.setattr(atomic.sys, "platform", "win32")
 
 
 def test_a_file_that_somebody_reads_for_a_moment_is_replaced_after_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reader = Reader(monkeypatch, tries=3)
-    whole.replace(tmp_path / "x", [b"1"], synced=False)
+    atomic.replace_file(tmp_path / "x", [b"1"], synced=False)
     assert (tmp_path / "x").read_bytes() == b"1"
     assert reader.left == -1
 
@@ -147,7 +147,7 @@ def test_a_file_that_somebody_keeps_open_is_told_and_nothing_is_left_beside_it(
 ) -> None:
     Reader(monkeypatch, tries=1000)
     with pytest.raises(FileError, match="Access is denied"):
-        whole.write_whole(tmp_path / "x", [b"1"], synced=False)
+        atomic.write_atomic(tmp_path / "x", [b"1"], synced=False)
     assert not list(tmp_path.iterdir())
 
 
@@ -156,7 +156,7 @@ def test_after_a_power_cut_the_generation_before_is_read_and_that_is_told(tmp_pa
     path = tmp_path / "x"
     saved(path, b"1")
     path.write_bytes(left)
-    value, damage = load(path, number)
+    value, damage = load_checkpoint(path, number)
     assert value == 1
     assert damage
 
@@ -165,16 +165,16 @@ def test_where_neither_can_be_read_nothing_is_guessed(tmp_path: Path) -> None:
     path = tmp_path / "x"
     saved(path, b"1")
     path.write_bytes(b"")
-    former(path).write_bytes(b"")
+    previous_generation(path).write_bytes(b"")
     with pytest.raises(FileError, match="remove it"):
-        load(path, number)
+        load_checkpoint(path, number)
 
 
 def test_a_file_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
     path = tmp_path / "x"
     saved(path, b"1")
     path.unlink()
-    assert load(path, number) == (None, "")
+    assert load_checkpoint(path, number) == (None, "")
 
 
 @pytest.mark.parametrize("left", CUT)
@@ -204,7 +204,7 @@ def test_what_is_saved_without_waiting_for_the_disk_has_a_generation_before(tmp_
     memory._generations.close()
     assert (
         Memory(tmp_path / "microscope.json").damage,
-        json.loads(former(tmp_path / "microscope.json").read_bytes()),
+        json.loads(previous_generation(tmp_path / "microscope.json").read_bytes()),
     ) == (
         "",
         {"tip": "blunt"},

@@ -12,7 +12,7 @@ from afspm.model import Packet, Scan, ScanLines, ScopeState, ScopeStatus, Spectr
 
 
 @dataclass
-class ScanTaken:
+class AssembledScan:
     """A scan that is over.
 
     Attributes:
@@ -47,7 +47,7 @@ class ScanTaken:
 
 
 @dataclass(frozen=True)
-class SpectrumTaken:
+class AssembledSpectrum:
     """A spectrum with its packet."""
 
     packet: Packet
@@ -58,10 +58,10 @@ class SpectrumTaken:
         yield self.packet
 
 
-Taken = ScanTaken | SpectrumTaken
+Assembled = AssembledScan | AssembledSpectrum
 
 
-class Gathering:
+class ScanAssembler:
     """Gathers what belongs together, from packets in the order in which they were published.
 
     Args:
@@ -70,44 +70,44 @@ class Gathering:
 
     def __init__(self, state: ScopeState = ScopeState.UNDEFINED) -> None:
         self._state = state
-        self._open = ScanTaken()
+        self._open = AssembledScan()
 
-    def copy(self) -> Gathering:
+    def copy(self) -> ScanAssembler:
         """As it is now, to go back to."""
-        other = Gathering(self._state)
-        other._open = ScanTaken(list(self._open.channels), list(self._open.lines), self._open.interrupted_ns)
+        other = ScanAssembler(self._state)
+        other._open = AssembledScan(list(self._open.channels), list(self._open.lines), self._open.interrupted_ns)
         return other
 
     def waiting(self) -> Iterator[Packet]:
         """Packets that were given and not given back yet."""
         return self._open.packets()
 
-    def scan(self, packet: Packet, scan: Scan) -> list[Taken]:
+    def scan(self, packet: Packet, scan: Scan) -> list[Assembled]:
         """A channel of a scan."""
-        over: list[Taken] = []
+        over: list[Assembled] = []
         if self._open.channels and not _same(self._open, scan):
             over = self.flush()
         self._open.channels.append((packet, scan))
         return over
 
-    def lines(self, packet: Packet, lines: ScanLines) -> list[Taken]:
+    def lines(self, packet: Packet, lines: ScanLines) -> list[Assembled]:
         """Lines of a running scan. A translator that is started anew publishes them from the first row on again."""
         before = self._open.lines[-1][1] if self._open.lines else None
-        over: list[Taken] = []
+        over: list[Assembled] = []
         if self._open.channels or (before is not None and (before.region, before.shape) != (lines.region, lines.shape)):
             over = self.finish(packet.time_ns or 0)
         self._open.lines.append((packet, lines))
         return over
 
-    def spectrum(self, packet: Packet, spectrum: Spectrum) -> list[Taken]:
+    def spectrum(self, packet: Packet, spectrum: Spectrum) -> list[Assembled]:
         """A spectrum, which is whole."""
-        return [*self.flush(), SpectrumTaken(packet, spectrum)]
+        return [*self.flush(), AssembledSpectrum(packet, spectrum)]
 
-    def status(self, status: ScopeStatus, time_ns: int) -> list[Taken]:
+    def status(self, status: ScopeStatus, time_ns: int) -> list[Assembled]:
         """The microscope does something else."""
         before, self._state = self._state, status.state
         if status.state is ScopeState.INTERRUPTED and before is ScopeState.SCANNING and not self._open.channels:
-            interrupted, self._open = self._open, ScanTaken()
+            interrupted, self._open = self._open, AssembledScan()
             interrupted.interrupted_ns = time_ns
             return [interrupted]
         if status.state is ScopeState.SCANNING and before is not ScopeState.SCANNING:
@@ -115,24 +115,24 @@ class Gathering:
         # lines alone wait on: there are translators that are free before they publish what they have measured
         return self.flush() if status.state is ScopeState.FREE else []
 
-    def flush(self) -> list[Taken]:
+    def flush(self) -> list[Assembled]:
         """No more channels come to the scan that is being gathered."""
         if not self._open.channels:
             return []
-        taken, self._open = self._open, ScanTaken()
+        taken, self._open = self._open, AssembledScan()
         return [taken]
 
-    def finish(self, time_ns: int) -> list[Taken]:
+    def finish(self, time_ns: int) -> list[Assembled]:
         """What was seen of a scan is all that there will be: without its channels, it vanished on the way."""
         if not self._open.channels and not self._open.lines:
             return []
-        taken, self._open = self._open, ScanTaken()
+        taken, self._open = self._open, AssembledScan()
         if not taken.channels:
             taken.interrupted_ns = time_ns
         return [taken]
 
 
-def _same(taken: ScanTaken, scan: Scan) -> bool:
+def _same(taken: AssembledScan, scan: Scan) -> bool:
     """Whether this is another channel of the scan. One that comes again, from a translator started anew, is too.
 
     Some controllers write a file for each channel: then it is the time that says so, and a channel that is there

@@ -8,7 +8,7 @@ from afspm.model import Region, ScanLines, ScanParameters
 
 
 @dataclass(slots=True)
-class Lines:
+class ChannelLines:
     """What has come of one channel: its rows, by index."""
 
     unit: str
@@ -44,15 +44,15 @@ class RunningScan:
     began_ns: int | None
     holder: str | None
     parameters: ScanParameters | None
-    channels: dict[str, Lines] = field(default_factory=dict)
+    channels: dict[str, ChannelLines] = field(default_factory=dict)
 
     def take(self, lines: ScanLines) -> None:
-        """Lines of it came."""
+        """ChannelLines of it came."""
         if self.began_ns is None:
             self.began_ns = lines.began_ns
         channel = self.channels.get(lines.channel)
         if channel is None or channel.shape != lines.shape:
-            channel = self.channels[lines.channel] = Lines(lines.unit, lines.region, lines.shape)
+            channel = self.channels[lines.channel] = ChannelLines(lines.unit, lines.region, lines.shape)
         channel.rows.update(range(lines.first_row, lines.first_row + len(lines.values)))
 
     @property

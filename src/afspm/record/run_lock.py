@@ -10,13 +10,13 @@ from pathlib import Path
 
 from afspm.errors import FileError
 from afspm.file_lock import lock
-from afspm.record.facts import ENDED, REPLAY_OF, STATE_DIR, known_facts
+from afspm.record.run_json import ENDED, REPLAY_OF, STATE_DIR, run_json_or_empty
 
 LOCK_FILE = "running"
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def lock_run(folder: Path) -> Iterator[None]:
     """The run in this folder goes on while in the block; the system takes the lock back from whoever is killed.
 
     Raises:
@@ -30,12 +30,12 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def cut_off(folder: Path) -> str:
+def cut_off_message(folder: Path) -> str:
     """What to say of a run whose supervisor was killed, or its computer; empty: it goes on, or has ended.
 
     Only who can read the disk of the computer that it ran on can know.
     """
-    facts = known_facts(folder)
+    facts = run_json_or_empty(folder)
     if not facts or facts.get(ENDED) or not _is_left(folder):
         return ""
     if REPLAY_OF in facts:
@@ -43,12 +43,12 @@ def cut_off(folder: Path) -> str:
     return f"it was cut off; {resume_command(folder)} goes on with it"
 
 
-def standing(folder: Path) -> str:
+def describe_state(folder: Path) -> str:
     """How it is with a run, in words: how it ended, that it was cut off, that it goes on."""
-    if ended := known_facts(folder).get(ENDED):
+    if ended := run_json_or_empty(folder).get(ENDED):
         return str(ended)
     known = (folder / STATE_DIR / LOCK_FILE).exists()
-    return cut_off(folder) or ("it goes on" if known else "it goes on, or was cut off")
+    return cut_off_message(folder) or ("it goes on" if known else "it goes on, or was cut off")
 
 
 def resume_command(folder: Path) -> str:

@@ -21,7 +21,7 @@ LATEST_FILE: Final = "latest"
 """In the folder of all runs: the name of the newest."""
 
 
-def read_facts(folder: Path) -> dict[str, Any]:
+def read_run_json(folder: Path) -> dict[str, Any]:
     """What run.json in the folder of a run says.
 
     Raises:
@@ -37,14 +37,14 @@ def read_facts(folder: Path) -> dict[str, Any]:
     return facts
 
 
-def known_facts(folder: Path) -> dict[str, Any]:
+def run_json_or_empty(folder: Path) -> dict[str, Any]:
     """The same; empty where nothing can be read."""
     try:
-        return read_facts(folder)
+        return read_run_json(folder)
     except FileError:
         return {}
 
 
-def name_in(folder: Path, otherwise: str = "") -> str:
+def experiment_name(folder: Path, otherwise: str = "") -> str:
     """The name of the experiment that left a folder; `otherwise` if it is not known."""
-    return str(known_facts(folder).get("name") or otherwise)
+    return str(run_json_or_empty(folder).get("name") or otherwise)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from afspm.record import disk
-from afspm.record.disk import Disk, DiskHangs, Syncer, bounded
+from afspm.storage import disk
+from afspm.storage.disk import DiskThread, DiskTimeout, Syncer, run_bounded
 
 DEADLINE_S = 10.0
 
@@ -28,7 +28,7 @@ class Hanging:
 
 def test_what_is_asked_for_is_done_in_order_and_its_error_is_told() -> None:
     done: list[int] = []
-    work = Disk()
+    work = DiskThread()
     for number in range(100):
         work.run(lambda number=number: done.append(number))
         assert done[-1] == number
@@ -39,11 +39,11 @@ def test_what_is_asked_for_is_done_in_order_and_its_error_is_told() -> None:
 
 
 def test_who_asks_goes_on_while_the_disk_hangs_and_all_is_done_later_in_order() -> None:
-    hanging, work = Hanging(), Disk(deadline_s=0.01)
-    with pytest.raises(DiskHangs):
+    hanging, work = Hanging(), DiskThread(deadline_s=0.01)
+    with pytest.raises(DiskTimeout):
         work.run(hanging.hang)
     for name in ("a", "b"):
-        with pytest.raises(DiskHangs):
+        with pytest.raises(DiskTimeout):
             work.run(lambda name=name: hanging.done.append(name))
     hanging.goes_on.set()
     assert work.close(DEADLINE_S)
@@ -52,11 +52,11 @@ def test_who_asks_goes_on_while_the_disk_hangs_and_all_is_done_later_in_order() 
 
 
 def test_no_more_than_a_bound_waits_for_a_disk_that_hangs() -> None:
-    hanging, work = Hanging(), Disk(deadline_s=0.01, most_bytes=100)
-    with pytest.raises(DiskHangs):
+    hanging, work = Hanging(), DiskThread(deadline_s=0.01, most_bytes=100)
+    with pytest.raises(DiskTimeout):
         work.run(hanging.hang)
     for size in (60, 60, 30):
-        with pytest.raises(DiskHangs):
+        with pytest.raises(DiskTimeout):
             work.run(lambda size=size: hanging.done.append(str(size)), size)
     hanging.goes_on.set()
     assert work.close(DEADLINE_S)
@@ -65,9 +65,9 @@ def test_no_more_than_a_bound_waits_for_a_disk_that_hangs() -> None:
 
 def test_what_is_read_once_is_not_waited_for_without_end() -> None:
     hanging = Hanging()
-    assert bounded(lambda: 7, DEADLINE_S) == 7
-    with pytest.raises(DiskHangs):
-        bounded(hanging.hang, 0.01)
+    assert run_bounded(lambda: 7, DEADLINE_S) == 7
+    with pytest.raises(DiskTimeout):
+        run_bounded(hanging.hang, 0.01)
     hanging.goes_on.set()
 
 
@@ -107,6 +107,6 @@ def test_a_disk_that_does_not_sync_is_told(tmp_path: Path, monkeypatch: pytest.M
     syncer = Syncer(period_s=100.0)
     with (tmp_path / "a").open("wb", buffering=0) as file:
         syncer.soon(file.fileno())
-        with pytest.raises(DiskHangs):
+        with pytest.raises(DiskTimeout):
             syncer.now(0.01)
     goes_on.set()

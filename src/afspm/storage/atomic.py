@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from afspm.errors import FileError
-from afspm.record.disk import SYNCER, sync_file, sync_folder
+from afspm.storage.disk import SYNCER, sync_file, sync_folder
 
 T = TypeVar("T")
 
@@ -27,7 +27,7 @@ _TRIES, _AGAIN_S = 50, 0.01
 _ANYONE = 0o666
 
 
-def replace(
+def replace_file(
     path: Path,
     parts: Iterable[bytes | memoryview],
     *,
@@ -76,15 +76,15 @@ def _rename(aside: Path, path: Path) -> None:
         threading.Event().wait(_AGAIN_S)  # nobody tells when the reader has closed it
 
 
-def write_whole(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:
+def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:
     """`replace`, for whoever tells people of it. Raises FileError: it can't be written."""
     try:
-        replace(path, parts, synced=synced)
+        replace_file(path, parts, synced=synced)
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(path)) from error
 
 
-class ToldOnce:
+class OutageLog:
     """A disk that is full, or away for a while, must not end an experiment: what can't be written is told once, until
     it can be again.
 
@@ -112,12 +112,12 @@ class ToldOnce:
             self._is_failing = False
 
 
-def former(path: Path) -> Path:
-    """The generation before, of a file that `Generations` keeps."""
+def previous_generation(path: Path) -> Path:
+    """The generation before, of a file that `CheckpointFile` keeps."""
     return path.with_name(f"{path.name}.old")
 
 
-class Generations:
+class CheckpointFile:
     """A small text that is saved too often to wait for the disk each time, and is to outlive a power cut all the same.
 
     Each generation is a line that is appended: that takes ten microseconds, twenty times less than to replace the file,
@@ -163,7 +163,7 @@ class Generations:
     def _append(self, line: bytes) -> None:
         if self._file is None or self._size + len(line) > self._longest or not _is_there(self._file):
             self._let_go()
-            replace(self.path, [line], synced=False)
+            replace_file(self.path, [line], synced=False)
             self._file, self._size = io.FileIO(self.path, "ab"), len(line)
             SYNCER.soon(self._file.fileno())
             SYNCER.folder_soon(self.path.parent)
@@ -196,7 +196,7 @@ class Generations:
             if newest is None:
                 return
             with contextlib.suppress(FileError):  # a full disk is told of by who saves
-                write_whole(former(self.path), [newest])
+                write_atomic(previous_generation(self.path), [newest])
             self._closing.wait(self._period_s)
 
 
@@ -205,8 +205,8 @@ def _is_there(file: io.FileIO) -> bool:
     return os.fstat(file.fileno()).st_nlink > 0
 
 
-def load(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
-    """What `Generations` saved last; None if there is no such file.
+def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
+    """What `CheckpointFile` saved last; None if there is no such file.
 
     Args:
         read: makes something of a generation; raises ValueError, KeyError or TypeError if it is damaged.
@@ -232,7 +232,7 @@ def load(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
         except _DAMAGED as error:
             damage = f"{error!r}"
     with contextlib.suppress(OSError):
-        generations.insert(0, former(path).read_bytes())
+        generations.insert(0, previous_generation(path).read_bytes())
     for before in reversed(generations):
         with contextlib.suppress(*_DAMAGED):
             return read(before), damage
