@@ -20,7 +20,7 @@ from afspm.translator.settings import SettingsGroup
 from afspm.units import Duration
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 
@@ -366,7 +366,7 @@ class Driver(ABC):
                 found[mark.name] = replace(mark, do=getattr(self, attribute))
         return found
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         """Be the translator of an experiment (what the host calls)."""
         from afspm.translator.process import run_translator
 

@@ -18,7 +18,7 @@ from afspm import wire
 from afspm.exit_codes import ExitCode
 from afspm.logic.fencing import SchedulerFence
 from afspm.model import ControlResponse, Response, ScopeState, ScopeStatus
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 from afspm.translator.connection import Connection
 from afspm.translator.controller_lock import ControllerTaken, commanding
 from afspm.translator.driver import Driver
@@ -31,7 +31,7 @@ from afspm.translator.temporary_settings import TemporarySettings
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 
 class Translator:
@@ -161,7 +161,7 @@ class Translator:
         self.look()
 
 
-def run_translator(driver: Driver, context: Context, make: Callable[..., Translator] = Translator) -> int:
+def run_translator(driver: Driver, context: ProcessContext, make: Callable[..., Translator] = Translator) -> int:
     """Run a translator as the host does. While another run commands the controller, say which, and end."""
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, driver)
@@ -174,7 +174,7 @@ def run_translator(driver: Driver, context: Context, make: Callable[..., Transla
         return _run_alone(driver, context, partial(make, controller=controller))
 
 
-def _run_alone(driver: Driver, context: Context, make: Callable[..., Translator]) -> int:
+def _run_alone(driver: Driver, context: ProcessContext, make: Callable[..., Translator]) -> int:
     """Open the sockets and the memory, and run the translator."""
     from afspm.transport.launching import open_server_port
 

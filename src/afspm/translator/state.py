@@ -6,7 +6,7 @@ from typing import Any
 
 from afspm.clock import Clock
 from afspm.model import ScopeState, ScopeStatus
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 from afspm.translator.sequence import StatusSequence
 
 Kept = dict[str, Any]
