@@ -12,7 +12,7 @@ from afspm.dashboard.sample_map import MapContent, map_html
 from afspm.dashboard.time_line import NOT_HEARD_OF, time_line_html
 from afspm.dashboard.watch import OLD_AFTER_S, Watch
 from afspm.dashboard.words import colour_class, date_and_clock, escape, position
-from afspm.formatting import lasting, time_of_day
+from afspm.formatting import duration_text, time_of_day
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
 from afspm.record.overview import OVER, Overview
 
@@ -150,7 +150,7 @@ def trouble(watch: Watch) -> str:
     silent_s = watch.silent_s()
     if silent_s > OLD_AFTER_S:
         why = f" {said[0].upper()}{said[1:]}." if (said := watch.cut_off()) else ""
-        return f"No word from the experiment for {lasting(silent_s)}: what is shown is that old.{why}"
+        return f"No word from the experiment for {duration_text(silent_s)}: what is shown is that old.{why}"
     return ""
 
 
@@ -161,7 +161,9 @@ def status_html(watch: Watch, overview: Overview) -> str:
         return '<span class="chip">waiting for the scheduler</span>'
     since_ns = overview.control_since_ns
     now_ns = overview.newest_ns if watch.ended else watch.clock.now_ns()
-    since = "" if since_ns is None else f" since {time_of_day(since_ns)} ({lasting((now_ns - since_ns) / NS_PER_S)})"
+    since = (
+        "" if since_ns is None else f" since {time_of_day(since_ns)} ({duration_text((now_ns - since_ns) / NS_PER_S)})"
+    )
     mode = control.mode.name
     parts = [f'<span class="chip mode-{mode.lower()}" data-part="mode">{mode}</span>']
     if control.holder:
@@ -185,7 +187,7 @@ def _microscope(overview: Overview, now_ns: int) -> list[str]:
     state = status.state.name.lower().replace("_", " ") if status else "not heard of"
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
-    far = "" if done is None else f" {100 * done[0]:.0f} %, {lasting(done[1] / NS_PER_S)} left"
+    far = "" if done is None else f" {100 * done[0]:.0f} %, {duration_text(done[1] / NS_PER_S)} left"
     found = [
         f'<span class="chip state-{state.replace(" ", "-")}" data-part="state">microscope {state}{paused}{far}</span>'
     ]
@@ -257,10 +259,10 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
     condition = state.condition.name.lower().replace("_", " ")
     since = f"since {time_of_day(state.since_ns)}"
     if unheard_ns is not None:
-        gone = f"for {lasting(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
+        gone = f"for {duration_text(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
         condition, since = NOT_HEARD_OF, gone
     elif state.step_age_s >= 1.0:
-        since = f"on its step for {lasting(state.step_age_s)}"
+        since = f"on its step for {duration_text(state.step_age_s)}"
     restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"
     if state.last_exit and state.starts > 1:
         restarts += f" (last: {state.last_exit})"

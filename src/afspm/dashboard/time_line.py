@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from afspm.clock import NS_PER_S
 from afspm.dashboard.words import colour_class, escape
-from afspm.formatting import lasting, time_of_day
+from afspm.formatting import duration_text, time_of_day
 from afspm.record.overview import Overview, Span, Timeline
 
 NOT_HEARD_OF = "not heard of"
@@ -121,7 +121,7 @@ def _row(row: Row, spans: Sequence[Span], begin_ns: int, now_ns: int) -> str:
 def _cell(row: Row, one: _Stretch, begin_ns: int, now_ns: int) -> str:
     start_ns = begin_ns + one.begin * (now_ns - begin_ns) // COLUMNS
     by = f", by {one.by}" if one.by else ""
-    often = f", {one.count} times about here" if one.count > 1 else f" for {lasting(one.lasted_ns / NS_PER_S)}"
+    often = f", {one.count} times about here" if one.count > 1 else f" for {duration_text(one.lasted_ns / NS_PER_S)}"
     title = f"{one.label.replace('_', ' ')}{by} from {time_of_day(start_ns)}{often}"
     left, width = 100 * one.begin / COLUMNS, 100 * (one.end - one.begin) / COLUMNS
     word = f"<i>{escape(one.label.replace('_', ' '))}</i>" if width > 7 else ""

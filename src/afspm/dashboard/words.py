@@ -34,12 +34,12 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
 
 def position(xy_m: tuple[float, float]) -> str:
     """ "(1.2, −0.5) µm"."""
-    return formatting.typeset(formatting.place(xy_m))
+    return formatting.typeset(formatting.position_text(xy_m))
 
 
 def area(size_m: tuple[float, float]) -> str:
     """ "2 × 1 µm"."""
-    return formatting.typeset(formatting.area(size_m))
+    return formatting.typeset(formatting.area_text(size_m))
 
 
 def date_and_clock(time_ns: int) -> str:

@@ -9,7 +9,7 @@ import pytest
 
 from afspm.errors import InvalidValue
 from afspm.model import ProblemNames, Region, Scan, ScanParameters, ScanSet, Spectrum
-from afspm.model.picture import png
+from afspm.model.notebook import png
 
 REGION = Region.from_top_left((0.0, 1e-6), (3e-6, 2e-6))
 SCAN = Scan(REGION, "Height", "m", np.arange(12.0).reshape(3, 4), 1_767_225_600_000_000_000, "a.nc")

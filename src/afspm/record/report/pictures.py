@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from afspm import wire
 from afspm.errors import AfspmError
 from afspm.model import ControlMode, ControlState, ScanSet, names
-from afspm.model.picture import png
+from afspm.model.notebook import png
 from afspm.record.night_record import NightMark, NightRecord, Shot, thumbnail
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run
