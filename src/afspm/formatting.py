@@ -1,4 +1,4 @@
-"""Durations, lengths and times as people are told them: in logs, terminals, on pages and in reports alike."""
+"""Durations, lengths, times and quantities as text: in logs, terminals, on pages and in reports alike."""
 
 from __future__ import annotations
 

@@ -41,13 +41,13 @@ from afspm.record.timeline import Span, Timeline
 
 __all__ = [
     "DriftPoint",
-    "Timeline",
     "Overview",
     "ProcessRestart",
     "RunningScan",
     "ScanSummary",
     "Span",
     "SpectrumSummary",
+    "Timeline",
 ]
 
 MOST_LINES = 2_000

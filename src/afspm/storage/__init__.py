@@ -1,1 +1,1 @@
-"""TODO: what storage holds."""
+"""What is kept on disk: files replaced atomically, saved state, and the threads that write and sync."""

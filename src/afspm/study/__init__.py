@@ -13,11 +13,11 @@ from afspm.study.summary import Summary, summarised
 from afspm.study.workers import TaskOutcome, on_cluster, on_cores
 
 __all__ = [
+    "NightSettings",
     "SettingsGrid",
     "SimulatedNight",
-    "NightSettings",
-    "TaskOutcome",
     "Summary",
+    "TaskOutcome",
     "night",
     "on_cluster",
     "on_cores",

@@ -15,7 +15,7 @@ from afspm.client.connect import GUEST_KEYS
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.record.run_json import STATE_DIR
-from afspm.storage.atomic import replace_file as write
+from afspm.storage.atomic import replace_file
 from afspm.storage.disk import run_bounded
 from afspm.transport import keys
 from afspm.transport.keys import GUEST, Keys

@@ -9,9 +9,8 @@ from functools import partial
 from afspm import wire
 from afspm.errors import WireError
 from afspm.logic.fencing import Epoch, SchedulerFence
-from afspm.logic.forwarder import NOT_SENT
 from afspm.logic.sessions import run_of
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, names
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ResponseDetail, names
 from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
 from afspm.translator.driver import LOST, Driver
@@ -90,8 +89,10 @@ class RequestHandler:
         except LOST as error:
             if self._connection.stands:
                 self._connection.lose(error)
-            reason = f"{'' if self._acting is request else NOT_SENT}the controller can't be reached: {error}"
-            self._finish(request, Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id))
+            reason, detail = f"the controller can't be reached: {error}", ResponseDetail.OUTCOME_UNKNOWN
+            if self._acting is not request:
+                reason, detail = f"not sent: {reason}", ResponseDetail.NOT_SENT
+            self._finish(request, Response(ControlResponse.NO_RESPONSE, b"", reason, request.id, detail))
 
     def act(self, action: str) -> Response:
         """Do an action that nobody has asked for."""
