@@ -152,9 +152,6 @@ class Driver(ABC):
     parameters_file: ClassVar[Path]
     translated: ClassVar[Collection[str]] = ()
     """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
-    kept: ClassVar[Mapping[str, Value]] = MappingProxyType({})
-    """Parameters that the translator keeps itself, and their values at first, unless a row says what the controller
-    calls them."""
     eager_poll_s: ClassVar[float] = EAGER_S
     """Real seconds between two looks when a scan may end at any moment."""
     max_pixels: ClassVar[int] = 4096 * 4096

@@ -66,7 +66,7 @@ for _core in ("numpy.core", "numpy._core"):  # before numpy 2, and since
 class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc, unused-ignore]
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
-            raise BadReply(f"GXSM's reply asks for {f'{module}.{name}'[:100]!r}, which is not run")
+            raise BadReply(f"GXSM's reply asks for {f'{module} {name}'[:100]!r}, which is not run")
         return _ALLOWED[module, name]
 
 
