@@ -18,7 +18,7 @@ from afspm.process.context import new_session
 from afspm.process.message_types import register_all
 from afspm.record.run_json import LATEST_FILE, RUN_FILE, STATE_DIR, read_run_json, run_json_or_empty
 from afspm.record.run_lock import cut_off_message
-from afspm.transport.launching import open_port
+from afspm.transport.zmq_port import open_port
 
 GUEST = "guest"
 GUEST_KEYS = "guest.keys"

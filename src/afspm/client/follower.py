@@ -16,7 +16,7 @@ from afspm.process.context import new_session
 from afspm.process.message_types import register_all
 from afspm.record.overview import Overview
 from afspm.record.run_lock import cut_off_message
-from afspm.transport.launching import open_port
+from afspm.transport.zmq_port import open_port
 
 SMALL = (
     "ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "DriftMapping",

@@ -33,8 +33,8 @@ from afspm.testing.translators.processes import Processes
 from afspm.testing.translators.registry import Lost
 from afspm.testing.translators.support import Support, find_out
 from afspm.translator import Driver
-from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
+from afspm.transport.zmq_port import open_port
 
 NAME = "translator_test"
 SPEED = 20.0
