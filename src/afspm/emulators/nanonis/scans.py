@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.activities import RETRACE, SimulatedScan
+from afspm.emulators.activities import RETRACE, ScanActivity
 from afspm.emulators.nanonis import files
 from afspm.emulators.nanonis.core import NanonisCore
 from afspm.emulators.nanonis.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
@@ -31,7 +31,7 @@ _AUTOSAVE: Final = ("all", "next", "off")
 class StartedScan:
     """A scan with the settings of its start."""
 
-    scan: SimulatedScan
+    scan: ScanActivity
     frame: tuple[float, float, float, float, float]
     line_s: tuple[float, float]
     channels: list[int]
@@ -50,6 +50,69 @@ class ScanProperties:
     autopaste: int = 2
 
 
+class ScanFiles:
+    """Images of scans, and the files that they are saved in."""
+
+    def __init__(self, core: NanonisCore, signals: Signals) -> None:
+        self._core, self._signals = core, signals
+
+    def images(self, started: StartedScan, until_s: float | None) -> dict[int, Image]:
+        """Return an image for each channel; lines not yet scanned are NaN."""
+        drawn = started.scan.channels(until_s)
+        found: dict[int, Image] = {}
+        for channel, (unit, values) in drawn.items():
+            if channel in CHANNELS:
+                back = drawn.get(f"{channel}{RETRACE}", (unit, values))[1]
+                found[CHANNELS[channel]] = (NAMES.get(channel, channel), unit, values, back)
+        nothing = np.zeros(started.scan.shape)
+        for index in started.channels:
+            if index not in found:
+                found[index] = (*name_and_unit(self._signals.names[index]), nothing, nothing)
+        return {index: found[index] for index in started.channels}
+
+    def save(self, ended: StartedScan, properties: ScanProperties, now_s: float) -> str:
+        """Save a scan; return the path that the controller announces."""
+        session, scan, feedback = self._core.session, ended.scan, ended.scan.feedback
+        name = session.next_name(properties.series, 3, ".sxm")
+        path = session.path_of(name)
+        images = self.images(ended, scan.stopped_s)
+        controller, unit = self._core.z_controller_name
+        gains = (feedback.proportional_gain or 0.0, feedback.integral_gain or 0.0)
+        content = files.SxmContent(
+            path=path,
+            start_s=scan.start_s,
+            duration_s=scan.end_s - scan.start_s,
+            center_m=ended.frame[:2],
+            range_m=ended.frame[2:4],
+            angle_deg=ended.frame[4],
+            upwards=scan.upwards,
+            line_s=ended.line_s,
+            bias_v=scan.bias_v,
+            z_controller=(controller, bool(feedback.on), feedback.setpoint or 0.0, unit, *gains),
+            comment=properties.comment,
+            channels=[(index, *image) for index, image in images.items()],
+            settings=self._header(ended, properties, images),
+        )
+        return path if session.save(name, files.sxm(content), now_s) else ""
+
+    def _header(self, ended: StartedScan, properties: ScanProperties, images: Mapping[int, Image]) -> dict[str, str]:
+        scan, number = ended.scan, files.engineering
+        return {
+            "NanonisMain>Session Path": self._core.session.path,
+            "NanonisMain>SW Version": "Generic 5",
+            "Bias>Bias (V)": number(scan.bias_v),
+            "Z-Controller>Controller status": "ON" if scan.feedback.on else "OFF",
+            "Z-Controller>Setpoint": number(scan.feedback.setpoint or 0.0),
+            "Scan>Scanfield": ";".join(number(value) for value in ended.frame),
+            "Scan>series name": properties.series,
+            "Scan>channels": ";".join(f"{name} ({unit})" for name, unit, _, _ in images.values()),
+            "Scan>pixels/line": str(scan.shape[1]),
+            "Scan>lines": str(scan.shape[0]),
+            "Scan>speed forw. (m/s)": number(ended.frame[2] / ended.line_s[0]),
+            "Scan>speed backw. (m/s)": number(ended.frame[2] / ended.line_s[1]),
+        }
+
+
 class ScanModule:
     """The module.
 
@@ -64,7 +127,7 @@ class ScanModule:
     """
 
     def __init__(self, core: NanonisCore, signals: Signals, *, rows_as_recorded: bool) -> None:
-        self._core, self._signals = core, signals
+        self._core, self._signals, self._files = core, signals, ScanFiles(core, signals)
         self._rows_as_recorded = rows_as_recorded
         self.channels = sorted(CHANNELS[name] for name in core.rig.channels if name in CHANNELS)
         self.pixels, self.lines = 128, 128
@@ -73,7 +136,7 @@ class ScanModule:
         self.properties = ScanProperties()
         self.running: StartedScan | None = None
         self.last: StartedScan | None = None
-        self.ends, self._ended_s, self._last_path = 0, -math.inf, ""
+        self.ends, self._last_end = 0, (-math.inf, "")
         self._delayed_start: tuple[float, bool] | None = None
 
     # --- the running scan ---
@@ -132,10 +195,10 @@ class ScanModule:
     def _end(self, ended: StartedScan, now_s: float) -> None:
         self.running = None
         finished = ended.scan.stopped_s is None
-        path = self._save_file(ended, now_s) if finished and self._saves(now_s) else ""
-        if not (path and self._core.faults.strikes("stale-name", now_s)):
-            self._last_path = path
-        self.ends, self._ended_s = self.ends + 1, ended.scan.end_s
+        path = self._files.save(ended, self.properties, now_s) if finished and self._saves(now_s) else ""
+        if path and self._core.faults.strikes("stale-name", now_s):
+            path = self._last_end[1]
+        self.ends, self._last_end = self.ends + 1, (ended.scan.end_s, path)
         if finished and self.properties.continuous:
             self.start(ended.scan.upwards != self.properties.bouncy)
 
@@ -166,14 +229,15 @@ class ScanModule:
             return 0, ""
         ends_before, since_s = client.pop(_WAITED, (ends, 0.0))
         pause_s = core.clock.real_s(core.now_s - since_s)
-        if ends > ends_before and self._ended_s > since_s + pause_s:
-            return 0, self._last_path
+        ended_s, path = self._last_end
+        if ends > ends_before and ended_s > since_s + pause_s:
+            return 0, path
 
         def gave_up() -> None:
             client[_WAITED] = self.ends, core.now_s
 
         def ready(now_s: float) -> Results | None:
-            return (0, self._last_path) if self.ends > ends else None
+            return (0, self._last_end[1]) if self.ends > ends else None
 
         return DeferredResult(ready, core.deadline_s(timeout_ms), (1, ""), gave_up)
 
@@ -286,7 +350,7 @@ class ScanModule:
         if last is None or last.scan.drawing:
             raw, upwards = np.full((self.lines, self.pixels), np.nan), True
         else:
-            *_, there, back = self._images(last, self._core.now_s)[channel]
+            *_, there, back = self._files.images(last, self._core.now_s)[channel]
             raw, upwards = (there if forward else back[:, ::-1]), last.scan.upwards
         rows = raw if self._rows_as_recorded and upwards else raw[::-1]
         return self._signals.names[channel], rows, int(upwards)
@@ -295,61 +359,5 @@ class ScanModule:
     def _save(self, wait: int, timeout_ms: int) -> Answer:
         if self.last is None:
             raise FunctionRefused("there is no scan to save")
-        self._save_file(self.last, self._core.now_s)
+        self._files.save(self.last, self.properties, self._core.now_s)
         return (0,)
-
-    def _images(self, started: StartedScan, until_s: float | None) -> dict[int, Image]:
-        """Return an image for each channel; lines not yet scanned are NaN."""
-        drawn = started.scan.channels(until_s)
-        found: dict[int, Image] = {}
-        for channel, (unit, values) in drawn.items():
-            if channel in CHANNELS:
-                back = drawn.get(f"{channel}{RETRACE}", (unit, values))[1]
-                found[CHANNELS[channel]] = (NAMES.get(channel, channel), unit, values, back)
-        nothing = np.zeros(started.scan.shape)
-        for index in started.channels:
-            if index not in found:
-                found[index] = (*name_and_unit(self._signals.names[index]), nothing, nothing)
-        return {index: found[index] for index in started.channels}
-
-    def _save_file(self, ended: StartedScan, now_s: float) -> str:
-        """Save a scan; return the path that the controller announces."""
-        session, scan, feedback = self._core.session, ended.scan, ended.scan.feedback
-        name = session.next_name(self.properties.series, 3, ".sxm")
-        path = session.path_of(name)
-        images = self._images(ended, scan.stopped_s)
-        controller, unit = self._core.z_controller_name
-        gains = (feedback.proportional_gain or 0.0, feedback.integral_gain or 0.0)
-        content = files.SxmContent(
-            path=path,
-            start_s=scan.start_s,
-            duration_s=scan.end_s - scan.start_s,
-            center_m=ended.frame[:2],
-            range_m=ended.frame[2:4],
-            angle_deg=ended.frame[4],
-            upwards=scan.upwards,
-            line_s=ended.line_s,
-            bias_v=scan.bias_v,
-            z_controller=(controller, bool(feedback.on), feedback.setpoint or 0.0, unit, *gains),
-            comment=self.properties.comment,
-            channels=[(index, *image) for index, image in images.items()],
-            settings=self._header(ended, images),
-        )
-        return path if session.save(name, files.sxm(content), now_s) else ""
-
-    def _header(self, ended: StartedScan, images: Mapping[int, Image]) -> dict[str, str]:
-        scan, number = ended.scan, files.engineering
-        return {
-            "NanonisMain>Session Path": self._core.session.path,
-            "NanonisMain>SW Version": "Generic 5",
-            "Bias>Bias (V)": number(scan.bias_v),
-            "Z-Controller>Controller status": "ON" if scan.feedback.on else "OFF",
-            "Z-Controller>Setpoint": number(scan.feedback.setpoint or 0.0),
-            "Scan>Scanfield": ";".join(number(value) for value in ended.frame),
-            "Scan>series name": self.properties.series,
-            "Scan>channels": ";".join(f"{name} ({unit})" for name, unit, _, _ in images.values()),
-            "Scan>pixels/line": str(scan.shape[1]),
-            "Scan>lines": str(scan.shape[0]),
-            "Scan>speed forw. (m/s)": number(ended.frame[2] / ended.line_s[0]),
-            "Scan>speed backw. (m/s)": number(ended.frame[2] / ended.line_s[1]),
-        }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from afspm.emulators.activities import RETRACE, SimulatedSpectrum
+from afspm.emulators.activities import RETRACE, SpectrumActivity
 from afspm.emulators.nanonis.core import NanonisCore
 from afspm.emulators.nanonis.dispatch import Answer, FunctionRefused, answers
 from afspm.emulators.nanonis.logger import LARGEST_OVERSAMPLING, TcpLogger
@@ -193,7 +193,7 @@ class Signals:
         return (self.logger.status(),)
 
 
-def spectrum_columns(curve: SimulatedSpectrum) -> list[str]:
+def spectrum_columns(curve: SpectrumActivity) -> list[str]:
     """Return the column names as Nanonis writes them: "Current [bwd] (A)"; the swept signal comes first."""
     columns: list[str] = []
     for name, unit in zip(curve.names, curve.units, strict=True):

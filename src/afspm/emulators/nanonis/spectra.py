@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from afspm.emulators.activities import SimulatedSpectrum
+from afspm.emulators.activities import SpectrumActivity
 from afspm.emulators.nanonis import files
 from afspm.emulators.nanonis.core import NanonisCore
 from afspm.emulators.nanonis.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
@@ -44,7 +44,7 @@ class SweepSettings:
     saves_all: bool = False
     dialog: bool = False
 
-    def resample(self, curve: SimulatedSpectrum) -> SimulatedSpectrum:
+    def resample(self, curve: SpectrumActivity) -> SpectrumActivity:
         """Return the spectrum resampled to this sweep."""
         values = curve.values
         if self.points is not None or self.limits is not None:
@@ -74,7 +74,7 @@ class SpectroscopyModules:
     def __init__(self, core: NanonisCore, signals: Signals) -> None:
         self._core, self._signals = core, signals
         self.sweeps = {module: SweepSettings() for module in _KINDS}
-        self.running: SimulatedSpectrum | None = None
+        self.running: SpectrumActivity | None = None
         self.ended = 0
         self._base_names = dict(_FILE_NAMES)
 
@@ -98,7 +98,7 @@ class SpectroscopyModules:
         curve = sweep.resample(self._core.rig.start_spectrum(_KINDS[module], sweep.sweeps))
         self.running = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
 
-    def _recorded(self, curve: SimulatedSpectrum, channels: list[int]) -> SimulatedSpectrum:
+    def _recorded(self, curve: SpectrumActivity, channels: list[int]) -> SpectrumActivity:
         """Select the recorded channels; one that the simulated spectrum does not have is constant."""
         names, units, columns = [curve.names[0]], [curve.units[0]], [curve.values[:, 0]]
         for index in channels:
@@ -114,7 +114,7 @@ class SpectroscopyModules:
                 columns.append(np.full(len(curve.values), self._signals.values([index], curve.start_s)[0]))
         return replace(curve, names=tuple(names), units=tuple(units), values=np.stack(columns, axis=1))
 
-    def _header(self, module: str, curve: SimulatedSpectrum, now_s: float) -> dict[str, str]:
+    def _header(self, module: str, curve: SpectrumActivity, now_s: float) -> dict[str, str]:
         (x, y), number = curve.position_m, files.engineering
         return {
             "Experiment": _TITLES[module],
