@@ -176,7 +176,7 @@ def run_translator(driver: Driver, context: ProcessContext, make: Callable[..., 
 
 def _run_alone(driver: Driver, context: ProcessContext, make: Callable[..., Translator]) -> int:
     """Open the sockets and the memory, and run the translator."""
-    from afspm.transport.launching import open_server_port
+    from afspm.transport.zmq_server import open_server_port
 
     launch = context.launch
     # saved several times with each request: all of it is for a kill, after a power cut no request is waiting any more
