@@ -44,7 +44,7 @@ def sxm(folder: Path) -> Paths:
     """Each signal forward and backward: twice as much as of the others."""
     channels = [(k, name, "m", picture(k), picture(-k + 10)) for k, name in enumerate(CHANNELS)]
     path = folder / "scan001.sxm"
-    scan = nanonis.SavedScan(
+    scan = nanonis.SxmContent(
         path=str(path),
         start_s=0.0,
         duration_s=1024.0,
@@ -63,13 +63,13 @@ def sxm(folder: Path) -> Paths:
     return [path]
 
 
-def netcdf(folder: Path, write: Callable[[gxsm.SavedScan], bytes]) -> Paths:
+def netcdf(folder: Path, write: Callable[[gxsm.GxsmScanFile], bytes]) -> Paths:
     """A file for each channel."""
     paths = []
     for k, name in enumerate(CHANNELS):
         paths.append(folder / f"scan001-Xp-{name}.nc")
         frame = (0.0, 0.0, 1e4, 1e4, 0.0)
-        scan = gxsm.SavedScan(str(paths[-1]), name, picture(k), 0.5, ("AA", "Å"), frame, 0.0, 1024.0, "SPM-SIM", 0.1)
+        scan = gxsm.GxsmScanFile(str(paths[-1]), name, picture(k), 0.5, ("AA", "Å"), frame, 0.0, 1024.0, "SPM-SIM", 0.1)
         paths[-1].write_bytes(write(scan))
     return paths
 

@@ -14,7 +14,7 @@ import zmq
 
 from afspm import wire
 from afspm.clock import ExperimentClock
-from afspm.emulators import known
+from afspm.emulators import registry
 from afspm.errors import WireError
 from afspm.model import Response
 from afspm.transport.network import Network
@@ -76,7 +76,7 @@ def translator(scan_every_s: float | None = None) -> None:
 
 def emulator(vendor: str, folder: str) -> None:
     """An emulated controller."""
-    made = known.emulator(vendor)(port=0)
+    made = registry.emulator(vendor)(port=0)
     made.run(ExperimentClock.real(), Path(folder), logging.getLogger(vendor), ready)
 
 

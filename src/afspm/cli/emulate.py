@@ -41,7 +41,7 @@ def emulate(
     Runs until Ctrl-C. It listens on this computer only, at a free port unless it is told another: whoever connects
     to the vendor's usual port may expect a real controller there.
     """
-    from afspm.emulators.known import emulator, names
+    from afspm.emulators.registry import emulator, names
 
     if not name:
         for known in names():

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from afspm.clock import Clock
-from afspm.emulators.running import (
+from afspm.emulators.activities import (
     RETRACE,
-    Drawn,
-    InAir,
-    NotDrawn,
+    NoValues,
     Occupied,
-    RunningScan,
-    RunningSpectrum,
+    ScanValues,
+    SimulatedScan,
+    SimulatedSpectrum,
+    ValuesInAir,
     noise_in_air,
 )
 from afspm.errors import AfspmError, InvalidValue
@@ -32,7 +32,7 @@ from afspm.simulation import World
 from afspm.simulation.feedback import Loop
 from afspm.simulation.scanning import Course
 
-Doing = RunningScan | RunningSpectrum | Occupied
+Doing = SimulatedScan | SimulatedSpectrum | Occupied
 _MOST_AVERAGED = 32  # of more sweeps the noise is no less
 _FASTEST_DRIFT_M_S = 1e-6
 _SMALLEST_M, _LARGEST_M, _LONGEST_PIXEL = 1e-12, 200e-6, 1e4
@@ -84,8 +84,8 @@ class Rig:
         self.move_speed_m_s = 5e-6
         self.approach_s = 1.0
         self.engaged = True
-        self.scan: RunningScan | None = None
-        self.spectrum: RunningSpectrum | None = None
+        self.scan: SimulatedScan | None = None
+        self.spectrum: SimulatedSpectrum | None = None
         self.wake: Callable[[], None] = lambda: None
         self.log = logging.getLogger(__name__)
         self._background = background
@@ -115,12 +115,12 @@ class Rig:
         """When it will be free by itself; None if it is, if it is paused, or if `wake` will tell."""
         if self._doing is None or not self._doing.running(now_s) or self._doing.end_s <= now_s:
             return None
-        return None if isinstance(self._doing, RunningScan) and self._doing.paused else self._doing.end_s
+        return None if isinstance(self._doing, SimulatedScan) and self._doing.paused else self._doing.end_s
 
     def probe_at(self, now_s: float) -> tuple[float, float]:
         """Where the tip is, also during a move or a scan."""
         doing = self._doing
-        if isinstance(doing, RunningScan) and doing.running(now_s):
+        if isinstance(doing, SimulatedScan) and doing.running(now_s):
             return doing.tip_m(now_s)
         if isinstance(doing, Occupied) and doing.what == "move" and doing.running(now_s):
             part = (now_s - doing.start_s) / (doing.end_s - doing.start_s)
@@ -163,15 +163,15 @@ class Rig:
 
     # -- what it can be told to do
 
-    def start_scan(self) -> RunningScan:
+    def start_scan(self) -> SimulatedScan:
         """Scan the frame.
 
         Raises:
             RigBusy. InvalidValue: what is in force can't be scanned.
         """
         now_s = self._free_now_s()
-        drawn: Future[Drawn] = Future()
-        scan = RunningScan(
+        drawn: Future[ScanValues] = Future()
+        scan = SimulatedScan(
             self._scans + 1,
             self.region,
             self.shape,
@@ -196,7 +196,7 @@ class Rig:
         if self.scan is not None:
             self.scan.stop(self.clock.now_s())
 
-    def start_spectrum(self, kind: str, sweeps: int = 1) -> RunningSpectrum:
+    def start_spectrum(self, kind: str, sweeps: int = 1) -> SimulatedSpectrum:
         """Take a curve of a kind ("IV", "force") where the probe is, the mean of so many.
 
         Raises:
@@ -215,7 +215,7 @@ class Rig:
             for column, unit in list(enumerate(units))[1:]:  # the first is what is swept
                 values[:, column] = noise_in_air(random, values.shape[:1], unit)
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
-        self.spectrum = RunningSpectrum(self._spectra, kind, self._probe_m, now_s, end_s, names, units, values)
+        self.spectrum = SimulatedSpectrum(self._spectra, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
         return self.spectrum
 
@@ -226,7 +226,7 @@ class Rig:
 
     def stop_spectrum(self) -> None:
         """Break the spectrum off, if one is running: it is gone."""
-        if isinstance(self._doing, RunningSpectrum) and self._doing.running(self.clock.now_s()):
+        if isinstance(self._doing, SimulatedSpectrum) and self._doing.running(self.clock.now_s()):
             self._doing = self.spectrum = None
 
     def move_probe(self, xy_m: tuple[float, float]) -> None:
@@ -324,14 +324,14 @@ class Rig:
         if self.scan is not None:
             wait([self.scan._drawn])
 
-    def _drawer(self, scan: RunningScan) -> Callable[[], Drawn]:
+    def _drawer(self, scan: SimulatedScan) -> Callable[[], ScanValues]:
         _scannable(scan)
         direction, slope = ("up" if scan.upwards else "down"), self.slope
         course = Course(scan.region, scan.shape, scan.line_s, scan.start_s, direction)
         Loop.of(self.world.settings.feedback, scan.feedback)
         _finite("bias and slope", scan.bias_v, *slope)
         if not self.engaged:
-            air = InAir(self._units, course, (self.seed, 1, scan.number))
+            air = ValuesInAir(self._units, course, (self.seed, 1, scan.number))
             return lambda: air
         return lambda: self.world.scan(
             scan.region,
@@ -344,13 +344,13 @@ class Rig:
             slope=slope,
         )
 
-    def _in_background(self, draw: Callable[[], Drawn], scan: RunningScan) -> None:
+    def _in_background(self, draw: Callable[[], ScanValues], scan: SimulatedScan) -> None:
         def work() -> None:
             try:
                 drawn = draw()
             except Exception:
                 self.log.exception("scan %d can't be simulated: it was broken off", scan.number)
-                drawn, scan.stopped_s = NotDrawn(self._units, scan.shape), scan.start_s
+                drawn, scan.stopped_s = NoValues(self._units, scan.shape), scan.start_s
             scan._drawn.set_result(drawn)
             self.wake()
 
@@ -358,7 +358,7 @@ class Rig:
         Thread(target=work, daemon=True, name="simulated scan").start()
 
 
-def _scannable(scan: RunningScan) -> None:
+def _scannable(scan: SimulatedScan) -> None:
     """Raises InvalidValue: no scanner has such a frame; simulating it takes minutes, or more memory than there is."""
     pixels = [size_m / count for size_m, count in zip(scan.region.size_m, scan.shape[::-1], strict=True)]
     reach = all(_SMALLEST_M <= size_m <= _LARGEST_M for size_m in scan.region.size_m)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from afspm.emulators import known
+from afspm.emulators import registry
 
 FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")
@@ -41,11 +41,11 @@ def checked(folder: Path, *files: Path) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("vendor", known.names())
+@pytest.mark.parametrize("vendor", registry.names())
 def test_no_byte_reaches_who_has_the_vendors_usual_port(
     vendor: str, tmp_path: Path, strangers: Callable[..., AbstractContextManager[Any]]
 ) -> None:
-    usual = known.emulator(vendor).usual
+    usual = registry.emulator(vendor).usual
     with strangers(*range(usual["port"], usual["port"] + usual.get("ports", 1))):
         assert checked(tmp_path, FILES / f"emulated_{vendor}.toml")["simulated"] is True
 
@@ -55,7 +55,7 @@ def test_no_call_reaches_the_shared_memory_of_a_gxsm_that_is_not_the_emulated_on
     from afspm.clock import ExperimentClock
     from afspm.emulators.faults import Faults
     from afspm.emulators.gxsm import GxsmEmulator
-    from afspm.emulators.gxsm.block import Block
+    from afspm.emulators.gxsm.block import SharedMemoryBlock
 
     name = GxsmEmulator.usual["block"]
     if Path("/dev/shm", name).exists():
@@ -64,7 +64,7 @@ def test_no_call_reaches_the_shared_memory_of_a_gxsm_that_is_not_the_emulated_on
     overlay.write_text('[controller]\ntransport = "shm"\n[microscope]\naddress = "shm"\n', encoding="utf-8")
     calls: list[Any] = []
     clock = ExperimentClock.real()
-    real = Block(
+    real = SharedMemoryBlock(
         name, GxsmEmulator.usual["process"], tmp_path, Faults([], {}, clock.now_s()), clock.now_s, calls.append
     )
     try:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.emulators import known
+from afspm.emulators import registry
 from afspm.emulators.asylum import AsylumEmulator
 from afspm.emulators.emulator import Emulator
 from afspm.errors import ConfigError
@@ -76,16 +76,16 @@ def test_settings_without_sense_are_refused_before_it_runs() -> None:
 
 
 def test_an_emulator_has_a_name_or_is_one_of_the_users() -> None:
-    assert known.emulator(f"{Tiny.__module__}.Tiny") is Tiny
+    assert registry.emulator(f"{Tiny.__module__}.Tiny") is Tiny
     with pytest.raises(ConfigError, match="there is no emulator 'veeco'"):
-        known.emulator("veeco")
+        registry.emulator("veeco")
     with pytest.raises(ConfigError, match="is no emulator"):
-        known.emulator("pathlib.Path")
+        registry.emulator("pathlib.Path")
 
 
-@pytest.mark.parametrize("name", known.names())
+@pytest.mark.parametrize("name", registry.names())
 def test_those_of_afspm_say_what_they_are(name: str) -> None:
-    found = known.emulator(name)
+    found = registry.emulator(name)
     assert issubclass(found, Emulator)
     assert found.vendor
     assert all(found.fault_kinds.values())

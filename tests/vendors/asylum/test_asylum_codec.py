@@ -67,15 +67,15 @@ def test_the_longest_request_has_1024_bytes() -> None:
 
 @pytest.mark.parametrize("value", [3.0, 1e-9, 0.1, -1.5e300, math.inf, -math.inf, math.nan])
 def test_numbers_come_back(value: float) -> None:
-    reply = xop.reply(wire.success(wire.Function(lambda: value), value, "7"))
+    reply = xop.reply(wire.success(wire.IgorFunction(lambda: value), value, "7"))
     assert reply.message_id == "7"
     np.testing.assert_equal(reply.results, (value,))
 
 
 def test_several_results_and_those_by_reference_come_back() -> None:
-    several = wire.Function(lambda: None, "", "vsd")
+    several = wire.IgorFunction(lambda: None, "", "vsd")
     assert xop.reply(wire.success(several, (1.0, "", "root:"), "7")).results == (1.0, "", "root:")
-    by_reference = wire.Function(lambda: None, "vVS")
+    by_reference = wire.IgorFunction(lambda: None, "vVS")
     assert xop.reply(wire.success(by_reference, (1.0, (2.0, "a")), "7")).passed_back == (2.0, "a")
 
 
@@ -83,11 +83,11 @@ def test_waves_come_back_column_by_column() -> None:
     content = wire.wave([1.0, 2.0, 3.0, 4.0, 5.0, math.nan], note="height")
     content["dimension"] = {"size": [2, 3], "delta": [0.5, 1.0]}
     content["data"]["unit"] = "m"
-    (wave,) = xop.reply(wire.success(wire.Function(lambda: None, "", "w"), content, "7")).results
+    (wave,) = xop.reply(wire.success(wire.IgorFunction(lambda: None, "", "w"), content, "7")).results
     assert isinstance(wave, xop.Wave)
     np.testing.assert_array_equal(wave.values, [[1.0, 3.0, 5.0], [2.0, 4.0, math.nan]])
     assert (wave.unit, wave.steps, wave.offsets, wave.note) == ("m", (0.5, 1.0), (0.0, 0.0), "height")
-    assert xop.reply(wire.success(wire.Function(lambda: None, "", "w"), None, "7")).results == (None,)
+    assert xop.reply(wire.success(wire.IgorFunction(lambda: None, "", "w"), None, "7")).results == (None,)
 
 
 def test_complex_waves_and_waves_of_texts() -> None:
@@ -104,7 +104,7 @@ def test_complex_waves_and_waves_of_texts() -> None:
 
 
 def test_an_error_has_its_number_its_meaning_and_what_igor_printed() -> None:
-    reply = xop.reply(wire.failure(wire.Failed(107, "index out of range"), "7"))
+    reply = xop.reply(wire.failure(wire.CallFailed(107, "index out of range"), "7"))
     assert reply.error is not None
     error = xop.XopError(*reply.error, where="F")
     assert error.number == 107
@@ -112,7 +112,7 @@ def test_an_error_has_its_number_its_meaning_and_what_igor_printed() -> None:
     assert f"the function was aborted (107: {meant} index out of range)" in str(error)
 
 
-GOOD = wire.success(wire.Function(lambda: None, "S", "v"), (1.0, ("a",)), "7")
+GOOD = wire.success(wire.IgorFunction(lambda: None, "S", "v"), (1.0, ("a",)), "7")
 
 
 @settings(max_examples=300)

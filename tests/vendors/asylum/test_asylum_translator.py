@@ -12,7 +12,7 @@ from asylum_bench import Bench, Emulated
 from igor2 import binarywave
 from vendor_bench import FLAT, SHAPE, TURNED, Peer, left_in_danger, moved, ready, scanned, states
 
-from afspm.emulators.asylum.wire import Failed
+from afspm.emulators.asylum.wire import CallFailed
 from afspm.files import read
 from afspm.model import (
     ControlRequest,
@@ -443,7 +443,7 @@ def test_after_a_scan_that_did_not_begin_spots_count_on_the_image_of_before(benc
 
         def abort(now_s: float, down: bool | None) -> None:
             made.emulator.controller.scan = plain  # type: ignore[method-assign]
-            raise Failed(107, "User abort.")
+            raise CallFailed(107, "User abort.")
 
         made.emulator.controller.scan = abort  # type: ignore[method-assign]
     else:

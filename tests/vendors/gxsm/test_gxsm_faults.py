@@ -11,7 +11,7 @@ import pytest
 from gxsm_bench import Bench
 from vendor_bench import SHAPE, SOON, Peer, ready, scans, states
 
-from afspm.emulators.gxsm.program import Program
+from afspm.emulators.gxsm.program import GxsmProgram
 from afspm.files import read
 from afspm.model import (
     ControlRequest,
@@ -396,7 +396,7 @@ def test_a_gxsm_that_names_its_channels_only_once_it_scans(bench: Make) -> None:
     assert {name[:7] for name in scanned(peer)} == {"scan002"}
 
 
-def _named_late(program: Program) -> Callable[[float], list[Path]]:
+def _named_late(program: GxsmProgram) -> Callable[[float], list[Path]]:
     names, first = program.names, program.last
 
     def late(now_s: float) -> list[Path]:

@@ -11,7 +11,7 @@ import pytest
 from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm import files
 from afspm.emulators.gxsm.channels import CHANNELS
-from afspm.emulators.gxsm.saving import FAULT_KINDS, Saving
+from afspm.emulators.gxsm.file_writer import FAULT_KINDS, GxsmFileWriter
 from afspm.files import netcdf, read
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "gxsm"
@@ -36,7 +36,7 @@ def sizes(folder: Path) -> dict[str, int]:
 
 
 def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_path: Path) -> None:
-    saving = Saving(tmp_path, Faults([], FAULT_KINDS, START_S))
+    saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S))
     saving.write([(tmp_path / "a", bytes(100)), (tmp_path / "b", bytes(200))], START_S)
     seen = [sizes(tmp_path)]
     next_s: float | None = START_S
@@ -48,7 +48,7 @@ def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_p
 
 
 def test_the_next_number_is_the_first_that_no_file_has(tmp_path: Path) -> None:
-    saving = Saving(tmp_path, Faults([], FAULT_KINDS, START_S))
+    saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S))
     (tmp_path / "scan001-Xp-a.nc").touch()
     paths = [saving.free(ending) for ending in ("Xp-a.nc", "Xp-b.nc")]
     assert [path.name for path in paths] == ["scan002-Xp-a.nc", "scan001-Xp-b.nc"]
@@ -64,7 +64,7 @@ def written(folder: Path, version: int, label: str, real: Path) -> Path:
     header = content.header
     frame = tuple(float(header[key]) for key in ("offsetx", "offsety", "rangex", "rangey", "alpha"))
     in_channels_unit = np.asarray(scan.values) * (1e10 if scan.unit == "m" else 1.0) / channel.scale
-    saved = files.SavedScan(
+    saved = files.GxsmScanFile(
         str(folder / real.name),
         label,
         channel.raw(in_channels_unit),
@@ -128,7 +128,7 @@ def test_a_spectrum_written_by_the_emulator_reads_as_the_real_one(tmp_path: Path
         for k, (name, unit) in enumerate(zip(curve.names, curve.units, strict=True))
     }
     assert true.end_ns is not None
-    saved = files.SavedCurve("x", columns, true.end_ns / 1e9, (0.0, 0.0), 0.25, "00.02")
+    saved = files.GxsmSpectrumFile("x", columns, true.end_ns / 1e9, (0.0, 0.0), 0.25, "00.02")
     path = tmp_path / Path(CURVE).name
     path.write_bytes(files.vpdata(saved))
     ours = read(path)

@@ -22,8 +22,8 @@ from vendor_bench import DEADLINE_S
 
 from afspm.emulators.emulator import Crashed
 from afspm.emulators.faults import Faults
-from afspm.emulators.gxsm.block import FAULT_KINDS, Block
-from afspm.emulators.gxsm.saving import Saving
+from afspm.emulators.gxsm.block import FAULT_KINDS, SharedMemoryBlock
+from afspm.emulators.gxsm.file_writer import GxsmFileWriter
 from afspm.files import read
 
 Make = Callable[..., Bench]
@@ -432,19 +432,19 @@ def test_a_scan_that_can_not_be_simulated_does_not_begin(bench: Make) -> None:
 
 
 def test_files_are_counted_beyond_three_digits(tmp_path: Path) -> None:
-    saving = Saving(tmp_path, Faults([], {}, 0.0))
+    saving = GxsmFileWriter(tmp_path, Faults([], {}, 0.0))
     saving.counted([tmp_path / "scan1000-M-Xp-Topo.nc"])
     assert saving.counter == 1001
 
 
 @contextmanager
-def answering(folder: Path, value: object) -> Iterator[tuple[Block, MemoryClient]]:
+def answering(folder: Path, value: object) -> Iterator[tuple[SharedMemoryBlock, MemoryClient]]:
     """Shared memory, every call of which is answered with a value, once it is taken."""
     if not sys.platform.startswith("linux"):
         pytest.skip("Gxsm4's shared memory is there on Linux alone")
     name = f"afspm_test_{os.getpid()}_{id(value)}"
     faults = Faults([], FAULT_KINDS, 0.0)
-    block = Block(name, "emulated", folder, faults, lambda: 0.0, lambda call: call.answered(value))
+    block = SharedMemoryBlock(name, "emulated", folder, faults, lambda: 0.0, lambda call: call.answered(value))
     client = MemoryClient(f"shm:{name}@{block.pid}")
     try:
         yield block, client

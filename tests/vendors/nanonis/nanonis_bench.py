@@ -8,7 +8,7 @@ from typing import Any
 
 from vendor_bench import PATIENT, AtPanel, VendorBench
 
-from afspm.emulators.nanonis import NanonisEmulator, Waiting
+from afspm.emulators.nanonis import NanonisEmulator, PendingReply
 
 
 class Emulated(AtPanel, NanonisEmulator):
@@ -35,7 +35,7 @@ class Emulated(AtPanel, NanonisEmulator):
     def _waits_for(self, function: str) -> bool:
         """Whether a client does."""
         waiting = [connection.waits_for for connection in self._server.connections]
-        return any(isinstance(one, Waiting) and one.name == function for one in waiting)
+        return any(isinstance(one, PendingReply) and one.name == function for one in waiting)
 
 
 class Bench(VendorBench[Emulated]):

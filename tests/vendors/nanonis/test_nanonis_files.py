@@ -40,9 +40,9 @@ REAL_LINES = [
 ]
 
 
-def saved(*, upwards: bool) -> files.SavedScan:
+def saved(*, upwards: bool) -> files.SxmContent:
     rows = np.arange(160.0 * 160.0).reshape(160, 160)
-    return files.SavedScan(
+    return files.SxmContent(
         path="nanonis.sxm",
         start_s=1_700_000_000.0,
         duration_s=415.9,

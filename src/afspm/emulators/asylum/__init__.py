@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from afspm.emulators.asylum import wire
-from afspm.emulators.asylum.controller import FAULT_KINDS, Controller
-from afspm.emulators.asylum.functions import Dialog, Software
-from afspm.emulators.asylum.server import Queued, Server
-from afspm.emulators.asylum.values import Values
+from afspm.emulators.asylum.controller import FAULT_KINDS, AsylumController
+from afspm.emulators.asylum.functions import AsylumFunctions, DialogOpen
+from afspm.emulators.asylum.server import QueuedCall, XopServer
+from afspm.emulators.asylum.values import IgorValues
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
 from afspm.errors import AfspmError, ConfigError
 from afspm.units import Duration
@@ -22,7 +22,7 @@ _NOT_COMPILED, _ABORTED, _UNKNOWN = 100, 107, 1
 
 
 @dataclass(frozen=True)
-class Delayed:
+class DelayedMessage:
     """A reply that is sent at a time."""
 
     client: bytes
@@ -97,14 +97,14 @@ class AsylumEmulator(Emulator):
 
     def open(self) -> str:
         """Bind the XOP's socket."""
-        self._server = Server(self.port, self.woken, self.log)
+        self._server = XopServer(self.port, self.woken, self.log)
         # "C:Users:Me:"; where there are no drives it begins with a colon
         path = self._save_path or f"{self.folder.drive.rstrip(':')}:{':'.join(self.folder.parts[1:])}:"
         texts = {"SaveImage": path, "SaveForce": path, "BaseName": self._base_name}
-        self.controller = Controller(
+        self.controller = AsylumController(
             self.rig,
             self.faults,
-            Values(texts),
+            IgorValues(texts),
             self.folder,
             start_s=self._start_s,
             file_s=self._file_s,
@@ -112,7 +112,7 @@ class AsylumEmulator(Emulator):
             log=self.log,
         )
         self._functions = self.functions()
-        self._delayed: deque[Delayed] = deque()
+        self._delayed: deque[DelayedMessage] = deque()
         self._idle_at_s = -math.inf
         self._locked_until_s = self._bound_again_at_s = -math.inf
         self._last_id: str | None = None
@@ -122,9 +122,9 @@ class AsylumEmulator(Emulator):
     def _address(self) -> str:
         return f"tcp://{LOOPBACK}:{self._server.port}"
 
-    def functions(self) -> dict[str, wire.Function]:
+    def functions(self) -> dict[str, wire.IgorFunction]:
         """All that can be called, by names in lower case."""
-        software = Software(
+        software = AsylumFunctions(
             self.controller,
             self.clock.now_s,
             self._procedures,
@@ -178,14 +178,14 @@ class AsylumEmulator(Emulator):
     def _busy(self) -> bool:
         return self._locked() or self.faults.lasts("busy", self.clock.now_s())
 
-    def _carry_out(self, queued: Queued) -> None:
+    def _carry_out(self, queued: QueuedCall) -> None:
         """Call the function, and reply."""
         now_s = self.clock.now_s()
         if self.faults.strikes("crash", now_s):
             raise Crashed(f"at {queued.call.name}")
         try:
             payload = self._called(queued.call, now_s)
-        except wire.Failed as failed:
+        except wire.CallFailed as failed:
             payload = wire.failure(failed, queued.call.message_id)
         except UnicodeEncodeError:
             self.log.warning("the reply to %s is not UTF-8: there is none", queued.call.name)
@@ -194,32 +194,32 @@ class AsylumEmulator(Emulator):
         if dialog is not None:
             self._wait_for_somebody(dialog.duration_s)
         if self._locked():
-            self._delayed.append(Delayed(queued.client, payload, self._locked_until_s))
+            self._delayed.append(DelayedMessage(queued.client, payload, self._locked_until_s))
         else:
             self._reply(queued, payload, now_s)
 
-    def _called(self, call: wire.Call, now_s: float) -> bytes:
+    def _called(self, call: wire.FunctionCall, now_s: float) -> bytes:
         if self.faults.lasts("not-compiled", now_s):
-            raise wire.Failed(_NOT_COMPILED)
+            raise wire.CallFailed(_NOT_COMPILED)
         function = self._functions.get(call.name.lower())
         arguments = wire.arguments(function, call.parameters)
         assert function is not None
         if self.faults.strikes("aborted", now_s):
-            raise wire.Failed(_ABORTED, "While executing a user function, the following error occurred: emulated")
+            raise wire.CallFailed(_ABORTED, "While executing a user function, the following error occurred: emulated")
         if self.faults.strikes("unknown", now_s):
-            raise wire.Failed(_UNKNOWN)
+            raise wire.CallFailed(_UNKNOWN)
         try:
             given = function.do(*arguments)
-        except wire.Failed:
+        except wire.CallFailed:
             raise
-        except Dialog as dialog:
+        except DialogOpen as dialog:
             self.log.warning("a dialog waits for OK: %s", dialog)
             self._wait_for_somebody(math.inf)
             given = dialog.result
         except Exception as error:  # whatever a client asks for, Igor stays
             if not isinstance(error, AfspmError):
                 self.log.exception("%s was aborted", call.name)
-            raise wire.Failed(_ABORTED, f"While executing {call.name} an error occurred: {error}") from error
+            raise wire.CallFailed(_ABORTED, f"While executing {call.name} an error occurred: {error}") from error
         if isinstance(given, str) and self.faults.strikes("not-utf8", now_s):
             given += "\udcb0"
         return wire.success(function, given, call.message_id)
@@ -227,18 +227,18 @@ class AsylumEmulator(Emulator):
     def _wait_for_somebody(self, lasts_s: float) -> None:
         self._locked_until_s = self.clock.now_s() + lasts_s
 
-    def _reply(self, queued: Queued, payload: bytes, now_s: float) -> None:
+    def _reply(self, queued: QueuedCall, payload: bytes, now_s: float) -> None:
         """A reply, or what goes wrong with it."""
         before, self._last_id = self._last_id, queued.call.message_id
         if self.faults.strikes("no-reply", now_s):
             return
         if self.faults.strikes("wrong-id", now_s):
-            payload = wire.failure(wire.Failed(_UNKNOWN), before or "another")
+            payload = wire.failure(wire.CallFailed(_UNKNOWN), before or "another")
         if self.faults.strikes("garbage", now_s):
             payload = payload[: len(payload) // 2]
         late = self.faults.strikes("late-reply", now_s)
         if late is not None:
-            self._delayed.append(Delayed(queued.client, payload, now_s + late.duration_s))
+            self._delayed.append(DelayedMessage(queued.client, payload, now_s + late.duration_s))
             return
         if self.faults.strikes("frames", now_s):
             self._server.send(queued.client, payload, b"")

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from afspm.emulators.asylum import saving
-from afspm.emulators.asylum.values import Values
+from afspm.emulators.asylum import files
+from afspm.emulators.asylum.values import IgorValues
 from afspm.emulators.faults import Faults
 from afspm.emulators.rig import Rig
 from afspm.errors import AfspmError, InvalidValue
@@ -41,7 +41,7 @@ _INTEGRAL_GAIN: Final = 150.0
 """What Asylum's gain of 1 is to the simulated feedback, in 1/s."""
 
 
-class Controller:
+class AsylumController:
     """The software.
 
     Args:
@@ -55,7 +55,7 @@ class Controller:
         self,
         rig: Rig,
         faults: Faults,
-        values: Values,
+        values: IgorValues,
         folder: Path,
         *,
         start_s: float,
@@ -71,7 +71,7 @@ class Controller:
         self._file_s = file_s
         self._saves_partial = saves_partial
         self._log = log
-        self._disk = saving.Disk()
+        self._disk = files.PendingWrites()
         self._starts_at_s = math.inf
         self._bias_since_s = -math.inf
         self._curve_running = self._engages = False
@@ -211,7 +211,7 @@ class Controller:
     def _image_done(self, now_s: float) -> None:
         scan = self.rig.scan
         if scan is not None:
-            self._save("SaveImage", now_s, lambda name: saving.image(name, scan, self.values, now_s))
+            self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
         if not self.values.get("LastScan"):
             self.scan(now_s, not self.values.get("ScanDown"))
             return
@@ -226,7 +226,7 @@ class Controller:
         self.values.put("ScanStatus", 0)
         scan = self.rig.scan
         if running and self._saves_partial and scan is not None:
-            self._save("SaveImage", now_s, lambda name: saving.image(name, scan, self.values, now_s))
+            self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
 
     # --- force curves ---
 
@@ -272,7 +272,7 @@ class Controller:
         self._curve_running = False
         spectrum = self.rig.spectrum
         if spectrum is not None:
-            self._save("SaveForce", now_s, lambda name: saving.curve(name, spectrum, self.values, now_s))
+            self._save("SaveForce", now_s, lambda name: files.curve(name, spectrum, self.values, now_s))
 
     # --- files ---
 
@@ -283,7 +283,7 @@ class Controller:
             suffix += 1
         self.values.put("BaseSuffix", suffix)
 
-    def _save(self, where: str, now_s: float, made: saving.Made) -> None:
+    def _save(self, where: str, now_s: float, made: files.Made) -> None:
         faults = self.faults
         if faults.strikes("other-name", now_s):
             self.values.put_text("BaseName", "Somebody")

@@ -6,15 +6,15 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from afspm.emulators.asylum.controller import Controller
-from afspm.emulators.asylum.wire import Failed, Function
+from afspm.emulators.asylum.controller import AsylumController
+from afspm.emulators.asylum.wire import CallFailed, IgorFunction
 
 ABORTED: Final = 107
 _NOTHING: Final = math.nan
 """What a function without a return gives."""
 
 
-class Dialog(Exception):
+class DialogOpen(Exception):
     """A window waits for somebody to press OK; the function gives `result` then."""
 
     def __init__(self, text: str, result: float) -> None:
@@ -22,7 +22,7 @@ class Dialog(Exception):
         self.result = result
 
 
-class Software:
+class AsylumFunctions:
     """Asylum's functions.
 
     Args:
@@ -32,7 +32,13 @@ class Software:
     """
 
     def __init__(
-        self, controller: Controller, now_s: Callable[[], float], procedures: str, *, has_status: bool, image_open: bool
+        self,
+        controller: AsylumController,
+        now_s: Callable[[], float],
+        procedures: str,
+        *,
+        has_status: bool,
+        image_open: bool,
     ) -> None:
         self._controller = controller
         self._now_s = now_s
@@ -40,46 +46,46 @@ class Software:
         self._has_status = has_status
         self._image_open = image_open
 
-    def table(self) -> dict[str, Function]:
+    def table(self) -> dict[str, IgorFunction]:
         """By their names in lower case, as Igor does not tell the two apart."""
         values = self._controller.values
         table = {
-            "GV": Function(self._get, "s"),
-            "PV": Function(self._put, "sv"),
-            "GS": Function(values.text, "s", "s"),
-            "PS": Function(self._put_text, "ss"),
-            "DoScanFunc": Function(self._do_scan, "s"),
-            "DoForceFunc": Function(self._do_force, "s"),
-            "GoToSpot": Function(self._go_to_spot),
-            "SimpleEngageMe": Function(self._engage, "s"),
-            "ARCheckSuffix": Function(self._check_suffix),
+            "GV": IgorFunction(self._get, "s"),
+            "PV": IgorFunction(self._put, "sv"),
+            "GS": IgorFunction(values.text, "s", "s"),
+            "PS": IgorFunction(self._put_text, "ss"),
+            "DoScanFunc": IgorFunction(self._do_scan, "s"),
+            "DoForceFunc": IgorFunction(self._do_force, "s"),
+            "GoToSpot": IgorFunction(self._go_to_spot),
+            "SimpleEngageMe": IgorFunction(self._engage, "s"),
+            "ARCheckSuffix": IgorFunction(self._check_suffix),
         }
         if self._has_status:
-            table["ARGetStatus"] = Function(self._status)
+            table["ARGetStatus"] = IgorFunction(self._status)
         if self._procedures != "none":
             table |= self._spots()
         if self._procedures == "afspm":
             table |= self._afspm()
         return {name.lower(): function for name, function in table.items()}
 
-    def _spots(self) -> dict[str, Function]:
+    def _spots(self) -> dict[str, IgorFunction]:
         values = self._controller.values
         return {
-            "InitProbePos": Function(self._init_spots),
-            "SetProbePosX": Function(lambda x: self._set_spot(0, x), "v"),
-            "SetProbePosY": Function(lambda y: self._set_spot(1, y), "v"),
-            "GetProbePosX": Function(lambda: self._spot()[0]),
-            "GetProbePosY": Function(lambda: self._spot()[1]),
-            "GetBaseName": Function(lambda: values.text("BaseName"), "", "s"),
-            "SetBaseName": Function(lambda name: self._put_text("BaseName", name), "s"),
+            "InitProbePos": IgorFunction(self._init_spots),
+            "SetProbePosX": IgorFunction(lambda x: self._set_spot(0, x), "v"),
+            "SetProbePosY": IgorFunction(lambda y: self._set_spot(1, y), "v"),
+            "GetProbePosX": IgorFunction(lambda: self._spot()[0]),
+            "GetProbePosY": IgorFunction(lambda: self._spot()[1]),
+            "GetBaseName": IgorFunction(lambda: values.text("BaseName"), "", "s"),
+            "SetBaseName": IgorFunction(lambda name: self._put_text("BaseName", name), "s"),
         }
 
-    def _afspm(self) -> dict[str, Function]:
+    def _afspm(self) -> dict[str, IgorFunction]:
         return {
-            "AfspmLook": Function(self._look, "s", "s"),
-            "AfspmController": Function(lambda: "Igor Pro 6.37, SIMULATED", "", "s"),
-            "AfspmFeedback": Function(self._feedback, "v"),
-            "AfspmFeedbackOn": Function(self._feedback_on),
+            "AfspmLook": IgorFunction(self._look, "s", "s"),
+            "AfspmController": IgorFunction(lambda: "Igor Pro 6.37, SIMULATED", "", "s"),
+            "AfspmFeedback": IgorFunction(self._feedback, "v"),
+            "AfspmFeedbackOn": IgorFunction(self._feedback_on),
         }
 
     # --- values ---
@@ -120,7 +126,7 @@ class Software:
         elif name in ("StopScan", "StopEngage"):
             self._controller.stop(now_s)
         else:
-            raise Dialog(f"Something called DoScanFunc with an invalid CtrlName {button!r}", 1.0)
+            raise DialogOpen(f"Something called DoScanFunc with an invalid CtrlName {button!r}", 1.0)
         return 0.0
 
     def _do_force(self, button: str) -> float:
@@ -137,7 +143,7 @@ class Software:
 
     def _go_to_spot(self) -> float:
         if not self._image_open:
-            raise Dialog("there is no image with spots", 0.0)
+            raise DialogOpen("there is no image with spots", 0.0)
         self._controller.go_to_spot(self._now_s())
         return 0.0
 
@@ -164,7 +170,7 @@ class Software:
 
     def _spot(self) -> tuple[float, float]:
         if len(self._controller.spots_m) < 2:
-            raise Failed(ABORTED, "Index out of range for wave SpotX.")
+            raise CallFailed(ABORTED, "Index out of range for wave SpotX.")
         return self._controller.spots_m[1]
 
     def _set_spot(self, axis: int, value: float) -> float:

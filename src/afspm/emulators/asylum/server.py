@@ -13,19 +13,19 @@ from typing import Any
 
 import zmq
 
-from afspm.emulators.asylum.wire import LONGEST_REQUEST, Call, Failed, call, failure
+from afspm.emulators.asylum.wire import LONGEST_REQUEST, CallFailed, FunctionCall, call, failure
 from afspm.emulators.emulator import LOOPBACK
 
 
 @dataclass(frozen=True)
-class Queued:
+class QueuedCall:
     """A call that waits for Igor."""
 
     client: bytes
-    call: Call
+    call: FunctionCall
 
 
-class Server:
+class XopServer:
     """The socket and the queue.
 
     Args:
@@ -37,10 +37,10 @@ class Server:
         self._log = log
         self._context: zmq.Context[Any] = zmq.Context()
         self._wakes = wakes
-        self.queue: deque[Queued] = deque()
+        self.queue: deque[QueuedCall] = deque()
         self.port = port
         self._socket: zmq.Socket[bytes] | None = None
-        self._held: Queued | None = None
+        self._held: QueuedCall | None = None
         self.bind()
 
     def bind(self) -> None:
@@ -110,8 +110,8 @@ class Server:
             return
         client, _, payload = frames
         try:
-            queued = Queued(client, call(payload))
-        except Failed as failed:
+            queued = QueuedCall(client, call(payload))
+        except CallFailed as failed:
             self.send(client, failure(failed, None))
             return
         if locked:

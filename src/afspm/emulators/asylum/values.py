@@ -20,7 +20,7 @@ NUMBERS: Final[dict[str, float]] = {
 }  # fmt: skip
 
 
-class Values:
+class IgorValues:
     """Igor does not tell upper from lower case.
 
     Args:

@@ -42,7 +42,7 @@ _NUMBER: Final = re.compile(
 Value = float | str | Mapping[str, Any] | None
 
 
-class Failed(Exception):
+class CallFailed(Exception):
     """A request that is answered with an error.
 
     Attributes:
@@ -57,7 +57,7 @@ class Failed(Exception):
 
 
 @dataclass(frozen=True)
-class Call:
+class FunctionCall:
     """What a request asks for."""
 
     name: str
@@ -66,7 +66,7 @@ class Call:
 
 
 @dataclass(frozen=True)
-class Function:
+class IgorFunction:
     """A function of Igor's.
 
     Attributes:
@@ -84,23 +84,23 @@ class Function:
     listed: bool = False
 
 
-def call(payload: bytes) -> Call:
+def call(payload: bytes) -> FunctionCall:
     """The call that a request makes.
 
     Raises:
-        Failed: 3 to 7 or 106: the request itself is wrong.
+        CallFailed: 3 to 7 or 106: the request itself is wrong.
     """
     content = _parsed(payload)
     fields = content if isinstance(content, dict) else {}
     version, message_id = fields.get("version"), fields.get("messageID")
     if type(version) is not int or version != 1:
-        raise Failed(4)
+        raise CallFailed(4)
     if "messageID" in fields and not (isinstance(message_id, str) and 1 <= len(message_id.encode()) <= 255):
-        raise Failed(7)
+        raise CallFailed(7)
     wanted = fields.get("CallFunction")
     if not isinstance(wanted, dict):
-        raise Failed(5)
-    return Call(*_function_call(wanted), message_id)
+        raise CallFailed(5)
+    return FunctionCall(*_function_call(wanted), message_id)
 
 
 def _parsed(payload: bytes) -> Any:
@@ -110,7 +110,7 @@ def _parsed(payload: bytes) -> Any:
         content = json.loads(text.decode("utf-8"), parse_constant=_no_constant, parse_int=_integer, parse_float=_finite)
         json.dumps(content, ensure_ascii=False).encode("utf-8")  # half a surrogate pair is no text
     except (ValueError, RecursionError):
-        raise Failed(3) from None
+        raise CallFailed(3) from None
     return content
 
 
@@ -118,35 +118,35 @@ def _function_call(wanted: dict[str, Any]) -> tuple[str, tuple[str, ...]]:
     """The name of the function, and its parameters."""
     name, given = wanted.get("name"), wanted.get("params", [])
     if len(wanted) > 2 or not isinstance(name, str):
-        raise Failed(6)
+        raise CallFailed(6)
     if not name:
-        raise Failed(101)
+        raise CallFailed(101)
     if "params" not in wanted and len(wanted) > 1:
-        raise Failed(6)
+        raise CallFailed(6)
     if not isinstance(given, list):
-        raise Failed(106)
+        raise CallFailed(106)
     return name, tuple(map(_parameter, given))
 
 
-def arguments(function: Function | None, parameters: Sequence[str]) -> list[float | str]:
+def arguments(function: IgorFunction | None, parameters: Sequence[str]) -> list[float | str]:
     """What a function is called with.
 
     Raises:
-        Failed: 101 to 106: it is not there, or can't be called so.
+        CallFailed: 101 to 106: it is not there, or can't be called so.
     """
     if function is None:
-        raise Failed(101)
+        raise CallFailed(101)
     if len(parameters) != len(function.takes):
-        raise Failed(102 if len(parameters) < len(function.takes) else 103)
+        raise CallFailed(102 if len(parameters) < len(function.takes) else 103)
     given = [_argument(kind.lower(), text) for kind, text in zip(function.takes, parameters, strict=True)]
     if not set(function.gives) <= set("vsdw"):
-        raise Failed(105)
+        raise CallFailed(105)
     if not set(function.takes.lower()) <= set("vsd"):
-        raise Failed(104)
+        raise CallFailed(104)
     return given
 
 
-def success(function: Function, given_back: Any, message_id: str | None) -> bytes:
+def success(function: IgorFunction, given_back: Any, message_id: str | None) -> bytes:
     """The reply with what a function gave.
 
     Raises:
@@ -162,7 +162,7 @@ def success(function: Function, given_back: Any, message_id: str | None) -> byte
     return _message(content, message_id)
 
 
-def failure(failed: Failed, message_id: str | None) -> bytes:
+def failure(failed: CallFailed, message_id: str | None) -> bytes:
     """The reply with an error."""
     content: dict[str, Any] = {"errorCode": {"value": failed.number, "msg": str(failed)}}
     if failed.history:
@@ -207,7 +207,7 @@ def _parameter(given: Any) -> str:
         return f"{float(given):.15g}"
     if isinstance(given, str):
         return given
-    raise Failed(106)
+    raise CallFailed(106)
 
 
 def _argument(kind: str, text: str) -> float | str:
@@ -216,7 +216,7 @@ def _argument(kind: str, text: str) -> float | str:
     if not text:
         return 0.0
     if not _NUMBER.fullmatch(text):
-        raise Failed(106)
+        raise CallFailed(106)
     number = text.strip().lower()
     if "nan" in number:
         return math.nan

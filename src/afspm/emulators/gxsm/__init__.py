@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.emulators.emulator import Crashed, Emulator
-from afspm.emulators.gxsm import block, calls, files, program, saving
-from afspm.emulators.gxsm.block import Block
-from afspm.emulators.gxsm.calls import Calls, Silence
-from afspm.emulators.gxsm.console import SCRIPT, Call, Console
+from afspm.emulators.gxsm import block, calls, file_writer, files, program
+from afspm.emulators.gxsm.block import SharedMemoryBlock
+from afspm.emulators.gxsm.calls import GxsmFunctions, NoAnswer
+from afspm.emulators.gxsm.console import SCRIPT, ScriptCall, ScriptConsole
 from afspm.emulators.gxsm.entries import USER_UNITS
-from afspm.emulators.gxsm.program import Program
+from afspm.emulators.gxsm.program import GxsmProgram
 from afspm.errors import ConfigError
 from afspm.units import Length
 
@@ -53,7 +53,7 @@ class GxsmEmulator(Emulator):
         "script-stopped": "script-control is set to 0: the script in the console ends",
         **calls.FAULT_KINDS,
         **program.FAULT_KINDS,
-        **saving.FAULT_KINDS,
+        **file_writer.FAULT_KINDS,
         **block.FAULT_KINDS,
     }
 
@@ -90,18 +90,18 @@ class GxsmEmulator(Emulator):
         self._auto_save, self._probe_auto_save = auto_save, probe_auto_save
         self._reach_m = reach_m
         self._feedback_actions = tuple(feedback_actions)
-        self.unanswered: deque[Call] = deque()
+        self.unanswered: deque[ScriptCall] = deque()
         self.silent = False
-        self._console: Console | None = None
+        self._console: ScriptConsole | None = None
         self._listens = False
-        self._block: Block | None = None
+        self._block: SharedMemoryBlock | None = None
 
     def open(self) -> str:
         """Run the script in the console, or open the shared memory."""
         files.prepare(self._version)
         self.silent = False
         self.unanswered.clear()
-        self.program = Program(
+        self.program = GxsmProgram(
             self.rig,
             self.faults,
             self.clock,
@@ -113,9 +113,9 @@ class GxsmEmulator(Emulator):
             reach_m=self._reach_m,
         )
         self.program.auto_save, self.program.probe_auto_save = self._auto_save, self._probe_auto_save
-        self._calls = Calls(self.program, self._feedback_actions)
+        self._calls = GxsmFunctions(self.program, self._feedback_actions)
         if self._transport == "shm":
-            self._block = Block(
+            self._block = SharedMemoryBlock(
                 self._block_name, self._process, self.folder, self.faults, self.clock.now_s, self.unanswered.append
             )
             return f"shm:{self._block_name}@{self._block.pid}"
@@ -127,7 +127,7 @@ class GxsmEmulator(Emulator):
         if before is not None:
             before.end()
             self.unanswered.clear()
-        self._console = Console(self._script, self.port, self.folder.absolute(), self._post, self.woken.post)
+        self._console = ScriptConsole(self._script, self.port, self.folder.absolute(), self._post, self.woken.post)
         while (address := self._console.poll()) is None:
             self.serve(1.0)
         self.port = int(address.rpartition(":")[2])
@@ -170,7 +170,7 @@ class GxsmEmulator(Emulator):
             self._block.end()
             self._block = None
 
-    def _post(self, call: Call) -> None:
+    def _post(self, call: ScriptCall) -> None:
         self.unanswered.append(call)
         self.woken.post()
 
@@ -179,7 +179,7 @@ class GxsmEmulator(Emulator):
             call = self.unanswered.popleft()
             try:
                 found = self._calls.answer(call.method, call.arguments)
-            except Silence:
+            except NoAnswer:
                 self.silent = True
                 return
             except (NameError, SystemError) as error:  # what a script of the user's is to see

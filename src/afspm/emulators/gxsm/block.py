@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from afspm.emulators.emulator import Crashed
 from afspm.emulators.faults import Faults
-from afspm.emulators.gxsm.console import Call
+from afspm.emulators.gxsm.console import ScriptCall
 from afspm.emulators.gxsm.signalled import CONTENT, SIZE
 from afspm.errors import ConfigError
 from afspm.microscopes.gxsm import pickles
@@ -30,7 +30,7 @@ NAME_BYTES: Final = 64
 _NO_SUCH_FUNCTION, _NOT_PASSED_ON = -4, -1
 
 
-class Block:
+class SharedMemoryBlock:
     """The shared memory and the process that has it.
 
     Args:
@@ -47,7 +47,7 @@ class Block:
         folder: Path,
         faults: Faults,
         now_s: Callable[[], float],
-        post: Callable[[Call], None],
+        post: Callable[[ScriptCall], None],
     ) -> None:
         if not sys.platform.startswith("linux"):
             raise ConfigError("Gxsm4's shared memory is there on Linux alone", where="transport", hint='"bridge"')
@@ -76,7 +76,7 @@ class Block:
         except BadReply as error:
             self._answer(error)
             return
-        self._post(Call(method, arguments if isinstance(arguments, tuple) else (arguments,), self._answer))
+        self._post(ScriptCall(method, arguments if isinstance(arguments, tuple) else (arguments,), self._answer))
 
     def end(self, *, remains: bool = False) -> None:
         """GXSM is closed.
@@ -120,7 +120,7 @@ class Block:
         if self._faults.strikes("bad-pickle", now_s):
             content = bytes(range(255, 255 - length, -1)) if length < 255 else content[: length // 2]
         if self._faults.strikes("evil-pickle", now_s):
-            content = pickle.dumps(_Evil(), 4)
+            content = pickle.dumps(_MaliciousPickle(), 4)
             length = len(content)
         if self._faults.strikes("huge", now_s):
             length = 1 << 31
@@ -133,7 +133,7 @@ class Block:
             self._process.stdin.flush()
 
 
-class _Evil:
+class _MaliciousPickle:
     """Makes a folder called `evil` where it is unpickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from afspm.emulators.gxsm.program import ANGSTROM_M, SHOWS_S, Program
+from afspm.emulators.gxsm.program import ANGSTROM_M, SHOWS_S, GxsmProgram
 from afspm.emulators.rig import RigBusy
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -59,7 +59,7 @@ def _fits(signature: inspect.Signature, arguments: tuple[Any, ...]) -> bool:
     return needed <= len(arguments) <= len(takes) and all(map(_converts, arguments, kinds))
 
 
-class Silence(Exception):
+class NoAnswer(Exception):
     """There is no answer, to this call or any other, until GXSM is started anew."""
 
 
@@ -67,14 +67,14 @@ class Uninitialised:
     """What must not be looked at."""
 
 
-class Calls:
+class GxsmFunctions:
     """The functions. For one thread.
 
     Args:
         feedback_actions: names of those that switch the feedback on and off, if there are any.
     """
 
-    def __init__(self, program: Program, feedback_actions: Sequence[str] = ()) -> None:
+    def __init__(self, program: GxsmProgram, feedback_actions: Sequence[str] = ()) -> None:
         self._program = program
         self._feedback_actions = feedback_actions
         self._faults = program.faults
@@ -83,7 +83,7 @@ class Calls:
         """Call one.
 
         Raises:
-            Silence. NameError: there is none. Whatever else a user's script would get.
+            NoAnswer. NameError: there is none. Whatever else a user's script would get.
         """
         if method not in _FUNCTIONS:
             raise NameError(method)
@@ -237,7 +237,7 @@ class Calls:
     def _waitscan(self, how: int = 0) -> int:
         program = self._program
         if program.version == 4 and program.card == "simulator":
-            raise Silence("waitscan")
+            raise NoAnswer("waitscan")
         return -1 if not program.rig.busy(program.clock.now_s()) else self._y_current()
 
     @_function

@@ -9,7 +9,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Channel:
+class GxsmChannel:
     """One channel.
 
     Attributes:
@@ -39,22 +39,22 @@ class Channel:
 
 _ANGSTROM: Final = (("AA", "Å"), 1e10)
 SIMULATED_3: Final = (
-    Channel("Height", "Topo", "Xp", *_ANGSTROM, 0.117506942891),
-    Channel("Amplitude", "MIX1", "Xp", ("V", "V"), 1.0, 0.000305185),
+    GxsmChannel("Height", "Topo", "Xp", *_ANGSTROM, 0.117506942891),
+    GxsmChannel("Amplitude", "MIX1", "Xp", ("V", "V"), 1.0, 0.000305185),
 )
 """Of the simulator that Gxsm3 has."""
 CHANNELS: Final = {
     3: (
-        Channel("Height", "Topo", "Xp", *_ANGSTROM, 0.117506942891),
-        Channel("Height Retrace", "Topo", "Xm", *_ANGSTROM, 0.117506942891),
-        Channel("Amplitude", "ADC1", "Xp", ("V", "V"), 1.0, 0.000305185),
+        GxsmChannel("Height", "Topo", "Xp", *_ANGSTROM, 0.117506942891),
+        GxsmChannel("Height Retrace", "Topo", "Xm", *_ANGSTROM, 0.117506942891),
+        GxsmChannel("Amplitude", "ADC1", "Xp", ("V", "V"), 1.0, 0.000305185),
     ),
     4: (
-        Channel("Height", "ZS-Topo", "Xp", *_ANGSTROM, 1.0),
-        Channel("Height Retrace", "ZS-Topo", "Xm", *_ANGSTROM, 1.0),
-        Channel("Current", "I-Tunnel", "Xp", ("nA", "nA"), 1e9, 1.0),
-        Channel("Frequency Shift", "dFreq", "Xp", ("Hz", "Hz"), 1.0, 1.0),
-        Channel("Phase", "Phase", "Xp", ("deg", "°"), 1.0, 1.0),
+        GxsmChannel("Height", "ZS-Topo", "Xp", *_ANGSTROM, 1.0),
+        GxsmChannel("Height Retrace", "ZS-Topo", "Xm", *_ANGSTROM, 1.0),
+        GxsmChannel("Current", "I-Tunnel", "Xp", ("nA", "nA"), 1e9, 1.0),
+        GxsmChannel("Frequency Shift", "dFreq", "Xp", ("Hz", "Hz"), 1.0, 1.0),
+        GxsmChannel("Phase", "Phase", "Xp", ("deg", "°"), 1.0, 1.0),
     ),
 }
 """By the version of GXSM."""

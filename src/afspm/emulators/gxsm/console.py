@@ -15,12 +15,12 @@ SCRIPT: Final = Path(__file__).parents[2] / "microscopes" / "gxsm" / "bridge.py"
 _LISTENS: Final = re.compile(r"listening at (\S+):(\d+)")
 
 
-class Gone(BaseException):
+class ConsoleClosed(BaseException):
     """GXSM is no more, nor is what runs in it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Call:
+class ScriptCall:
     """A call of a function of GXSM.
 
     Attributes:
@@ -32,10 +32,10 @@ class Call:
     answered: Callable[[Any], None]
 
 
-class Module:
+class GxsmModule:
     """The module `gxsm`, as a script sees it."""
 
-    def __init__(self, post: Callable[[Call], None]) -> None:
+    def __init__(self, post: Callable[[ScriptCall], None]) -> None:
         self._post = post
         self._waiting: set[Future[Any]] = set()
         self._gone = False
@@ -45,8 +45,8 @@ class Module:
             answer: Future[Any] = Future()
             self._waiting.add(answer)
             if self._gone:
-                raise Gone
-            self._post(Call(method, arguments, answer.set_result))
+                raise ConsoleClosed
+            self._post(ScriptCall(method, arguments, answer.set_result))
             found = answer.result()
             self._waiting.discard(answer)
             if isinstance(found, BaseException):
@@ -60,10 +60,10 @@ class Module:
         self._gone = True
         for answer in list(self._waiting):
             if not answer.done():
-                answer.set_result(Gone())
+                answer.set_result(ConsoleClosed())
 
 
-class Console:
+class ScriptConsole:
     """A console in which a script runs.
 
     Args:
@@ -74,9 +74,9 @@ class Console:
     """
 
     def __init__(
-        self, script: Path, port: int, folder: Path, post: Callable[[Call], None], ended: Callable[[], None]
+        self, script: Path, port: int, folder: Path, post: Callable[[ScriptCall], None], ended: Callable[[], None]
     ) -> None:
-        self._module = Module(post)
+        self._module = GxsmModule(post)
         self._said: Future[str] = Future()
         self._script, self._port, self._folder, self._ended = script, port, folder, ended
         self._runs = True
@@ -116,7 +116,7 @@ class Console:
         }
         try:
             exec(compile(self._script.read_text(encoding="utf-8"), str(self._script), "exec"), scope)
-        except Gone:
+        except ConsoleClosed:
             pass
         except BaseException as error:
             if not self._said.done():

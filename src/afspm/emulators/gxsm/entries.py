@@ -20,7 +20,7 @@ _DAC_STEP: Final = 0.422
 
 
 @dataclass
-class Entry:
+class GxsmEntry:
     """One.
 
     Attributes:
@@ -42,7 +42,7 @@ class Entry:
     told: Callable[[float], None] | None = None
 
 
-class Entries:
+class GxsmEntries:
     """All of them, by reference name.
 
     Args:
@@ -57,9 +57,9 @@ class Entries:
         self._user_unit = user_unit
         self._comma = decimal_comma
         self._dialogs = dialogs
-        self._entries: dict[str, Entry] = {}
+        self._entries: dict[str, GxsmEntry] = {}
 
-    def add(self, ref: str, entry: Entry) -> None:
+    def add(self, ref: str, entry: GxsmEntry) -> None:
         self._entries[ref] = entry
 
     def names(self) -> tuple[str, ...]:
@@ -120,7 +120,7 @@ class Entries:
         if entry.told is not None:
             entry.told(value)
 
-    def _factor(self, entry: Entry) -> float:
+    def _factor(self, entry: GxsmEntry) -> float:
         return USER_UNITS[self._user_unit] if entry.unit == _ANGSTROM else 1.0
 
     def _atof(self, text: str) -> float:
@@ -130,38 +130,38 @@ class Entries:
         return float(match[0]) if match else 0.0
 
 
-def lengths(reach: float, told: Callable[[str], Callable[[float], None]]) -> dict[str, Entry]:
+def lengths(reach: float, told: Callable[[str], Callable[[float], None]]) -> dict[str, GxsmEntry]:
     """The entries of the scan frame that every GXSM has, in ångström, up to so far from the centre."""
 
-    def length(ref: str, value: float, low: float, high: float) -> Entry:
-        return Entry(value, low, high, _ANGSTROM, "{:.1f}", told=told(ref))
+    def length(ref: str, value: float, low: float, high: float) -> GxsmEntry:
+        return GxsmEntry(value, low, high, _ANGSTROM, "{:.1f}", told=told(ref))
 
-    def extent(value: float, shown: str) -> Entry:
-        return Entry(value, 0.0, 2 * reach, _ANGSTROM, shown, _DAC_STEP)
+    def extent(value: float, shown: str) -> GxsmEntry:
+        return GxsmEntry(value, 0.0, 2 * reach, _ANGSTROM, shown, _DAC_STEP)
 
     return {
         "RangeX": extent(1e4, "{:.1f}"),
         "RangeY": extent(1e4, "{:.1f}"),
-        "PointsX": Entry(64.0, 2.0, 20_000.0, whole=True),
-        "PointsY": Entry(64.0, 2.0, 20_000.0, whole=True),
+        "PointsX": GxsmEntry(64.0, 2.0, 20_000.0, whole=True),
+        "PointsY": GxsmEntry(64.0, 2.0, 20_000.0, whole=True),
         "StepsX": extent(1e4 / 63, "{:.3f}"),
         "StepsY": extent(1e4 / 63, "{:.3f}"),
         "OffsetX": length("OffsetX", 0.0, -reach, reach),
         "OffsetY": length("OffsetY", 0.0, -reach, reach),
         "ScanX": length("ScanX", 0.0, -reach, reach),
         "ScanY": length("ScanY", 0.0, -reach, reach),
-        "Rotation": Entry(0.0, -360.0, 360.0, "°", "{:6.0f}"),
-        "script-control": Entry(50.0, 0.0, 100.0),
+        "Rotation": GxsmEntry(0.0, -360.0, 360.0, "°", "{:6.0f}"),
+        "script-control": GxsmEntry(50.0, 0.0, 100.0),
     }
 
 
-def simulated_3() -> dict[str, Entry]:
+def simulated_3() -> dict[str, GxsmEntry]:
     """Return the entries that the simulator of Gxsm3 has besides those of Gxsm4's."""
     return {
-        "sim-stm-fbs-bias": Entry(0.1, -10.0, 10.0, "V"),
-        "sim-stm-fbs-mx0-current-set": Entry(0.5, -100.0, 100.0, "nA"),
-        "sim-stm-fbs-cp": Entry(0.0, 0.0, 200.0),
-        "sim-stm-fbs-ci": Entry(0.0, 0.0, 200.0),
-        "sim-config-adv-scan-slope-x": Entry(0.0, -0.2, 0.2),
-        "sim-config-adv-scan-slope-y": Entry(0.0, -0.2, 0.2),
+        "sim-stm-fbs-bias": GxsmEntry(0.1, -10.0, 10.0, "V"),
+        "sim-stm-fbs-mx0-current-set": GxsmEntry(0.5, -100.0, 100.0, "nA"),
+        "sim-stm-fbs-cp": GxsmEntry(0.0, 0.0, 200.0),
+        "sim-stm-fbs-ci": GxsmEntry(0.0, 0.0, 200.0),
+        "sim-config-adv-scan-slope-x": GxsmEntry(0.0, -0.2, 0.2),
+        "sim-config-adv-scan-slope-y": GxsmEntry(0.0, -0.2, 0.2),
     }

@@ -17,7 +17,7 @@ _ANGSTROM: Final = {"label": "L", "var_unit": "Ang", "unit": "AA"}
 
 
 @dataclass(frozen=True)
-class SavedScan:
+class GxsmScanFile:
     """One channel of a scan.
 
     Attributes:
@@ -103,7 +103,7 @@ def prepare(version: int) -> None:
     import_module("scipy.io" if version == 3 else "h5py")
 
 
-def netcdf3(scan: SavedScan) -> bytes:
+def netcdf3(scan: GxsmScanFile) -> bytes:
     """The file that Gxsm3 saves."""
     from scipy.io import netcdf_file
 
@@ -139,7 +139,7 @@ def _variable(file: Any, name: str, kind: str, dimensions: tuple[str, ...], valu
     return made
 
 
-def netcdf4(scan: SavedScan) -> bytes:
+def netcdf4(scan: GxsmScanFile) -> bytes:
     """The file that Gxsm4 saves."""
     import h5py
 
@@ -177,7 +177,7 @@ def _describe(node: Any, **attributes: str) -> None:
 
 
 @dataclass(frozen=True)
-class SavedCurve:
+class GxsmSpectrumFile:
     """A spectrum.
 
     Attributes:
@@ -193,7 +193,7 @@ class SavedCurve:
     version: str
 
 
-def vpdata(curve: SavedCurve) -> bytes:
+def vpdata(curve: GxsmSpectrumFile) -> bytes:
     """The file of a spectrum."""
     labels, values = list(curve.columns), [*curve.columns.values()]
     count = len(values[0])

@@ -11,13 +11,13 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.clock import Clock
+from afspm.emulators.activities import SimulatedScan, SimulatedSpectrum
 from afspm.emulators.faults import Faults
 from afspm.emulators.gxsm import files
-from afspm.emulators.gxsm.channels import CHANNELS, SIMULATED_3, Channel
-from afspm.emulators.gxsm.entries import Entries, Entry, lengths, simulated_3
-from afspm.emulators.gxsm.saving import Saving
+from afspm.emulators.gxsm.channels import CHANNELS, SIMULATED_3, GxsmChannel
+from afspm.emulators.gxsm.entries import GxsmEntries, GxsmEntry, lengths, simulated_3
+from afspm.emulators.gxsm.file_writer import GxsmFileWriter
 from afspm.emulators.rig import Rig
-from afspm.emulators.running import RunningScan, RunningSpectrum
 from afspm.errors import InvalidValue
 from afspm.model import Region
 
@@ -50,7 +50,7 @@ _MIXERS: Final = {
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
-class Program:
+class GxsmProgram:
     """GXSM.
 
     Args:
@@ -84,19 +84,19 @@ class Program:
         self.dialogs: list[str] = []
         self.behind_s = 0.0
         self.repeats = False
-        self.entries = Entries(version, user_unit, decimal_comma=decimal_comma, dialogs=self.dialogs.append)
+        self.entries = GxsmEntries(version, user_unit, decimal_comma=decimal_comma, dialogs=self.dialogs.append)
         self.auto_save, self.probe_auto_save = True, True
         known = SIMULATED_3 if (version, card) == (3, "simulator") else CHANNELS[version]
-        self.channels: list[Channel] = [one for one in known if one.source in rig.channels]
-        self.saving = Saving(folder, faults)
-        self.last: RunningScan | None = None
+        self.channels: list[GxsmChannel] = [one for one in known if one.source in rig.channels]
+        self.saving = GxsmFileWriter(folder, faults)
+        self.last: SimulatedScan | None = None
         self.last_frame = (0.0, 0.0, 0.0, 0.0, 0.0)
-        self.curve: RunningSpectrum | None = None
+        self.curve: SimulatedSpectrum | None = None
         self._scanning = self._saved = False
         self._before: list[Path] | None = None
         self._y_before = 0
         self._bias_since_s = -math.inf
-        self._memory: dict[Channel, np.ndarray] = {}
+        self._memory: dict[GxsmChannel, np.ndarray] = {}
         self._own: list[Path] = []
         self._curves = 0
         for ref, entry in lengths(reach_m / ANGSTROM_M, self._told).items():
@@ -110,11 +110,11 @@ class Program:
             return lambda _: self._move()
         return lambda _: None
 
-    def _of_hardware(self) -> dict[str, Entry]:
+    def _of_hardware(self) -> dict[str, GxsmEntry]:
         rig, loop = self.rig, self.rig.feedback
-        bias = Entry(rig.bias_v, -10.0, 10.0, "V", told=self._bias)
+        bias = GxsmEntry(rig.bias_v, -10.0, 10.0, "V", told=self._bias)
         if self.card == "simulator":
-            speed = Entry(1.0, 0.01, 4000.0, "px/s", "{:.2f}")
+            speed = GxsmEntry(1.0, 0.01, 4000.0, "px/s", "{:.2f}")
             return {"sim-stm-speed": speed, "sim-stm-bias": bias, **(simulated_3() if self.version == 3 else {})}
 
         def fed_back(name: str, factor: float = 1.0) -> Callable[[float], None]:
@@ -127,26 +127,28 @@ class Program:
         def sloped(axis: int) -> Callable[[float], None]:
             return lambda value: setattr(rig, "slope", (*rig.slope[:axis], value, *rig.slope[axis + 1 :]))
 
-        speed = Entry(2e4, 1e-3, 1e7, told=lambda value: setattr(rig, "move_speed_m_s", value * ANGSTROM_M))
+        speed = GxsmEntry(2e4, 1e-3, 1e7, told=lambda value: setattr(rig, "move_speed_m_s", value * ANGSTROM_M))
         mixer, unit, factor = _MIXERS.get(rig.world.settings.feedback.mode, _MIXER)
-        setpoint = Entry((loop.setpoint or 0.0) / factor, -1e3, 1e3, unit, told=fed_back("setpoint", factor))
+        setpoint = GxsmEntry((loop.setpoint or 0.0) / factor, -1e3, 1e3, unit, told=fed_back("setpoint", factor))
         found = {
             "dsp-fbs-bias": bias,
-            "dsp-fbs-mx0-current-set": Entry(0.0, -100.0, 100.0, "nA"),
+            "dsp-fbs-mx0-current-set": GxsmEntry(0.0, -100.0, 100.0, "nA"),
             mixer: setpoint,
-            "dsp-fbs-mx0-current-level": Entry(0.0, -100.0, 100.0, "nA"),
-            "dsp-fbs-cp": Entry(loop.proportional_gain or 0.0, -100.0, 200.0, told=fed_back("proportional_gain")),
-            "dsp-fbs-ci": Entry((loop.integral_gain or 0) / IGAIN, -100, 200, told=fed_back("integral_gain", IGAIN)),
-            "dsp-fbs-scan-speed-scan": Entry(1e4, 1e-3, 1e7),
+            "dsp-fbs-mx0-current-level": GxsmEntry(0.0, -100.0, 100.0, "nA"),
+            "dsp-fbs-cp": GxsmEntry(loop.proportional_gain or 0.0, -100.0, 200.0, told=fed_back("proportional_gain")),
+            "dsp-fbs-ci": GxsmEntry(
+                (loop.integral_gain or 0) / IGAIN, -100, 200, told=fed_back("integral_gain", IGAIN)
+            ),
+            "dsp-fbs-scan-speed-scan": GxsmEntry(1e4, 1e-3, 1e7),
             "dsp-fbs-scan-speed-move": speed,
-            "dsp-adv-scan-slope-x": Entry(0.0, -0.2, 0.2, told=sloped(0)),
-            "dsp-adv-scan-slope-y": Entry(0.0, -0.2, 0.2, told=sloped(1)),
-            "dsp-gvp-du00": Entry(0.0, -10.0, 10.0, "V"),
+            "dsp-adv-scan-slope-x": GxsmEntry(0.0, -0.2, 0.2, told=sloped(0)),
+            "dsp-adv-scan-slope-y": GxsmEntry(0.0, -0.2, 0.2, told=sloped(1)),
+            "dsp-gvp-du00": GxsmEntry(0.0, -10.0, 10.0, "V"),
         }
         if self.card == "RPSPMC":
-            return {**found, "dsp-GVP-VPJR": Entry(0.0)}
-        zs = {"dsp-Z-start": Entry(0.0, -1e4, 1e4), "dsp-Z-end": Entry(0.0, -1e4, 1e4)}
-        return {**found, **zs, "dsp-Z-Slope": Entry(100.0, 1e-3, 1e6), "dsp-fbs-motor": Entry(0.0, -10.0, 10.0)}
+            return {**found, "dsp-GVP-VPJR": GxsmEntry(0.0)}
+        zs = {"dsp-Z-start": GxsmEntry(0.0, -1e4, 1e4), "dsp-Z-end": GxsmEntry(0.0, -1e4, 1e4)}
+        return {**found, **zs, "dsp-Z-Slope": GxsmEntry(100.0, 1e-3, 1e6), "dsp-fbs-motor": GxsmEntry(0.0, -10.0, 10.0)}
 
     def _bias(self, value: float) -> None:
         """Another bias; one that was in force for a short while has been a pulse."""
@@ -239,7 +241,7 @@ class Program:
         """Return a path as it is told: a GXSM whose user has chosen no folder saves to ".", wherever it was started."""
         return f"./{path.name}" if path.parent == self.folder else str(path)
 
-    def image(self, channel: Channel) -> np.ndarray:
+    def image(self, channel: GxsmChannel) -> np.ndarray:
         """Return what is in memory of a channel: rows that the last scan did not come to are as they were."""
         if self.last is None or channel not in self._memory:
             return np.zeros((0, 0), np.float32)
@@ -269,10 +271,10 @@ class Program:
     def _endings(self) -> list[str]:
         return [channel.ending(master=number == 0) for number, channel in enumerate(self.channels)]
 
-    def _file(self, channel: Channel, path: Path, *, finished: bool) -> bytes:
+    def _file(self, channel: GxsmChannel, path: Path, *, finished: bool) -> bytes:
         scan = self.last
         assert scan is not None
-        saved = files.SavedScan(
+        saved = files.GxsmScanFile(
             str(path),
             channel.label,
             self.image(channel),
@@ -319,7 +321,7 @@ class Program:
         except InvalidValue as error:
             self.dialogs.append(str(error))
 
-    def columns(self, curve: RunningSpectrum) -> dict[str, np.ndarray]:
+    def columns(self, curve: SimulatedSpectrum) -> dict[str, np.ndarray]:
         """As GXSM labels them."""
         blanks = "    " if self.card == "RPSPMC" else ""
         found = {}
@@ -328,7 +330,7 @@ class Program:
             found[f"{blanks}{_COLUMNS.get(name, name)} ({shown})"] = values * scale
         return found
 
-    def _save_curve(self, curve: RunningSpectrum, now_s: float) -> None:
+    def _save_curve(self, curve: SimulatedSpectrum, now_s: float) -> None:
         self._curves += 1
         path = self._curve_path()
         while self.card == "RPSPMC" and path.exists():  # others overwrite
@@ -336,7 +338,7 @@ class Program:
             path = self._curve_path()
         offset = self.entries["OffsetX"], self.entries["OffsetY"]
         version = "00.03" if self.card == "RPSPMC" else "00.02"
-        saved = files.SavedCurve(str(path), self.columns(curve), now_s, offset, self.rig.bias_v, version)
+        saved = files.GxsmSpectrumFile(str(path), self.columns(curve), now_s, offset, self.rig.bias_v, version)
         self.saving.write([(path, files.vpdata(saved))], now_s)
 
     def _curve_path(self) -> Path:

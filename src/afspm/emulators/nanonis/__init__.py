@@ -10,11 +10,20 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from afspm.emulators.emulator import LOOPBACK, Crashed, Emulator
-from afspm.emulators.nanonis import logger, on_curves, on_patterns, on_scans, on_signals, on_tip, panel, wire
-from afspm.emulators.nanonis.answers import Later, Nope, Results, answer
-from afspm.emulators.nanonis.nonsense import nonsense
-from afspm.emulators.nanonis.panel import Panel
-from afspm.emulators.nanonis.server import Connection, Server
+from afspm.emulators.nanonis import (
+    handle_patterns,
+    handle_scans,
+    handle_signals,
+    handle_spectra,
+    handle_tip,
+    logger,
+    panel,
+    wire,
+)
+from afspm.emulators.nanonis.corruption import senseless_value
+from afspm.emulators.nanonis.dispatch import DeferredResult, FunctionRefused, Results, answer
+from afspm.emulators.nanonis.panel import NanonisState
+from afspm.emulators.nanonis.server import ClientConnection, NanonisServer
 from afspm.emulators.rig import RigBusy
 from afspm.errors import ConfigError, InvalidValue
 from afspm.units import Length
@@ -22,7 +31,7 @@ from afspm.units import Length
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
 """By the year of the software: the first that has what the protocol has from then on."""
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
-_ANSWERING: Final = (on_curves, on_patterns, on_scans, on_signals, on_tip)
+_ANSWERING: Final = (handle_spectra, handle_patterns, handle_scans, handle_signals, handle_tip)
 """What answers to the functions, by having been imported."""
 _LOGS_EVERY_S: Final = 0.005
 """Real time between two looks at what the TCP Logger has to send."""
@@ -30,7 +39,7 @@ _OTHER_NAME: Final = "Util.RTFreqGet"
 
 
 @dataclass(frozen=True)
-class Asked:
+class NanonisRequest:
     """A request.
 
     Attributes:
@@ -43,11 +52,11 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Waiting:
+class PendingReply:
     """A reply that comes when something has happened."""
 
-    asked: Asked
-    later: Later
+    asked: NanonisRequest
+    later: DeferredResult
 
     @property
     def name(self) -> str:
@@ -55,7 +64,7 @@ class Waiting:
 
 
 @dataclass(frozen=True)
-class Delayed:
+class DelayedReply:
     """A reply that is ready, and sent at a time."""
 
     content: bytes
@@ -128,7 +137,7 @@ class NanonisEmulator(Emulator):
     def open(self) -> str:
         """Listen on all ports."""
         ports = [self.port + i if self.port else 0 for i in range(self._ports)]
-        self._server = Server(
+        self._server = NanonisServer(
             LOOPBACK,
             ports,
             stream_port=self.logger_port,
@@ -137,7 +146,7 @@ class NanonisEmulator(Emulator):
             on_bytes=self._answer_all,
         )
         self.logger_port = self._server.stream_port
-        self.panel = Panel(
+        self.panel = NanonisState(
             self.rig,
             self.faults,
             self.clock,
@@ -174,20 +183,20 @@ class NanonisEmulator(Emulator):
                     self._server.send(reader, panel.logger.frame(counter, values))
         return max(panel.logger.next_s(), now_s + panel.experiment_s(_LOGS_EVERY_S))
 
-    def _go_on(self, connection: Connection, now_s: float) -> float | None:
+    def _go_on(self, connection: ClientConnection, now_s: float) -> float | None:
         """Send what was waited for, if it is there; returns when to look again."""
         waits = connection.waits_for
-        if isinstance(waits, Delayed):
+        if isinstance(waits, DelayedReply):
             if now_s < waits.at_s:
                 return waits.at_s
             connection.waits_for = None
             self._server.send(connection, waits.content)
-        elif isinstance(waits, Waiting):
+        elif isinstance(waits, PendingReply):
             with self._refusing(connection, waits.asked):
                 return self._settled(connection, waits, now_s)
         return None
 
-    def _settled(self, connection: Connection, waits: Waiting, now_s: float) -> float | None:
+    def _settled(self, connection: ClientConnection, waits: PendingReply, now_s: float) -> float | None:
         """Reply if what was waited for has happened, or not in time; returns when to look again."""
         later = waits.later
         results = later.ready(now_s)
@@ -208,7 +217,7 @@ class NanonisEmulator(Emulator):
 
     # --- requests ---
 
-    def _answer_all(self, connection: Connection) -> None:
+    def _answer_all(self, connection: ClientConnection) -> None:
         """What has come on a connection, as far as it does not wait for something."""
         while connection.waits_for is None and not connection.closing:
             now_s = self.clock.now_s()
@@ -216,23 +225,23 @@ class NanonisEmulator(Emulator):
                 return
             try:
                 request = wire.split(connection.received)
-            except wire.Unreadable as error:
+            except wire.MalformedRequest as error:
                 self.log.warning("a client is cut: %s", error)
                 self._server.cut(connection)
                 return
             if request is None:
                 return
             sent, wants_answer, body = request
-            asked = Asked(wire.known_as(sent) or sent, sent, wants_answer)
+            asked = NanonisRequest(wire.known_as(sent) or sent, sent, wants_answer)
             with self._refusing(connection, asked):
                 self._answer(connection, asked, body, now_s)
 
     @contextmanager
-    def _refusing(self, connection: Connection, asked: Asked) -> Iterator[None]:
+    def _refusing(self, connection: ClientConnection, asked: NanonisRequest) -> Iterator[None]:
         """Answer with an error where something can't be: all that a client asks passes through here."""
         try:
             yield
-        except (Nope, RigBusy, InvalidValue, wire.Unreadable) as error:
+        except (FunctionRefused, RigBusy, InvalidValue, wire.MalformedRequest) as error:
             self._refuse(connection, asked, str(error))
         except Crashed:
             raise
@@ -240,28 +249,28 @@ class NanonisEmulator(Emulator):
             self.log.exception("%s failed", asked.name)
             self._refuse(connection, asked, str(error))
 
-    def _refuse(self, connection: Connection, asked: Asked, reason: str) -> None:
+    def _refuse(self, connection: ClientConnection, asked: NanonisRequest, reason: str) -> None:
         connection.waits_for = None
         if asked.wants_answer:
             text = f"Error in command: {asked.sent.lower()}: {reason}"
             body = wire.error_body(asked.name, text, self.release, bare=self._bare_errors)
             self._send(connection, asked.sent, body)
 
-    def _answer(self, connection: Connection, asked: Asked, body: bytes, now_s: float) -> None:
+    def _answer(self, connection: ClientConnection, asked: NanonisRequest, body: bytes, now_s: float) -> None:
         name = asked.name
         if self.faults.strikes("crash", now_s):
             raise Crashed(f"at {name}")
         known = wire.functions().get(name)
         if known is None or known.since > self.release:
-            raise Nope(f"the function {name} is not known")
+            raise FunctionRefused(f"the function {name} is not known")
         if self.faults.strikes("error", now_s):
-            raise Nope("an emulated error")
+            raise FunctionRefused("an emulated error")
         if name.endswith(_ACTS) and self.faults.strikes("refused", now_s):
-            raise Nope("it is not possible now")
+            raise FunctionRefused("it is not possible now")
         self.panel.client = connection.memory
         found = answer(self.panel, name, wire.arguments(name, body, self._wire_release(now_s)))
-        if isinstance(found, Later):
-            connection.waits_for = Waiting(asked, found)
+        if isinstance(found, DeferredResult):
+            connection.waits_for = PendingReply(asked, found)
         else:
             self._reply(connection, asked, found)
 
@@ -271,7 +280,7 @@ class NanonisEmulator(Emulator):
             return min(RELEASES.values()) if self.release > min(RELEASES.values()) else max(RELEASES.values())
         return self.release
 
-    def _reply(self, connection: Connection, asked: Asked, results: Results) -> None:
+    def _reply(self, connection: ClientConnection, asked: NanonisRequest, results: Results) -> None:
         if not asked.wants_answer:
             return
         now_s = self.clock.now_s()
@@ -284,10 +293,10 @@ class NanonisEmulator(Emulator):
         fields = wire.functions()[asked.name].results
         padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
         if self.faults.lasts("nonsense", now_s):
-            padded = tuple(nonsense(field.code, self._chance) for field in fields)
+            padded = tuple(senseless_value(field.code, self._chance) for field in fields)
         self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
 
-    def _send(self, connection: Connection, name: str, body: bytes) -> None:
+    def _send(self, connection: ClientConnection, name: str, body: bytes) -> None:
         """A reply, or what goes wrong with it."""
         now_s = self.clock.now_s()
         content = wire.reply(name, body)
@@ -306,7 +315,7 @@ class NanonisEmulator(Emulator):
             content, connection.closing = content[: len(content) // 2], True
         slow = self.faults.strikes("slow", now_s)
         if slow is not None:
-            connection.waits_for = Delayed(content, now_s + slow.duration_s)
+            connection.waits_for = DelayedReply(content, now_s + slow.duration_s)
             return
         self._server.send(connection, content)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class SavedScan:
+class SxmContent:
     """What goes into a scan's file.
 
     Attributes:
@@ -37,7 +37,7 @@ class SavedScan:
     settings: Mapping[str, str]
 
 
-def sxm(scan: SavedScan) -> bytes:
+def sxm(scan: SxmContent) -> bytes:
     """The bytes of a scan's file."""
     rows, columns = scan.channels[0][3].shape
     start = _local(scan.start_s)

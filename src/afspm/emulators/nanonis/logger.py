@@ -1,4 +1,4 @@
-"""The TCP Logger: a stream of signals on a port of its own, to whoever has connected there. No sockets here."""
+"""The TCP TcpLogger: a stream of signals on a port of its own, to whoever has connected there. No sockets here."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MOST_AT_ONCE: Final = 20
 _DISCONNECTED, _IDLE, _RUNNING, _OVERFLOW = 0, 1, 4, 7
 
 
-class Logger:
+class TcpLogger:
     """What is logged, while it is started.
 
     Attributes:

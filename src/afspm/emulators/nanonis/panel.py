@@ -11,13 +11,13 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.clock import Clock
+from afspm.emulators.activities import RETRACE, SimulatedScan, SimulatedSpectrum
 from afspm.emulators.faults import Faults
 from afspm.emulators.nanonis import files
-from afspm.emulators.nanonis.logger import Logger
+from afspm.emulators.nanonis.logger import TcpLogger
 from afspm.emulators.nanonis.registers import Registers
-from afspm.emulators.nanonis.sweeps import Sweep
+from afspm.emulators.nanonis.sweeps import SweepSettings
 from afspm.emulators.rig import Rig
-from afspm.emulators.running import RETRACE, RunningScan, RunningSpectrum
 from afspm.errors import InvalidValue
 from afspm.model import Region
 
@@ -59,16 +59,16 @@ _BASE_NAMES: Final = {"IV": "Bias-Spectroscopy", "force": "Z-Spectroscopy"}
 
 
 @dataclass
-class Scanning:
+class StartedScan:
     """A scan that was started: as the panel was then."""
 
-    scan: RunningScan
+    scan: SimulatedScan
     frame: tuple[float, float, float, float, float]
     line_s: tuple[float, float]
     channels: list[int]
 
 
-class Panel:
+class NanonisState:
     """The state of the software.
 
     Args:
@@ -80,7 +80,7 @@ class Panel:
         autosave: "all", "next" or "off".
         ends: how many scans have ended; `ended_s` when the last, `last_path` where it was saved.
         slots: the signals in the 24 slots of the Signals Manager.
-        logger: the TCP Logger.
+        logger: the TCP TcpLogger.
         client: what is remembered of the client that asks just now.
         pulse_holds: whether the z controller is on hold during a pulse.
         z_controller: "off", "on" or "safe"; `z_follows_s` is when it follows what was set.
@@ -109,16 +109,16 @@ class Panel:
         self.speed = (2e-6, 2e-6, 0.5, 0.5, 0, 1.0)
         self.continuous = self.bouncy = False
         self.autosave, self.series, self.comment, self.modules = "all", "unnamed", "", ["Z-Controller"]
-        self.scanning: Scanning | None = None
-        self.last: Scanning | None = None
-        self.curve: RunningSpectrum | None = None
+        self.scanning: StartedScan | None = None
+        self.last: StartedScan | None = None
+        self.curve: SimulatedSpectrum | None = None
         self.curve_name, self.curves_ended = "", 0
-        self.sweeps = {module: Sweep() for module in MODULES}
+        self.sweeps = {module: SweepSettings() for module in MODULES}
         self.curve_names = dict(_BASE_NAMES)
         self.ends, self.ended_s, self.last_path = 0, -math.inf, ""
         used = [*_SIGNALS.values(), _BIAS]
         self.slots = [*used, *(index for index in range(len(self.signals)) if index not in used)][:_SLOTS]
-        self.logger = Logger()
+        self.logger = TcpLogger()
         self.client: dict[str, Any] = {}
         self.opened: set[str] = set()
         self.autopaste, self.pulse_holds = 2, True
@@ -184,9 +184,9 @@ class Panel:
         forward_s, backward_s = self.speed[2:4]
         self.rig.line_s, self.rig.upwards = forward_s + backward_s, upwards
         scan = self.rig.start_scan()
-        self.scanning = self.last = Scanning(scan, self.frame, (forward_s, backward_s), list(self.channels))
+        self.scanning = self.last = StartedScan(scan, self.frame, (forward_s, backward_s), list(self.channels))
 
-    def _end_scan(self, ended: Scanning, now_s: float) -> None:
+    def _end_scan(self, ended: StartedScan, now_s: float) -> None:
         self.scanning = None
         finished = ended.scan.stopped_s is None
         path = self.save_scan(ended, now_s) if finished and self._saves(now_s) else ""
@@ -210,7 +210,7 @@ class Panel:
         curve = sweep.of(self.rig.start_spectrum(kind, sweep.sweeps))
         self.curve = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
 
-    def _recorded(self, curve: RunningSpectrum, channels: list[int]) -> RunningSpectrum:
+    def _recorded(self, curve: SimulatedSpectrum, channels: list[int]) -> SimulatedSpectrum:
         """The channels that were chosen; one that the simulated curve does not have does not change during it."""
         names, units, columns = [curve.names[0]], [curve.units[0]], [curve.values[:, 0]]
         for index in channels:
@@ -237,7 +237,7 @@ class Panel:
             self.curve = None
             self.curves_ended += 1
 
-    def _end_curve(self, curve: RunningSpectrum, now_s: float) -> None:
+    def _end_curve(self, curve: SimulatedSpectrum, now_s: float) -> None:
         self.curve = None
         self.curves_ended += 1
         module = next(name for name, kind in MODULES.items() if kind == curve.kind)
@@ -366,7 +366,9 @@ class Panel:
 
     # --- pictures and files ---
 
-    def images(self, scanning: Scanning, until_s: float | None) -> dict[int, tuple[str, str, np.ndarray, np.ndarray]]:
+    def images(
+        self, scanning: StartedScan, until_s: float | None
+    ) -> dict[int, tuple[str, str, np.ndarray, np.ndarray]]:
         """By channel: name, unit, forward and backward [y, x], lines not yet scanned NaN."""
         drawn = scanning.scan.channels(until_s)
         found = {}
@@ -380,7 +382,7 @@ class Panel:
                 found[index] = (*_name_and_unit(self.signals[index]), nothing, nothing)
         return {index: found[index] for index in scanning.channels}
 
-    def save_scan(self, ended: Scanning, now_s: float) -> str:
+    def save_scan(self, ended: StartedScan, now_s: float) -> str:
         """Save it, as well as the faults allow. Returns where it is said to be."""
         name = self._next_name(self.series, 3, ".sxm")
         path = self.told_path(name)
@@ -397,7 +399,7 @@ class Panel:
             feedback.proportional_gain or 0.0,
             integral,
         )
-        saved = files.SavedScan(
+        saved = files.SxmContent(
             path,
             scan.start_s,
             scan.end_s - scan.start_s,
@@ -420,7 +422,7 @@ class Panel:
         return str(PureWindowsPath(self.session_path) / name) if windows else str(Path(self.session_path) / name)
 
     def _settings(
-        self, ended: Scanning, images: Mapping[int, tuple[str, str, np.ndarray, np.ndarray]]
+        self, ended: StartedScan, images: Mapping[int, tuple[str, str, np.ndarray, np.ndarray]]
     ) -> dict[str, str]:
         scan, number = ended.scan, files.engineering
         return {
@@ -438,7 +440,7 @@ class Panel:
             "Scan>speed backw. (m/s)": number(ended.frame[2] / ended.line_s[1]),
         }
 
-    def _curve_header(self, curve: RunningSpectrum, now_s: float) -> dict[str, str]:
+    def _curve_header(self, curve: SimulatedSpectrum, now_s: float) -> dict[str, str]:
         (x, y), number = curve.position_m, files.engineering
         return {
             "Experiment": _EXPERIMENTS[curve.kind],
@@ -479,7 +481,7 @@ class Panel:
         return True
 
 
-def curve_columns(curve: RunningSpectrum) -> list[str]:
+def curve_columns(curve: SimulatedSpectrum) -> list[str]:
     """As Nanonis names them: "Current [bwd] (A)"; what is swept comes first, and has a name of its own."""
     columns: list[str] = []
     for name, unit in zip(curve.names, curve.units, strict=True):

@@ -13,7 +13,7 @@ READ_AT_ONCE = 1 << 16
 
 
 @dataclass(eq=False)
-class Connection:
+class ClientConnection:
     """One client.
 
     Attributes:
@@ -31,7 +31,7 @@ class Connection:
     memory: dict[str, Any] = field(default_factory=dict)
 
 
-class Server:
+class NanonisServer:
     """Ports and connections, without a thread: everything happens in `poll`.
 
     Args:
@@ -50,14 +50,14 @@ class Server:
         stream_port: int | None = None,
         one_each: bool,
         wakes: Any,
-        on_bytes: Callable[[Connection], None],
+        on_bytes: Callable[[ClientConnection], None],
     ) -> None:
         self._one_each = one_each
         self._stream: socket.socket | None = None
         self._on_bytes = on_bytes
         self._selector = selectors.DefaultSelector()
         self._listeners: list[socket.socket] = []
-        self._of: dict[Connection, socket.socket] = {}
+        self._of: dict[ClientConnection, socket.socket] = {}
         self._selector.register(wakes, selectors.EVENT_READ, None)
         try:
             self._listeners = [self._listener(host, port) for port in ports]
@@ -78,19 +78,19 @@ class Server:
         return 0 if self._stream is None else int(self._stream.getsockname()[1])
 
     @property
-    def connections(self) -> list[Connection]:
+    def connections(self) -> list[ClientConnection]:
         """Of the clients that ask."""
         return [connection for connection, listener in self._of.items() if listener is not self._stream]
 
     @property
-    def readers(self) -> list[Connection]:
+    def readers(self) -> list[ClientConnection]:
         """Of those who have connected to the stream."""
         return [connection for connection, listener in self._of.items() if listener is self._stream]
 
     def poll(self, timeout_s: float) -> None:
         """Wait for clients up to so many real seconds, and deal with what has come."""
         for key, events in self._selector.select(timeout_s):
-            if isinstance(key.data, Connection):
+            if isinstance(key.data, ClientConnection):
                 if events & selectors.EVENT_READ:
                     self._read(key.data)
                 if events & selectors.EVENT_WRITE and key.data in self._of:
@@ -98,7 +98,7 @@ class Server:
             elif key.data is not None:
                 self._accept(key.data)
 
-    def send(self, connection: Connection, content: bytes = b"") -> None:
+    def send(self, connection: ClientConnection, content: bytes = b"") -> None:
         """As much as the client takes, the rest later."""
         connection.sending += content
         try:
@@ -116,7 +116,7 @@ class Server:
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if connection.sending else 0)
         self._selector.modify(connection.socket, events, connection)
 
-    def cut(self, connection: Connection) -> None:
+    def cut(self, connection: ClientConnection) -> None:
         """End a connection."""
         listener = self._of.pop(connection, None)
         if listener is None:
@@ -147,13 +147,13 @@ class Server:
             client, _ = listener.accept()
             client.settimeout(0)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection = Connection(client)
+            connection = ClientConnection(client)
             self._of[connection] = listener
             self._selector.register(client, selectors.EVENT_READ, connection)
             if self._one_each and listener is not self._stream:
                 self._selector.unregister(listener)
 
-    def _read(self, connection: Connection) -> None:
+    def _read(self, connection: ClientConnection) -> None:
         try:
             received = connection.socket.recv(READ_AT_ONCE)
         except BlockingIOError:

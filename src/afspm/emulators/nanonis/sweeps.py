@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from afspm.emulators.running import RunningSpectrum
+from afspm.emulators.activities import SimulatedSpectrum
 
 
 @dataclass
-class Sweep:
+class SweepSettings:
     """As the panel of a module of spectra has it.
 
     Attributes:
@@ -32,7 +32,7 @@ class Sweep:
     saves_all: bool = False
     dialog: bool = False
 
-    def of(self, curve: RunningSpectrum) -> RunningSpectrum:
+    def of(self, curve: SimulatedSpectrum) -> SimulatedSpectrum:
         """The same curve, swept like this."""
         values = curve.values
         if self.points is not None or self.limits is not None:

@@ -31,12 +31,12 @@ ZEROS: Final[Mapping[str, Any]] = {
 }
 
 
-class Unreadable(Exception):
+class MalformedRequest(Exception):
     """The bytes of a client are not what belongs to the function."""
 
 
 @dataclass(frozen=True)
-class Field:
+class WireField:
     """One field of a request or a reply.
 
     Attributes:
@@ -51,7 +51,7 @@ class Field:
     mark: str = ""
 
     @classmethod
-    def of(cls, text: str) -> Field:
+    def of(cls, text: str) -> WireField:
         found = _FIELD.fullmatch(text)
         if found is None:
             raise ValueError(text)
@@ -63,11 +63,11 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Function:
+class NanonisFunction:
     """One function: its fields, and the first release that has it."""
 
-    arguments: tuple[Field, ...]
-    results: tuple[Field, ...]
+    arguments: tuple[WireField, ...]
+    results: tuple[WireField, ...]
     since: int
 
     def argument_codes(self, release: int) -> list[str]:
@@ -78,13 +78,13 @@ class Function:
 
 
 @cache
-def functions() -> Mapping[str, Function]:
+def functions() -> Mapping[str, NanonisFunction]:
     """All that there are, by name."""
     found = {}
     for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
         if line and not line.startswith("#"):
             name, arguments, results, *since = re.split(" {2,}", line)
-            found[name] = Function(_fields(arguments), _fields(results), int(since[0]) if since else 0)
+            found[name] = NanonisFunction(_fields(arguments), _fields(results), int(since[0]) if since else 0)
     return found
 
 
@@ -98,21 +98,21 @@ def known_as(name: str) -> str | None:
     return _by_lower_case().get(name.lower())
 
 
-def _fields(column: str) -> tuple[Field, ...]:
-    return tuple(Field.of(text) for text in column.split() if text != "-")
+def _fields(column: str) -> tuple[WireField, ...]:
+    return tuple(WireField.of(text) for text in column.split() if text != "-")
 
 
 def split(received: bytearray) -> tuple[str, bool, bytes] | None:
     """Takes one request off: its function, whether an answer is wanted, its body; None if it is not there yet.
 
     Raises:
-        Unreadable: these are no requests.
+        MalformedRequest: these are no requests.
     """
     if len(received) < HEADER_BYTES:
         return None
     (size,) = struct.unpack_from(">i", received, 32)
     if not 0 <= size <= _LARGEST_BODY:
-        raise Unreadable(f"a request of {size} bytes")
+        raise MalformedRequest(f"a request of {size} bytes")
     if len(received) < HEADER_BYTES + size:
         return None
     name = bytes(received[:32]).rstrip(b"\0").decode("ascii", "replace")
@@ -126,7 +126,7 @@ def arguments(name: str, body: bytes, release: int) -> list[Any]:
     """The arguments in the body of a request.
 
     Raises:
-        Unreadable: too few or too many bytes.
+        MalformedRequest: too few or too many bytes.
     """
     at, found, count = 0, [], 0
     try:
@@ -135,9 +135,9 @@ def arguments(name: str, body: bytes, release: int) -> list[Any]:
             count = value if code == "n" else count
             found.append(value)
     except struct.error as error:
-        raise Unreadable(f"{len(body)} bytes of arguments are too few for {name}") from error
+        raise MalformedRequest(f"{len(body)} bytes of arguments are too few for {name}") from error
     if at != len(body):
-        raise Unreadable(f"{len(body) - at} bytes of arguments too many for {name}")
+        raise MalformedRequest(f"{len(body) - at} bytes of arguments too many for {name}")
     return found
 
 

@@ -19,7 +19,7 @@ RETRACE = " Retrace"
 """What the name of a channel ends with that is recorded on the way back."""
 
 
-class Drawn(Protocol):
+class ScanValues(Protocol):
     """The values of a scan, the same all along, and which of its rows are there at a time."""
 
     def channels(self, until_s: float | None = None) -> Channels: ...
@@ -39,7 +39,7 @@ class Occupied:
 
 
 @dataclass
-class RunningScan:
+class SimulatedScan:
     """A scan that was started: with the values that were in force then, whatever is changed later.
 
     Attributes:
@@ -60,7 +60,7 @@ class RunningScan:
     feedback: Feedback
     bias_v: float
     stopped_s: float | None = None
-    _drawn: Future[Drawn] = field(default_factory=Future, repr=False)
+    _drawn: Future[ScanValues] = field(default_factory=Future, repr=False)
     _whole: Channels | None = field(default=None, repr=False)
     _paused_since_s: float | None = None
     _paused_s: float = 0.0
@@ -160,7 +160,7 @@ class RunningScan:
 
 
 @dataclass(frozen=True)
-class RunningSpectrum:
+class SimulatedSpectrum:
     """A curve that was started.
 
     Attributes:
@@ -184,7 +184,7 @@ class RunningSpectrum:
 
 
 @dataclass(frozen=True)
-class InAir:
+class ValuesInAir:
     """A scan without a sample: noise on every channel.
 
     Attributes:
@@ -208,7 +208,7 @@ class InAir:
 
 
 @dataclass(frozen=True)
-class NotDrawn:
+class NoValues:
     """A scan that could not be simulated: not one line."""
 
     units: Mapping[str, str]

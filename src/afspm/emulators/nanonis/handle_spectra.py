@@ -4,47 +4,47 @@ from __future__ import annotations
 
 import numpy as np
 
-from afspm.emulators.nanonis.answers import Answer, Later, Nope, Results, answers, chosen
-from afspm.emulators.nanonis.panel import MODULES, MOST_POINTS, Panel, curve_columns
-from afspm.emulators.running import RunningSpectrum
+from afspm.emulators.activities import SimulatedSpectrum
+from afspm.emulators.nanonis.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
+from afspm.emulators.nanonis.panel import MODULES, MOST_POINTS, NanonisState, curve_columns
 
 
 @answers("BiasSpectr.Open", "ZSpectr.Open")
-def _open(panel: Panel, name: str) -> Answer:
+def _open(panel: NanonisState, name: str) -> Answer:
     panel.opened.add(name.partition(".")[0])
     return ()
 
 
-def _module(panel: Panel, name: str) -> str:
+def _module(panel: NanonisState, name: str) -> str:
     module = name.split(".")[0]
     if module not in panel.opened:
-        raise Nope(f"the module {module} is not open")
+        raise FunctionRefused(f"the module {module} is not open")
     return module
 
 
 @answers("BiasSpectr.StatusGet", "ZSpectr.StatusGet")
-def _curve_status(panel: Panel, name: str) -> Answer:
+def _curve_status(panel: NanonisState, name: str) -> Answer:
     kind = MODULES[_module(panel, name)]
     curve = panel.curve
     return (int(curve is not None and curve.kind == kind and curve.running(panel.clock.now_s())),)
 
 
 @answers("BiasSpectr.Start", "ZSpectr.Start")
-def _start_curve(panel: Panel, name: str, get_data: int, base_name: str) -> Answer:
+def _start_curve(panel: NanonisState, name: str, get_data: int, base_name: str) -> Answer:
     panel.start_curve(_module(panel, name), base_name)
     curve, ended = panel.curve, panel.curves_ended
     if not get_data or curve is None:
         return [], np.zeros((0, 0)), []
-    return Later(lambda _: _curve_data(curve) if panel.curves_ended > ended else None)
+    return DeferredResult(lambda _: _curve_data(curve) if panel.curves_ended > ended else None)
 
 
-def _curve_data(curve: RunningSpectrum) -> Results:
+def _curve_data(curve: SimulatedSpectrum) -> Results:
     """A row for each channel; then the fixed parameters, and what else was set."""
     return curve_columns(curve), curve.values.T, [*curve.position_m, float(curve.values[0, 0])]
 
 
 @answers("BiasSpectr.Stop", "ZSpectr.Stop")
-def _stop_curve(panel: Panel, name: str) -> Answer:
+def _stop_curve(panel: NanonisState, name: str) -> Answer:
     _module(panel, name)
     panel.stop_curve()
     return ()
@@ -52,22 +52,31 @@ def _stop_curve(panel: Panel, name: str) -> Answer:
 
 @answers("BiasSpectr.PropsSet")
 def _bias_props_set(
-    panel: Panel, save_all: int, sweeps: int, backward: int, points: int, z_off_m: float, autosave: int, dialog: int
+    panel: NanonisState,
+    save_all: int,
+    sweeps: int,
+    backward: int,
+    points: int,
+    z_off_m: float,
+    autosave: int,
+    dialog: int,
 ) -> Answer:
     return _props_set(panel, "BiasSpectr", points, sweeps, (backward, autosave, save_all, dialog))
 
 
 @answers("ZSpectr.PropsSet")
 def _z_props_set(
-    panel: Panel, backward: int, points: int, sweeps: int, autosave: int, dialog: int, save_all: int
+    panel: NanonisState, backward: int, points: int, sweeps: int, autosave: int, dialog: int, save_all: int
 ) -> Answer:
     return _props_set(panel, "ZSpectr", points, sweeps, (backward, autosave, save_all, dialog))
 
 
-def _props_set(panel: Panel, module: str, points: int, sweeps: int, switches: tuple[int, int, int, int]) -> Answer:
+def _props_set(
+    panel: NanonisState, module: str, points: int, sweeps: int, switches: tuple[int, int, int, int]
+) -> Answer:
     sweep = panel.sweeps[_module(panel, module)]
     if not (points == 0 or 2 <= points <= MOST_POINTS) or sweeps < 0:
-        raise Nope(f"a spectrum of {points} points, {sweeps} sweeps")
+        raise FunctionRefused(f"a spectrum of {points} points, {sweeps} sweeps")
     before = (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog)
     on = True
     now = [chosen(switch, was, on, not on) for switch, was in zip(switches, before, strict=True)]
@@ -77,7 +86,7 @@ def _props_set(panel: Panel, module: str, points: int, sweeps: int, switches: tu
 
 
 @answers("BiasSpectr.PropsGet", "ZSpectr.PropsGet")
-def _curve_props_get(panel: Panel, name: str) -> Answer:
+def _curve_props_get(panel: NanonisState, name: str) -> Answer:
     module = _module(panel, name)
     sweep, channels = panel.sweeps[module], _channel_names(panel, module)
     switches = (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog)
@@ -91,31 +100,31 @@ def _curve_props_get(panel: Panel, name: str) -> Answer:
 
 
 @answers("BiasSpectr.LimitsSet")
-def _limits_set(panel: Panel, first_v: float, last_v: float) -> Answer:
+def _limits_set(panel: NanonisState, first_v: float, last_v: float) -> Answer:
     panel.sweeps["BiasSpectr"].limits = (first_v, last_v)
     return ()
 
 
 @answers("BiasSpectr.LimitsGet")
-def _limits_get(panel: Panel) -> Answer:
+def _limits_get(panel: NanonisState) -> Answer:
     range_v = panel.rig.world.settings.iv.range_v
     return panel.sweeps["BiasSpectr"].limits or (-range_v, range_v)
 
 
 @answers("BiasSpectr.ChsSet", "ZSpectr.ChsSet")
-def _curve_channels_set(panel: Panel, name: str, indexes: list[int]) -> Answer:
+def _curve_channels_set(panel: NanonisState, name: str, indexes: list[int]) -> Answer:
     module = _module(panel, name)
     if not indexes or not all(0 <= index < len(panel.signals) for index in indexes):
-        raise Nope("there are no such channels")
+        raise FunctionRefused("there are no such channels")
     panel.sweeps[module].channels = list(dict.fromkeys(indexes))
     return ()
 
 
 @answers("BiasSpectr.ChsGet", "ZSpectr.ChsGet")
-def _curve_channels(panel: Panel, name: str) -> Answer:
+def _curve_channels(panel: NanonisState, name: str) -> Answer:
     module = _module(panel, name)
     return panel.curve_channels(module), _channel_names(panel, module)
 
 
-def _channel_names(panel: Panel, module: str) -> list[str]:
+def _channel_names(panel: NanonisState, module: str) -> list[str]:
     return [panel.signals[index] for index in panel.curve_channels(module)]

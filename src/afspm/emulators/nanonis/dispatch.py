@@ -10,17 +10,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.nanonis.panel import Panel
+from afspm.emulators.nanonis.panel import NanonisState
 
 Results = tuple[Any, ...]
 
 
-class Nope(Exception):
+class FunctionRefused(Exception):
     """The controller can't, and says why."""
 
 
 @dataclass(frozen=True)
-class Later:
+class DeferredResult:
     """The reply comes when something has happened.
 
     Attributes:
@@ -37,7 +37,7 @@ class Later:
     next_s: Callable[[float], float] = lambda now_s: math.inf
 
 
-Answer = Results | Later
+Answer = Results | DeferredResult
 Handler = Callable[..., Answer]
 HANDLERS: Final[dict[str, Handler]] = {}
 _NAMED: Final[set[Handler]] = set()
@@ -63,27 +63,27 @@ def answers(*names: str) -> Callable[[Handler], Handler]:
     return marked
 
 
-def answer(panel: Panel, name: str, arguments: list[Any]) -> Answer:
+def answer(panel: NanonisState, name: str, arguments: list[Any]) -> Answer:
     """What is done and replied.
 
     Raises:
-        Nope, RigBusy, InvalidValue.
+        FunctionRefused, RigBusy, InvalidValue.
     """
     handler = HANDLERS.get(name)
     _refuse_no_numbers(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
     if handler is not None:
         return handler(panel, *([name] if handler in _NAMED else []), *arguments)
     if name.partition(".")[0] not in _STORED:
-        raise Nope("Module not available")
+        raise FunctionRefused("Module not available")
     if name.endswith("Set"):
         try:
             panel.registers.set(name, arguments)
         except ValueError as error:
-            raise Nope(str(error)) from error
+            raise FunctionRefused(str(error)) from error
         return ()
     if name.endswith("Get"):
         return panel.registers.got(name, arguments)
-    raise Nope("it is not part of this emulator")
+    raise FunctionRefused("it is not part of this emulator")
 
 
 def _refuse_no_numbers(name: str, arguments: Iterable[Any], *, keeps_nan: bool) -> None:
@@ -92,10 +92,10 @@ def _refuse_no_numbers(name: str, arguments: Iterable[Any], *, keeps_nan: bool) 
         if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":
             values = np.asarray(argument)
             if (np.isnan(values).any() and not keeps_nan) or (np.isinf(values).any() and name not in _MAY_BE_INFINITE):
-                raise Nope("a value is not a number")
+                raise FunctionRefused("a value is not a number")
 
 
-def deadline_s(panel: Panel, timeout_ms: int) -> float:
+def deadline_s(panel: NanonisState, timeout_ms: int) -> float:
     """Experiment time at which a client's patience ends, which is counted in real time."""
     return math.inf if timeout_ms < 0 else panel.clock.now_s() + panel.experiment_s(timeout_ms / 1000)
 
@@ -103,12 +103,12 @@ def deadline_s(panel: Panel, timeout_ms: int) -> float:
 def chosen(number: int, *choices: Any) -> Any:
     """What a number stands for; as a rule 0 is what it is already."""
     if not 0 <= number < len(choices):
-        raise Nope(f"{number} is none of the choices")
+        raise FunctionRefused(f"{number} is none of the choices")
     return choices[number]
 
 
-def until_free(panel: Panel, wait: int, timeout_ms: int = -1) -> Answer:
+def until_free(panel: NanonisState, wait: int, timeout_ms: int = -1) -> Answer:
     """At once, or once the instrument has done what it was told."""
     if not wait:
         return ()
-    return Later(lambda now_s: None if panel.rig.busy(now_s) else (), deadline_s(panel, timeout_ms))
+    return DeferredResult(lambda now_s: None if panel.rig.busy(now_s) else (), deadline_s(panel, timeout_ms))

@@ -24,7 +24,7 @@ class _Write:
     content: bytes
 
 
-class Saving:
+class GxsmFileWriter:
     """The files of one folder.
 
     Attributes:

@@ -23,7 +23,7 @@ _TEXTS: Final = (
 )
 
 
-def nonsense(code: str, chance: random.Random) -> Any:
+def senseless_value(code: str, chance: random.Random) -> Any:
     """A value of the field, by its code."""
     if code in "fd":
         return chance.choice(_NUMBERS)
@@ -37,4 +37,4 @@ def nonsense(code: str, chance: random.Random) -> Any:
     if code == "2S":
         return [[chance.choice(_TEXTS) for _ in range(chance.randrange(3))] for _ in range(chance.randrange(3))]
     item = "S" if code == "A" else code[1]
-    return [nonsense(item, chance) for _ in range(chance.randrange(4))]
+    return [senseless_value(item, chance) for _ in range(chance.randrange(4))]

@@ -10,9 +10,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from afspm.emulators.activities import SimulatedScan, SimulatedSpectrum
 from afspm.emulators.asylum import ibw
-from afspm.emulators.asylum.values import Values
-from afspm.emulators.running import RunningScan, RunningSpectrum
+from afspm.emulators.asylum.values import IgorValues
 
 AMPLITUDE_M_PER_V = 1e-7
 
@@ -22,7 +22,7 @@ Made = Callable[[str], bytes]
 
 
 @dataclass(frozen=True)
-class Write:
+class FilePart:
     """A part of a file, to be written at a time (experiment s)."""
 
     at_s: float
@@ -31,20 +31,20 @@ class Write:
     begins: bool = True
 
 
-class Disk:
+class PendingWrites:
     """What is still to be written."""
 
     def __init__(self) -> None:
-        self._writes: list[Write] = []
+        self._writes: list[FilePart] = []
 
     def save(self, path: Path, content: bytes, at_s: float, rest_at_s: float) -> None:
         """Half of a file at one time, the other half at another."""
         half = len(content) // 2
-        self._writes += [Write(at_s, path, content[:half]), Write(rest_at_s, path, content[half:], begins=False)]
+        self._writes += [FilePart(at_s, path, content[:half]), FilePart(rest_at_s, path, content[half:], begins=False)]
         self._writes.sort(key=lambda write: write.at_s)
 
     def advance(self, now_s: float, *, there: bool) -> float | None:
-        """Write what is due, if the drive is `there`; returns when there is more."""
+        """FilePart what is due, if the drive is `there`; returns when there is more."""
         while self._writes and self._writes[0].at_s <= now_s:
             write = self._writes.pop(0)
             with contextlib.suppress(OSError):
@@ -55,7 +55,7 @@ class Disk:
         return self._writes[0].at_s if self._writes else None
 
 
-def image(name: str, scan: RunningScan, values: Values, now_s: float) -> bytes:
+def image(name: str, scan: SimulatedScan, values: IgorValues, now_s: float) -> bytes:
     """The file of a scan; lines that were not scanned are NaN."""
     channels = scan.channels(scan.end_s if scan.stopped_s is not None else None)
     layers, labels = [], []
@@ -70,7 +70,7 @@ def image(name: str, scan: RunningScan, values: Values, now_s: float) -> bytes:
     return ibw.wave(name, np.stack(layers, axis=2), "m", steps, labels, _note(values, now_s), now_s)
 
 
-def curve(name: str, spectrum: RunningSpectrum, values: Values, now_s: float) -> bytes:
+def curve(name: str, spectrum: SimulatedSpectrum, values: IgorValues, now_s: float) -> bytes:
     """The file of a force curve: towards the sample and back, over time."""
     table = dict(zip(spectrum.names, spectrum.values.T, strict=True))
     extension = table["Z"].max() - table["Z"]
@@ -84,7 +84,7 @@ def curve(name: str, spectrum: RunningSpectrum, values: Values, now_s: float) ->
     return ibw.wave(name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, noted), now_s)
 
 
-def _of_curve(spectrum: RunningSpectrum, distance_m: float, points: int, values: Values) -> Entries:
+def _of_curve(spectrum: SimulatedSpectrum, distance_m: float, points: int, values: IgorValues) -> Entries:
     """What the note of a force curve says of how it was taken."""
     duration_s = spectrum.end_s - spectrum.start_s
     velocity_m_s = distance_m / (duration_s / 2)
@@ -105,7 +105,7 @@ def _of_curve(spectrum: RunningSpectrum, distance_m: float, points: int, values:
     }
 
 
-def _note(values: Values, now_s: float, more: Entries = MappingProxyType({})) -> bytes:
+def _note(values: IgorValues, now_s: float, more: Entries = MappingProxyType({})) -> bytes:
     local, seconds = ibw.moment(now_s)
     texts = {
         "StartHeadTemp": "32.125 °C",

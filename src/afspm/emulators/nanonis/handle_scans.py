@@ -7,8 +7,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulators.nanonis.answers import Answer, Later, Nope, Results, answers, chosen, deadline_s
-from afspm.emulators.nanonis.panel import Panel
+from afspm.emulators.nanonis.dispatch import (
+    Answer,
+    DeferredResult,
+    FunctionRefused,
+    Results,
+    answers,
+    chosen,
+    deadline_s,
+)
+from afspm.emulators.nanonis.panel import NanonisState
 from afspm.simulation.scanning import MOST_PIXELS
 
 _WAITED: Final = "waited"
@@ -17,7 +25,7 @@ _PASTES: Final = (0, 1, 2)
 
 
 @answers("Scan.Action")
-def _action(panel: Panel, action: int, direction: int) -> Answer:
+def _action(panel: NanonisState, action: int, direction: int) -> Answer:
     now_s, scan = panel.clock.now_s(), panel.rig.scan
     if action == 0:
         if panel.scanning is not None:  # it begins anew
@@ -34,18 +42,18 @@ def _action(panel: Panel, action: int, direction: int) -> Answer:
     elif action == 6:
         panel.rig.move_probe(panel.frame[:2])
     elif action not in (2, 3, 4, 5):
-        raise Nope(f"{action} is no action")
+        raise FunctionRefused(f"{action} is no action")
     return ()
 
 
 @answers("Scan.StatusGet")
-def _scan_status(panel: Panel) -> Answer:
+def _scan_status(panel: NanonisState) -> Answer:
     running = panel.scanning is not None and panel.scanning.scan.running(panel.clock.now_s())
     return (int(running),)
 
 
 @answers("Scan.WaitEndOfScan")
-def _wait_end_of_scan(panel: Panel, timeout_ms: int) -> Answer:
+def _wait_end_of_scan(panel: NanonisState, timeout_ms: int) -> Answer:
     """Of the next end: one that has been is none.
 
     A client's pause since it has begun the scan, or since its last wait has timed out, is taken to last as long in
@@ -63,11 +71,11 @@ def _wait_end_of_scan(panel: Panel, timeout_ms: int) -> Answer:
         client[_WAITED] = panel.ends, panel.clock.now_s()
 
     until_s = deadline_s(panel, timeout_ms)
-    return Later(lambda _: (0, panel.last_path) if panel.ends > ends else None, until_s, (1, ""), gave_up)
+    return DeferredResult(lambda _: (0, panel.last_path) if panel.ends > ends else None, until_s, (1, ""), gave_up)
 
 
 @answers("Scan.WaitEndOfLine")
-def _wait_end_of_line(panel: Panel, timeout_ms: int) -> Answer:
+def _wait_end_of_line(panel: NanonisState, timeout_ms: int) -> Answer:
     """Of a line forward (0) or backward (1), its number counted from 1."""
     scan = panel.rig.scan
     timed_out = (1, 0, 0, 0)
@@ -83,43 +91,43 @@ def _wait_end_of_line(panel: Panel, timeout_ms: int) -> Answer:
     def next_s(now_s: float) -> float:
         return now_s + scan.line_s / 2
 
-    return Later(ready, deadline_s(panel, timeout_ms), timed_out, next_s=next_s)
+    return DeferredResult(ready, deadline_s(panel, timeout_ms), timed_out, next_s=next_s)
 
 
 @answers("Scan.FrameSet")
-def _frame_set(panel: Panel, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
+def _frame_set(panel: NanonisState, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
     if not (min(width, height) > 0.0 and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
-        raise Nope("the frame is empty")
+        raise FunctionRefused("the frame is empty")
     panel.set_frame(x, y, width, height, angle_deg)
     return ()
 
 
 @answers("Scan.FrameGet")
-def _frame_get(panel: Panel) -> Answer:
+def _frame_get(panel: NanonisState) -> Answer:
     return panel.frame
 
 
 @answers("Scan.BufferSet")
-def _buffer_set(panel: Panel, channels: list[int], pixels: int, lines: int) -> Answer:
+def _buffer_set(panel: NanonisState, channels: list[int], pixels: int, lines: int) -> Answer:
     if not all(0 <= channel < 128 for channel in channels) or not 1 <= pixels <= MOST_PIXELS or lines < 0:
-        raise Nope("no such channel or number of pixels")
+        raise FunctionRefused("no such channel or number of pixels")
     panel.set_buffer(channels, pixels, lines)
     return ()
 
 
 @answers("Scan.BufferGet")
-def _buffer_get(panel: Panel) -> Answer:
+def _buffer_get(panel: NanonisState) -> Answer:
     return panel.channels, panel.pixels, panel.lines
 
 
 @answers("Scan.SpeedSet")
-def _speed_set(panel: Panel, *speed: Any) -> Answer:
+def _speed_set(panel: NanonisState, *speed: Any) -> Answer:
     """1 keeps the speed and 2 the time; which of both is kept says which of both counts now."""
     forward, backward, forward_s, backward_s, keep, ratio = speed
     keeps_time = panel.speed[4] if keep == 0 else keep - 1
     width = panel.frame[2]
     if not min(forward, backward, forward_s, backward_s) > 0.0 or keep > 2:
-        raise Nope("no such speed")
+        raise FunctionRefused("no such speed")
     if keeps_time:
         forward, backward = width / forward_s, width / backward_s
     else:
@@ -129,13 +137,13 @@ def _speed_set(panel: Panel, *speed: Any) -> Answer:
 
 
 @answers("Scan.SpeedGet")
-def _speed_get(panel: Panel) -> Answer:
+def _speed_get(panel: NanonisState) -> Answer:
     return panel.speed
 
 
 @answers("Scan.PropsSet")
 def _props_set(
-    panel: Panel, continuous: int, bouncy: int, autosave: int, series: str, comment: str, *rest: Any
+    panel: NanonisState, continuous: int, bouncy: int, autosave: int, series: str, comment: str, *rest: Any
 ) -> Answer:
     panel.continuous = bool(chosen(continuous, panel.continuous, 1, 0))
     panel.bouncy = bool(chosen(bouncy, panel.bouncy, 1, 0))
@@ -149,7 +157,7 @@ def _props_set(
 
 
 @answers("Scan.PropsGet")
-def _props_get(panel: Panel) -> Answer:
+def _props_get(panel: NanonisState) -> Answer:
     counts = [1] * len(panel.modules)
     table = [["Setpoint"] for _ in panel.modules]
     autosave = {"all": 0, "next": 1, "off": 2}[panel.autosave]
@@ -158,10 +166,10 @@ def _props_get(panel: Panel) -> Answer:
 
 
 @answers("Scan.FrameDataGrab")
-def _frame_data_grab(panel: Panel, channel: int, forward: int) -> Answer:
+def _frame_data_grab(panel: NanonisState, channel: int, forward: int) -> Answer:
     last = panel.last
     if channel not in (last.channels if last else panel.channels):
-        raise Nope("the channel is not among the acquired ones")
+        raise FunctionRefused("the channel is not among the acquired ones")
     now_s = panel.clock.now_s()
     if last is None or last.scan.drawing:
         raw, upwards = np.full((panel.lines, panel.pixels), np.nan), True
@@ -173,13 +181,13 @@ def _frame_data_grab(panel: Panel, channel: int, forward: int) -> Answer:
 
 
 @answers("Scan.XYPosGet")
-def _scan_position(panel: Panel, wait: int) -> Answer:
+def _scan_position(panel: NanonisState, wait: int) -> Answer:
     return panel.rig.probe_at(panel.clock.now_s())
 
 
 @answers("Scan.Save")
-def _save(panel: Panel, wait: int, timeout_ms: int) -> Answer:
+def _save(panel: NanonisState, wait: int, timeout_ms: int) -> Answer:
     if panel.last is None:
-        raise Nope("there is no scan to save")
+        raise FunctionRefused("there is no scan to save")
     panel.save_scan(panel.last, panel.clock.now_s())
     return (0,)
