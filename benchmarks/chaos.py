@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from afspm.clock import ExperimentClock
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 
 SAMPLE = Path(__file__).parents[1] / "experiments" / "tip_repair" / "experiment.toml"
 OVER = """

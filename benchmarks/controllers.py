@@ -23,7 +23,7 @@ from afspm.microscopes.gxsm.bridge_client import BridgeLink
 from afspm.microscopes.nanonis import Nanonis
 from afspm.microscopes.nanonis.link import Link as NanonisLink
 from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 from afspm.translator.driver import Driver
 from afspm.translator.process import Translator
 from afspm.transport.port import RequestReceived, Served

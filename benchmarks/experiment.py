@@ -61,7 +61,7 @@ component = true
 class = "watcher.Watcher"
 """
 WATCHER = """
-from afspm.runtime.component import Component
+from afspm.client.component import Component
 
 
 class Watcher(Component):

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from afspm.clock import ExperimentClock
+from afspm.launch import Launch, Sockets
 from afspm.record.ahead import expect_record
-from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
 CLOCK = ExperimentClock.real()
@@ -108,7 +108,7 @@ class Roles(ExitStack):
         return publish, serve
 
     def _host(self, launch: Launch) -> None:
-        process = subprocess.Popen([sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE)
+        process = subprocess.Popen([sys.executable, "-m", "afspm.process.host"], stdin=subprocess.PIPE)
         self.processes.append(process)
         self.callback(_end, process)
         assert process.stdin is not None

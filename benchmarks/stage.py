@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from afspm import wire
 from afspm.clock import ExperimentClock
+from afspm.launch import Launch, Sockets
 from afspm.model import ControlMode, ControlState, Region, Scan, ScopeState, ScopeStatus
-from afspm.runtime.launch import Launch, Sockets
 from afspm.transport.launching import open_port
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
@@ -57,7 +57,7 @@ class Stage(ExitStack):
             simulated=True,
         )
         self.process = subprocess.Popen(
-            (sys.executable, "-m", "afspm.runtime.host"), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            (sys.executable, "-m", "afspm.process.host"), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         assert self.process.stdin is not None
         assert self.process.stderr is not None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from afspm.client.component import Component
 from afspm.model import Scan
-from afspm.runtime.component import Component
 
 
 class Survey(Component):

@@ -9,12 +9,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from afspm.client.component import Component
+    from afspm.client.connect import connect
+    from afspm.client.scope import Scope
     from afspm.files import read
     from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
     from afspm.record.run import open_run
-    from afspm.runtime.component import Component
-    from afspm.runtime.connect import connect
-    from afspm.runtime.scope import Scope
 
 __all__ = [
     "Component",
@@ -32,9 +32,9 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Component": "afspm.runtime.component",
-    "Scope": "afspm.runtime.scope",
-    "connect": "afspm.runtime.connect",
+    "Component": "afspm.client.component",
+    "Scope": "afspm.client.scope",
+    "connect": "afspm.client.connect",
     "open_run": "afspm.record.run",
     "read": "afspm.files",
 }

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from afspm import wire
+from afspm.client.component import Component
 from afspm.errors import ControlLost
 from afspm.exit_codes import ExitCode
 from afspm.logic.liveness import LivenessPolicy
@@ -20,7 +21,6 @@ from afspm.logic.restart import RestartPolicy
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.supervision import ChildPolicy
 from afspm.model import Problem, Region
-from afspm.runtime.component import Component
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.testing.deterministic.bench import CHANNELS, BenchMicroscope
 from afspm.testing.deterministic.hosted import HostedComponent, HostedTranslator

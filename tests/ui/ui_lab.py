@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from afspm.client.follower import SMALL, Follower
 from afspm.model import ControlState, JournalEntry
-from afspm.runtime.following import SMALL, Follower
 
 DEADLINE_S = 30.0
 AFSPM = (sys.executable, "-c", "from afspm.cli import main; main()")

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any, Protocol
 
-HOST = "afspm.runtime.host"
+HOST = "afspm.process.host"
 IMPORTED = [HOST, "numpy", "afspm.microscopes.asylum", "afspm.microscopes.gxsm", "afspm.microscopes.nanonis"]
 
 
@@ -27,7 +27,7 @@ class Host(Protocol):
 
 
 def host(environment: Mapping[str, str]) -> Host:
-    """A process as `python -m afspm.runtime.host` is one; where the system can, forked from one that has imported what
+    """A process as `python -m afspm.process.host` is one; where the system can, forked from one that has imported what
     all of them need. (How one starts by itself is what the tests of experiments see to.)"""
     if "forkserver" in multiprocessing.get_all_start_methods():
         return _Forked(environment)
@@ -60,7 +60,7 @@ class _Forked:
 
 def _run(stdin: Connection, stderr: Connection, environment: Mapping[str, str], folder: Path) -> None:
     """In the new process."""
-    from afspm.runtime import host
+    from afspm.process import host
 
     for number, pipe in ((0, stdin), (2, stderr)):
         with pipe:

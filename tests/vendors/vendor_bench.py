@@ -23,6 +23,7 @@ from afspm.clock import ExperimentClock
 from afspm.emulators.emulator import Emulator
 from afspm.emulators.faults import Fault
 from afspm.exit_codes import ExitCode
+from afspm.launch import Launch, Sockets
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -37,7 +38,6 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
 DEADLINE_S = 30.0

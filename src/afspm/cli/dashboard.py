@@ -106,9 +106,9 @@ def _people_in(file: Path) -> dict[str, str]:
 
 def _running_here(where: Path) -> Path | None:
     """The folder of the run that is meant; None: the file is of one that was started elsewhere."""
+    from afspm.client.connect import find_run
     from afspm.errors import FileError
     from afspm.record.run_json import ENDED, read_run_json
-    from afspm.runtime.connect import find_run
 
     try:
         folder = find_run(where)

@@ -59,7 +59,7 @@ def _run(emulator: Emulator, speed: float, folder: Path) -> None:
 
     from afspm.clock import ExperimentClock
     from afspm.emulators.emulator import Crashed
-    from afspm.runtime.log import set_up
+    from afspm.process.log import set_up
 
     log = set_up("emulate", "INFO")
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -13,8 +13,8 @@ import typer
 
 if TYPE_CHECKING:
     from afspm.cli.telling import About
-    from afspm.runtime.following import Follower
-    from afspm.runtime.scope import Scope
+    from afspm.client.follower import Follower
+    from afspm.client.scope import Scope
 
 NOT_RUNNING = 3
 """The exit code where nothing runs."""
@@ -45,7 +45,7 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
     Args:
         lines: also of scans that are being taken.
     """
-    from afspm.runtime.following import LINES, SMALL, Follower
+    from afspm.client.follower import LINES, SMALL, Follower
 
     folder = _running(where)
     with Follower(folder, TERMINAL, (*SMALL, LINES) if lines else SMALL) as follower:
@@ -59,7 +59,7 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
 @contextmanager
 def acting(where: Path) -> Iterator[Scope]:
     """A handle on the run that is meant, in the name of whoever sits here; ends the command where nothing runs."""
-    from afspm.runtime.connect import connect
+    from afspm.client.connect import connect
 
     folder = _running(where)
     with _only_if_running(folder):
@@ -101,9 +101,9 @@ def say_nothing_runs(why: str) -> NoReturn:
 
 def _running(where: Path) -> Path:
     """The folder of the run that is meant, as far as it is not known to have ended."""
+    from afspm.client.connect import find_run
     from afspm.errors import FileError
     from afspm.record.run_json import ENDED, read_run_json
-    from afspm.runtime.connect import find_run
 
     try:
         folder = find_run(where)

@@ -21,7 +21,7 @@ def report(
 
     Of a run that goes on, too: it shows what has happened so far. The page needs no other file.
     """
+    from afspm.client.connect import find_run
     from afspm.record.report import write
-    from afspm.runtime.connect import find_run
 
     typer.echo(write(find_run(where)))

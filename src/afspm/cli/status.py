@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from afspm.cli.telling import About
-    from afspm.runtime.following import Follower
+    from afspm.client.follower import Follower
 
 REFRESH_S = 0.25
 LOOK_S = 2.0

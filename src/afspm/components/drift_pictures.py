@@ -25,14 +25,14 @@ _ALBUM = "afspm.drift.figures.album"
 
 
 @dataclass(frozen=True)
-class Told:
+class TabledScan:
     """A scan of the table: its file, and whether components were given sample coordinates when it was told."""
 
     file: str
     correcting: bool
 
 
-def parts(told: Sequence[Told]) -> list[tuple[str, int, int]]:
+def parts(told: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
     """Name, start and stop of the scans without and with correction. The one that was taken while correction was
     switched on, and may have been asked for before, is in neither."""
     first_on = next((k for k, one in enumerate(told) if one.correcting), len(told))
@@ -43,7 +43,7 @@ def parts(told: Sequence[Told]) -> list[tuple[str, int, int]]:
 class _AsSaved(Sequence["DriftScan"]):
     """Scans that are read whenever they are asked for."""
 
-    def __init__(self, told: Sequence[Told], read: Callable[[Told], DriftScan]) -> None:
+    def __init__(self, told: Sequence[TabledScan], read: Callable[[TabledScan], DriftScan]) -> None:
         self._told, self._read = told, read
 
     def __len__(self) -> int:
@@ -109,7 +109,7 @@ class DriftPictures(DriftTable):
 
     def on_drift_mapping(self, message: Any) -> None:
         super().on_drift_mapping(message)
-        self._heard.setdefault(message.filename, Told(message.filename, message.correcting))
+        self._heard.setdefault(message.filename, TabledScan(message.filename, message.correcting))
         told, newest = list(self._heard.values()), list(self._heard).index(message.filename)
         for _, start, stop in parts(told):
             if start < newest < stop:
@@ -124,7 +124,7 @@ class DriftPictures(DriftTable):
         else:
             self._draw(told)
 
-    def _draw(self, told: list[Told]) -> None:
+    def _draw(self, told: list[TabledScan]) -> None:
         from afspm.components.simulated_truth import true_drift
         from afspm.drift.figures import album
         from afspm.drift.record import DriftRecord
@@ -148,7 +148,7 @@ class DriftPictures(DriftTable):
         for path in album.write(run, folder, title=title):
             self.log.info("drawn: %s", path)
 
-    def _parts(self, told: list[Told], record: DriftRecord, frames: list[DriftScan]) -> list[Part]:
+    def _parts(self, told: list[TabledScan], record: DriftRecord, frames: list[DriftScan]) -> list[Part]:
         """With what was estimated off-line."""
         from afspm.drift.figures.album import Part
         from afspm.drift.offline import against_first
@@ -160,7 +160,7 @@ class DriftPictures(DriftTable):
             made.append(Part(name, f"correction {name}", start, stop, estimates))
         return made
 
-    def _matched(self, told: list[Told], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:
+    def _matched(self, told: list[TabledScan], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:
         """The first scan and the last without correction that has features in common with it: drift is seen best."""
         from afspm.drift.estimators import estimator
 
@@ -176,7 +176,7 @@ class DriftPictures(DriftTable):
                 return without[0], second, found
         return None
 
-    def _compared(self, first: Told, other: Told) -> Registration:
+    def _compared(self, first: TabledScan, other: TabledScan) -> Registration:
         """Of two scans, which are compared only once."""
         from afspm.drift.estimators import estimator
         from afspm.drift.registration import Registration
@@ -190,7 +190,7 @@ class DriftPictures(DriftTable):
                 self._pairs[pair] = Registration.refused(str(error))
         return self._pairs[pair]
 
-    def _frame_of(self, told: Told) -> DriftScan | None:
+    def _frame_of(self, told: TabledScan) -> DriftScan | None:
         """Where and when it was taken, without the values, of a night's worth of which there may be too many to be
         kept; None: it can't be had."""
         try:
@@ -206,7 +206,7 @@ class DriftPictures(DriftTable):
             self.log.error("a scan is left out of the pictures: %s", error)
         self._has_told = True
 
-    def _scan(self, told: Told) -> DriftScan:
+    def _scan(self, told: TabledScan) -> DriftScan:
         """As the microscope saved it, in tip coordinates."""
         from afspm.files import read
         from afspm.study.scan_series import drift_scan
@@ -217,10 +217,10 @@ class DriftPictures(DriftTable):
                 return drift_scan(scan, content)
         raise FileError(f"has no channel {self.channel!r}", where=told.file)
 
-    def _told(self) -> list[Told]:
+    def _told(self) -> list[TabledScan]:
         """What the table says."""
         path = Path(self.run_dir) / self.file
         if not path.exists():
             return []
         with path.open(newline="", encoding="utf-8") as file:
-            return [Told(row["filename"], row["correcting"] == "yes") for row in csv.DictReader(file)]
+            return [TabledScan(row["filename"], row["correcting"] == "yes") for row in csv.DictReader(file)]

@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from afspm.client.component import Component
 from afspm.clock import iso_utc
-from afspm.components.records import LineFile, csv_line
+from afspm.components.line_file import LineFile, csv_line
 from afspm.drift.record import COLUMNS as RECORD
 from afspm.drift.record import drift_at
-from afspm.runtime.component import Component
 
 COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "units", *RECORD, "lost", "correcting")
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from afspm import wire
-from afspm.components.channels import Expected
-from afspm.components.feedback_metrics import FeedbackError, Following, FollowingLimits
+from afspm.client.component import Component
+from afspm.components.channel_pairs import ChannelPairing, HeightPair
+from afspm.components.feedback_metrics import FeedbackError, FeedbackLimits, FeedbackQuality
 from afspm.components.feedback_signal import FeedbackSignal
-from afspm.components.tip_scans import HeightPair, Pairing
+from afspm.components.missing_channels import MissingChannels
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import ControlState, Feedback, Problem, Scan
-from afspm.runtime.component import Component
 from afspm.units import Length
 
 MESSAGE = "FeedbackAnalysis"
@@ -47,23 +47,23 @@ class FeedbackAnalysis(Component):
         channel: str = "Amplitude",
         height: str = "Height",
         threshold: float | None = None,
-        limit: float = FollowingLimits.pixels,
-        relief_limit: float = FollowingLimits.relief,
+        limit: float = FeedbackLimits.pixels,
+        relief_limit: float = FeedbackLimits.relief,
         sensitivity: Length | None = None,
         flag_after: int = 2,
         clear_after: int = 1,
     ) -> None:
         if not (0.0 < limit < 1.0 and relief_limit > 0.0 and flag_after >= 1 and clear_after >= 1):
             raise ConfigError("`limit` must be between 0 and 1, `relief_limit` above zero, the counts one at least")
-        self.limits = FollowingLimits(limit, relief_limit)
+        self.limits = FeedbackLimits(limit, relief_limit)
         self.flag_after, self.clear_after = flag_after, clear_after
-        self._pairing = Pairing(channel, height)
+        self._pairing = ChannelPairing(channel, height)
         self._signal = FeedbackSignal(threshold, sensitivity)
         self._feedback = Feedback()
         self._is_flagged = self._is_being_solved = False
 
     def on_start(self) -> None:
-        self.expected = Expected(self._pairing.channels, self.log)
+        self.expected = MissingChannels(self._pairing.channels, self.log)
 
     def on_feedback(self, feedback: Feedback) -> None:
         self._feedback = feedback
@@ -99,7 +99,7 @@ class FeedbackAnalysis(Component):
     def _count(self, error: FeedbackError) -> None:
         following = self.limits.judge(error)
         row = self.memory.get("row", 0)  # bad scans in a row as a positive number, good ones as a negative
-        row = min(row, 0) - 1 if following is Following.WELL else 0 if following.is_good else max(row, 0) + 1
+        row = min(row, 0) - 1 if following is FeedbackQuality.WELL else 0 if following.is_good else max(row, 0) + 1
         self.memory["row"] = row
         if row <= 0:
             self.memory["is_told"] = False

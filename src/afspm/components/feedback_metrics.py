@@ -20,7 +20,7 @@ _CLOSE = 1.1  # of two gains, between which none is looked for
 _SWING = 0.2  # of the error, that the height has to share for an oscillation
 
 
-class Following(Enum):
+class FeedbackQuality(Enum):
     """How the feedback follows the sample."""
 
     WELL = "follows"
@@ -30,7 +30,7 @@ class Following(Enum):
 
     @property
     def is_good(self) -> bool:
-        return self in (Following.WELL, Following.BARELY)
+        return self in (FeedbackQuality.WELL, FeedbackQuality.BARELY)
 
 
 @dataclass(frozen=True)
@@ -61,19 +61,19 @@ class FeedbackError:
 
 
 @dataclass(frozen=True)
-class FollowingLimits:
+class FeedbackLimits:
     """What a feedback that follows may leave: a share of pixels beyond the threshold, and one of the relief."""
 
     pixels: float = 0.1
     relief: float = 0.2
 
-    def judge(self, error: FeedbackError) -> Following:
+    def judge(self, error: FeedbackError) -> FeedbackQuality:
         """Return what the error of one scan says. Half the limits are left as a margin where it follows well."""
         worst = max(error.share / self.pixels, error.missed / self.relief)
         if worst <= 1.0:
-            return Following.WELL if worst <= 0.5 else Following.BARELY
+            return FeedbackQuality.WELL if worst <= 0.5 else FeedbackQuality.BARELY
         is_swinging = error.swing > _SWING and error.share > self.pixels
-        return Following.OSCILLATES if is_swinging else Following.TOO_SLOW
+        return FeedbackQuality.OSCILLATES if is_swinging else FeedbackQuality.TOO_SLOW
 
 
 def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> Array:
@@ -137,7 +137,7 @@ def _smooth_variance(values: Array) -> float:
 
 def gain_search(
     start: float, factor: float, lowest: float, highest: float, most_tries: int
-) -> Generator[float, Following | None, float | None]:
+) -> Generator[float, FeedbackQuality | None, float | None]:
     """Look for a gain at which the feedback follows well: higher while it is too slow, lower while it oscillates.
 
     Yields gains to try, the start first, and is sent how the feedback follows; None if the gain was refused. Returns
@@ -154,12 +154,12 @@ def gain_search(
     comes_from_above = False
     for _ in range(most_tries):
         following = yield gain
-        if following is None or following is Following.OSCILLATES:
+        if following is None or following is FeedbackQuality.OSCILLATES:
             fast, wanted = gain, gain / factor
-            comes_from_above = following is Following.OSCILLATES and well is None
-        elif following is Following.TOO_SLOW:
+            comes_from_above = following is FeedbackQuality.OSCILLATES and well is None
+        elif following is FeedbackQuality.TOO_SLOW:
             slow, wanted, comes_from_above = gain, gain * factor, False
-        elif following is Following.BARELY:
+        elif following is FeedbackQuality.BARELY:
             barely, wanted = gain, gain * factor
         elif comes_from_above:  # one step more, for a margin below the oscillation
             well, wanted, comes_from_above = gain, gain / factor, False

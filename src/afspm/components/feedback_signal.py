@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from afspm.client.scope import Scope
 from afspm.components.feedback_metrics import FeedbackError, feedback_error, relative_error
 from afspm.errors import ConfigError, InvalidValue, Refused, RequestError, UnitError
 from afspm.model import Scan, names
-from afspm.runtime.scope import Scope
 from afspm.units import convert, same_kind
 
 ASKED_WITHIN_S = 5.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import ClassVar
 
-from afspm.components.feedback_metrics import Following, FollowingLimits, gain_search
+from afspm.client.component import Component
+from afspm.components.feedback_metrics import FeedbackLimits, FeedbackQuality, gain_search
 from afspm.components.feedback_signal import FeedbackSignal
 from afspm.errors import ConfigError, ControlLost, InvalidValue, Refused
 from afspm.model import Problem, names
-from afspm.runtime.component import Component
 from afspm.units import Length
 
 BACK_WITHIN_S = 60.0
@@ -49,8 +49,8 @@ class FeedbackTuner(Component):
         channel: str = "Amplitude",
         height: str = "Height",
         threshold: float | None = None,
-        limit: float = FollowingLimits.pixels,
-        relief_limit: float = FollowingLimits.relief,
+        limit: float = FeedbackLimits.pixels,
+        relief_limit: float = FeedbackLimits.relief,
         sensitivity: Length | None = None,
     ) -> None:
         if not (0.0 < lowest_gain < highest_gain and factor > 1.0 and most_tries >= 2):
@@ -59,7 +59,7 @@ class FeedbackTuner(Component):
             raise ConfigError("`limit` must be between 0 and 1, `relief_limit` above zero")
         self.lowest, self.highest, self.factor, self.most_tries = lowest_gain, highest_gain, factor, most_tries
         self.channel, self.height = channel, height
-        self.limits = FollowingLimits(limit, relief_limit)
+        self.limits = FeedbackLimits(limit, relief_limit)
         self._signal = FeedbackSignal(threshold, sensitivity)
 
     def run(self) -> None:
@@ -107,7 +107,7 @@ class FeedbackTuner(Component):
             found: float | None = done.value
         return found
 
-    def _try(self, gain: float) -> Following | None:
+    def _try(self, gain: float) -> FeedbackQuality | None:
         """Return how the feedback follows with a gain; None if that was refused.
 
         Raises:

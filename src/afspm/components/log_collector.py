@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from afspm.addresses import ListeningAddress
+from afspm.client.component import Component
 from afspm.clock import iso_utc
-from afspm.components.records import LineFile
-from afspm.runtime.component import Component
+from afspm.components.line_file import LineFile
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
     from afspm.transport.log_link import LogLine
 
 
@@ -46,7 +46,7 @@ class LogCollector(Component):
         self.address, self.file = address, file
         self.level = logging.getLevelName(level)
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         from afspm.transport.log_link import LogReceiver
         from afspm.transport.network import Network
 

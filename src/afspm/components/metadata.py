@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+from afspm.client.component import Component
 from afspm.clock import iso_utc
-from afspm.components.records import LineFile, csv_line
+from afspm.components.line_file import LineFile, csv_line
 from afspm.model import ControlState, Region, Scan, ScopeState, ScopeStatus, Spectrum
-from afspm.runtime.component import Component
 
 COLUMNS = (
     "time",
@@ -37,7 +37,7 @@ _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
 
 
 @dataclass(frozen=True)
-class Circumstances:
+class ControlProvenance:
     """Who was in control when a measurement began, and how things stood; texts, empty where it is not known."""
 
     in_control: str = ""
@@ -112,35 +112,35 @@ class Metadata(Component):
             return self.packet.time_ns
         return measured.time_ns
 
-    def _circumstances(self, what: str, time_ns: int | None) -> Circumstances:
+    def _circumstances(self, what: str, time_ns: int | None) -> ControlProvenance:
         """Those noted when it began, if it is the measurement that they were noted for."""
         if self.memory.get("what") != what:
-            return Circumstances()
+            return ControlProvenance()
         finished_ns = self.memory["finished_ns"]
         if finished_ns is None and time_ns is not None:
             self.memory["finished_ns"] = time_ns
             self.memory.save()
         elif finished_ns != time_ns and not self._saw_begin:
-            return Circumstances()  # a later one, that began while we were not running
-        return Circumstances(*self.memory["circumstances"])
+            return ControlProvenance()  # a later one, that began while we were not running
+        return ControlProvenance(*self.memory["circumstances"])
 
-    def _write(self, what: str, time_ns: int | None, row_at: Callable[[Circumstances], list[str]]) -> None:
+    def _write(self, what: str, time_ns: int | None, row_at: Callable[[ControlProvenance], list[str]]) -> None:
         self._under_way = None  # should it scan on without another state between them, that is the next one
-        identity = _identity(row_at(Circumstances()))
+        identity = _identity(row_at(ControlProvenance()))
         if identity in self._written:
             return  # replayed after a restart
         self._table.append([csv_line(row_at(self._circumstances(what, time_ns)))])
         self._written.add(identity)
 
 
-def scan_row(scan: Scan, circumstances: Circumstances) -> list[str]:
+def scan_row(scan: Scan, circumstances: ControlProvenance) -> list[str]:
     """One channel of a scan as a row."""
     rows, columns = scan.shape
     what = ["scan", scan.filename, scan.channel]
     return _row(scan.time_ns, what, _of_region(scan.region), [str(columns), str(rows), scan.unit], circumstances)
 
 
-def spectrum_row(spectrum: Spectrum, circumstances: Circumstances) -> list[str]:
+def spectrum_row(spectrum: Spectrum, circumstances: ControlProvenance) -> list[str]:
     """A spectrum as a row: its points are rows, its variables columns."""
     points, variables = spectrum.values.shape
     place = ["", ""] if spectrum.position_m is None else [_number(v) for v in spectrum.position_m]
@@ -149,7 +149,9 @@ def spectrum_row(spectrum: Spectrum, circumstances: Circumstances) -> list[str]:
     return _row(spectrum.time_ns, what, [*place, "", "", "m", ""], of_values, circumstances)
 
 
-def _row(time_ns: int | None, what: list[str], place: list[str], of_values: list[str], at: Circumstances) -> list[str]:
+def _row(
+    time_ns: int | None, what: list[str], place: list[str], of_values: list[str], at: ControlProvenance
+) -> list[str]:
     return [iso_utc(time_ns), *what, *place, *of_values, at.in_control, at.mode, at.problems, at.state]
 
 

@@ -7,11 +7,11 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from afspm.components import verdicts
-from afspm.components.records import LineFile
+from afspm.client.component import Component
+from afspm.components import tip_verdict
+from afspm.components.line_file import LineFile
 from afspm.model import ControlState, Scan, ScopeState, ScopeStatus
 from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
-from afspm.runtime.component import Component
 
 
 class NightPicture(Component):
@@ -69,7 +69,7 @@ class NightPicture(Component):
         by = envelope.partition("_")[2]
         if envelope.startswith("ActionMsg"):
             self._add(mark_entry(by, message.action, self._packet_ns()))
-        elif envelope.startswith(verdicts.MESSAGE) and (verdict := verdicts.read_verdict(message)) is not None:
+        elif envelope.startswith(tip_verdict.MESSAGE) and (verdict := tip_verdict.read_verdict(message)) is not None:
             of_ns, score = verdict
             self._add(mark_entry(by, "verdict", self._packet_ns(), score, of_ns))
 

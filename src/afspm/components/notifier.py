@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from afspm.components import notices
-from afspm.components.notices import (
+from afspm.client.component import Component
+from afspm.components import notifications
+from afspm.components.notifications import (
     CRITICAL,
     GIVEN_UP,
     MOST_TRIES,
@@ -14,7 +15,7 @@ from afspm.components.notices import (
     OCCASIONS,
     UNSOLVED,
     NotDelivered,
-    Notice,
+    Notification,
     Targets,
 )
 from afspm.errors import ConfigError
@@ -22,7 +23,6 @@ from afspm.formatting import lasting
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
 from afspm.record.run_json import experiment_name
-from afspm.runtime.component import Component
 from afspm.units import Duration
 
 MOST_TOLD = 1000
@@ -73,7 +73,7 @@ class Notifier(Component):
         self.memory.setdefault("waiting", [])
         self._due_s: dict[str, float] = {}
         if self.targets.webhook:
-            notices.address(self.targets.webhook)  # what can't work is to be known now, not in the night
+            notifications.address(self.targets.webhook)  # what can't work is to be known now, not in the night
 
     def on_control(self, control_state: ControlState) -> None:
         since_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
@@ -117,7 +117,7 @@ class Notifier(Component):
             return
         self.log.warning("%s", text)
         run = Path(self.run_dir)
-        notice = Notice(what, experiment_name(run, run.name), str(run), self.clock.now_ns(), text, self.simulated)
+        notice = Notification(what, experiment_name(run, run.name), str(run), self.clock.now_ns(), text, self.simulated)
         new = [{"notice": dict(vars(notice)), "way": way, "tries": 0} for way in self.targets.ways]
         self.memory["waiting"] = [*self.memory["waiting"], *new][-MOST_WAITING:]
         self.memory["told"] = [*self.memory["told"], key][-MOST_TOLD:]
@@ -132,10 +132,10 @@ class Notifier(Component):
     def _try(self, waiting: dict[str, Any]) -> None:
         key, way = _key(waiting), waiting["way"]
         try:
-            self.targets.deliver(Notice(**waiting["notice"]), way)
+            self.targets.deliver(Notification(**waiting["notice"]), way)
         except (NotDelivered, ConfigError) as error:
             waiting["tries"] += 1
-            self._due_s[key] = self.clock.monotonic_s() + notices.delay_s(waiting["tries"])
+            self._due_s[key] = self.clock.monotonic_s() + notifications.delay_s(waiting["tries"])
             if waiting["tries"] < MOST_TRIES:
                 self.log.info("nobody told by the %s yet, it is tried again: %s", way, error)
                 self.memory.save()

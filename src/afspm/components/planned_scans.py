@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+from afspm.client.component import Component
 from afspm.clock import NS_PER_S
-from afspm.components.plan import XY, Rhythm, ScanPlan, Step, grid_centers, rounds_within, squares
+from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within, squares
 from afspm.errors import ConfigError, InvalidValue
 from afspm.formatting import day_and_time
 from afspm.model import Region, names
-from afspm.runtime.component import Component
 from afspm.units import Angle, Duration, Length
 
 Pixels = tuple[int, int]
@@ -59,7 +59,7 @@ class PlannedScans(Component):
     def run(self) -> None:
         self._began_s = self.clock.now_s()
         self.memory.setdefault("start_s", self._began_s)
-        rhythm = Rhythm(float(self.memory["start_s"]), self.beat_s)
+        rhythm = RoundSchedule(float(self.memory["start_s"]), self.beat_s)
         self.memory.save()
         self._set_parameters()
         done = int(self.memory.get("done", 0))
@@ -79,7 +79,7 @@ class PlannedScans(Component):
             for name, quantity in self.parameters.items():
                 self.scope.set(name, quantity)
 
-    def _await(self, step: Step, rhythm: Rhythm) -> bool:
+    def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
         """Until it is due; False: the rounds that were left out were the last."""
         if not step.starts_round or self.memory.get("begun") == step.index:
             return True
@@ -101,7 +101,7 @@ class PlannedScans(Component):
         self.memory.save()
         return is_left
 
-    def _take(self, step: Step) -> None:
+    def _take(self, step: PlanStep) -> None:
         scans = self.scope.scan(step.region, shape=step.shape, key=step.key)
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
         if self.memory.save():  # else a restart asks for it again
@@ -175,7 +175,7 @@ class ScanSeries(PlannedScans):
 
 
 @dataclass(frozen=True)
-class Place:
+class ListedRegion:
     """A region in an experiment file: {center = ["1 um", "0 um"], size = ["500 nm", "500 nm"], angle = "30 deg"}."""
 
     center: tuple[Length, Length]
@@ -183,9 +183,9 @@ class Place:
     angle: Angle = 0.0
 
     @classmethod
-    def of(cls, given: Place | Mapping[str, Any]) -> Place:
+    def of(cls, given: ListedRegion | Mapping[str, Any]) -> ListedRegion:
         """From the table that a process is given."""
-        return given if isinstance(given, Place) else cls(**given)
+        return given if isinstance(given, ListedRegion) else cls(**given)
 
     @property
     def region(self) -> Region:
@@ -207,7 +207,7 @@ class ScanList(PlannedScans):
 
     def __init__(
         self,
-        regions: list[Place],
+        regions: list[ListedRegion],
         pixels: Pixels = (128, 128),
         rounds: int = 1,
         every: Duration = 0.0,
@@ -215,7 +215,7 @@ class ScanList(PlannedScans):
         end_when_done: bool = False,
         parameters: dict[str, str | float] | None = None,
     ) -> None:
-        plan = _plan(tuple(Place.of(place).region for place in regions), pixels, rounds)
+        plan = _plan(tuple(ListedRegion.of(place).region for place in regions), pixels, rounds)
         super().__init__(
             plan, period_s=every, keep_control=keep_control, end_when_done=end_when_done, parameters=parameters
         )

@@ -8,16 +8,16 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from afspm.client.component import Component
 from afspm.exit_codes import ExitCode
 from afspm.model import Frame
+from afspm.process.priority import step_back
 from afspm.record.run_json import EXPERIMENT_FILE, experiment_name
-from afspm.runtime.component import Component
-from afspm.runtime.priority import step_back
 from afspm.transport.port import CaughtUp, Killed, PacketReceived, ParentGone
 
 if TYPE_CHECKING:
+    from afspm.process.context import ProcessContext
     from afspm.record.store import RecordSettings
-    from afspm.runtime.process import Context
 
 REST_S = 0.5
 """Real: for what is said of the end after it."""
@@ -42,8 +42,8 @@ class Recorder(Component):
     def __init__(self, scans: bool = True) -> None:
         self.scans = scans
 
-    def run_process(self, context: Context) -> int:
-        from afspm.components.recording import Writer
+    def run_process(self, context: ProcessContext) -> int:
+        from afspm.components.recording import RecordWriter
 
         step_back()
         launch = context.launch
@@ -52,7 +52,7 @@ class Recorder(Component):
         logging.getLogger("h5py").setLevel(logging.WARNING)  # else it tells of every number that it converts
         port = context.open_port()
         source = launch.sockets.subscribe[0] if launch.sockets.subscribe else ""
-        writer = Writer(
+        writer = RecordWriter(
             run_dir,
             Path(launch.state_dir) if launch.state_dir else None,
             _about(context, run_dir, scans=self.scans),
@@ -86,7 +86,7 @@ class Recorder(Component):
             port.close()
 
 
-def _about(context: Context, run_dir: Path, *, scans: bool) -> RecordSettings:
+def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSettings:
     from afspm.record.store import RecordSettings
 
     launch = context.launch

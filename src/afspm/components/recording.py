@@ -44,7 +44,7 @@ class _Item(NamedTuple):
     source: str = SCHEDULER
 
 
-class Writer:
+class RecordWriter:
     """Takes packets from one thread, and records them in another.
 
     Args:

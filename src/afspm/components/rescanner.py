@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from afspm import wire
+from afspm.client.component import Component
+from afspm.client.events import Events
 from afspm.errors import ConfigError, ControlLost, Refused
 from afspm.model import Problem, Region, RescanKind, ScanParameters, names
-from afspm.runtime.component import Component
-from afspm.runtime.events import Events
 
 WANTED, TOLD = "DriftRescan", "DriftMapping"
 FLAGGED_WITHIN_S = 5.0

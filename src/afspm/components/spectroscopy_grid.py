@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from afspm.components.plan import grid_centers
+from afspm.client.component import Component
 from afspm.components.planned_scans import pair
+from afspm.components.scan_plan import grid_centers
 from afspm.errors import ConfigError
 from afspm.model import names
-from afspm.runtime.component import Component
 from afspm.units import Angle, Length
 
 

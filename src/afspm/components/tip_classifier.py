@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from afspm.components import verdicts
-from afspm.components.channels import Expected
-from afspm.components.tip_judge import Counter, Opinion, TipJudge, Tolerance, Verdict
-from afspm.components.tip_scans import HeightPair, Pairing
+from afspm.client.component import Component
+from afspm.components import tip_verdict
+from afspm.components.channel_pairs import ChannelPairing, HeightPair
+from afspm.components.missing_channels import MissingChannels
+from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
 from afspm.errors import UnitError
 from afspm.model import ControlState, Scan
-from afspm.runtime.component import Component
 
-_SCORES = {Opinion.GOOD: verdicts.GOOD, Opinion.BAD: verdicts.BAD, Opinion.UNCLEAR: verdicts.UNCLEAR}
+_SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion.UNCLEAR: tip_verdict.UNCLEAR}
 
 
 class TipClassifier(Component):
@@ -37,7 +37,7 @@ class TipClassifier(Component):
     """
 
     flags: ClassVar = ("tip-shape-changed",)
-    publishes: ClassVar = (verdicts.MESSAGE,)
+    publishes: ClassVar = (tip_verdict.MESSAGE,)
     listens: ClassVar = ("Scan2d", "ControlState")
 
     def __init__(
@@ -47,21 +47,21 @@ class TipClassifier(Component):
         reference_scans: int = 4,
         flag_after: int = 1,
         clear_after: int = 1,
-        detail: float = Tolerance.detail,
-        ghost: float = Tolerance.ghost,
-        unrest: float = Tolerance.unrest,
-        worn: float = Tolerance.worn,
-        sigmas: float = Tolerance.sigmas,
+        detail: float = TipTolerance.detail,
+        ghost: float = TipTolerance.ghost,
+        unrest: float = TipTolerance.unrest,
+        worn: float = TipTolerance.worn,
+        sigmas: float = TipTolerance.sigmas,
         problem: str = "tip-shape-changed",
     ) -> None:
-        self.pairing = Pairing(channel, retrace_channel)
-        self.judge = TipJudge(reference_scans, Tolerance(detail, ghost, unrest, worn, sigmas))
-        self.counter = Counter(flag_after, clear_after)
+        self.pairing = ChannelPairing(channel, retrace_channel)
+        self.judge = TipJudge(reference_scans, TipTolerance(detail, ghost, unrest, worn, sigmas))
+        self.counter = VerdictCounter(flag_after, clear_after)
         self.problem = problem
         self._problems: tuple[int, ...] | None = None  # not known yet
 
     def on_start(self) -> None:
-        self.expected = Expected(self.pairing.channels, self.log)
+        self.expected = MissingChannels(self.pairing.channels, self.log)
         if "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
             self.counter.restore(self.memory["counter"])
@@ -110,7 +110,9 @@ class TipClassifier(Component):
             self.log.info("the tip is good again: %s", verdict.why)
             self.scope.clear(self.problem)
         if verdict.opinion in _SCORES:
-            self.publish(verdicts.verdict_message(scan, _SCORES[verdict.opinion]), f"{verdicts.MESSAGE}_{self.name}")
+            self.publish(
+                tip_verdict.verdict_message(scan, _SCORES[verdict.opinion]), f"{tip_verdict.MESSAGE}_{self.name}"
+            )
 
     def _remember(self, scan: Scan) -> None:
         if scan.time_ns is not None:

@@ -7,16 +7,16 @@ from dataclasses import replace
 from typing import ClassVar, Literal
 
 from afspm import wire
-from afspm.components import verdicts
+from afspm.client.component import Component
+from afspm.client.events import Events
+from afspm.components import tip_verdict
+from afspm.components.channel_pairs import ChannelPairing
 from afspm.components.planned_scans import pair
 from afspm.components.tip_judge import Opinion, TipJudge
-from afspm.components.tip_scans import Pairing
-from afspm.components.treatments import XY, Pulse, Treatment, clearance_m, fresh_place, treatments
-from afspm.components.verdicts import read_verdict
+from afspm.components.tip_treatments import XY, Pulse, Treatment, clearance_m, fresh_place, treatments
+from afspm.components.tip_verdict import read_verdict
 from afspm.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
 from afspm.model import Problem, Region, Scan, ScanSet, ScopeState, names
-from afspm.runtime.component import Component
-from afspm.runtime.events import Events
 from afspm.units import Duration, Length, Speed, Voltage
 
 VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
@@ -90,7 +90,7 @@ class TipCorrector(Component):
         self.problem = problem
         if place_spacing <= 0.0 or keep_away < 0.0:
             raise ConfigError("`place_spacing` must be above zero, `keep_away` not below")
-        self.pairing = Pairing(channel, retrace_channel)
+        self.pairing = ChannelPairing(channel, retrace_channel)
         self.judge = TipJudge(reference_scans) if judge == "self" else None
 
     def run(self) -> None:
@@ -133,7 +133,7 @@ class TipCorrector(Component):
         looks = (test, region, region) if self.test_center else (region,) * 3
         tried = int(self.memory.get("tried", 0))
         self.log.info("repairing the tip%s", f" ({tried} treatments were tried already)" if tried else "")
-        with self.scope.events("ControlState", verdicts.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
+        with self.scope.events("ControlState", tip_verdict.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
             try:
                 if tried and self._is_cured(looks, shape, answers):  # a kill may have come between treatment and test
                     return
@@ -277,7 +277,7 @@ class TipCorrector(Component):
             score = self._own_score(scans) if self.judge is not None else self._score_of_others(scans, answers)
             if not self.scope.is_flagged(self.problem):
                 return True
-            if score == verdicts.BAD:
+            if score == tip_verdict.BAD:
                 return False
         return False
 
@@ -292,21 +292,21 @@ class TipCorrector(Component):
                     self._restore(self._of_experiment()[0])
                     self.scope.clear(self.problem)
                     self._wait_flag(self.problem, flagged=False)
-                return verdicts.BAD if verdict.opinion is Opinion.BAD else verdicts.UNCLEAR
+                return tip_verdict.BAD if verdict.opinion is Opinion.BAD else tip_verdict.UNCLEAR
         self.log.warning("a test scan that can't be judged: no reference, or without the channels")
-        return verdicts.UNCLEAR
+        return tip_verdict.UNCLEAR
 
     def _score_of_others(self, scans: ScanSet, answers: Events) -> float:
         """Wait for the verdict on these scans, or for the flag to be removed."""
         times = {scan.time_ns for scan in scans.values()}
         for event in answers:
             if not self.scope.is_flagged(self.problem):
-                return verdicts.GOOD
-            verdict = read_verdict(event.message) if event.envelope.startswith(verdicts.MESSAGE) else None
+                return tip_verdict.GOOD
+            verdict = read_verdict(event.message) if event.envelope.startswith(tip_verdict.MESSAGE) else None
             if verdict is not None and verdict[0] in times:
                 return verdict[1]
         self.log.warning("nobody judged the test scan within %.0f s: taken for bad", VERDICT_WITHIN_S)
-        return verdicts.BAD
+        return tip_verdict.BAD
 
     def _learn(self, scan: Scan, problems: tuple[int, ...]) -> None:
         if self.judge is None or self.judge.has_learnt or problems:

@@ -56,7 +56,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Tolerance:
+class TipTolerance:
     """How far a tip may be from the reference and still be called good.
 
     Attributes:
@@ -86,7 +86,7 @@ class Tolerance:
 
 
 @dataclass
-class Place:
+class KnownPlace:
     """A region as a good tip shows it.
 
     Attributes:
@@ -111,7 +111,7 @@ class Place:
 
 
 @dataclass
-class Reference:
+class TipReference:
     """What the scans of a good tip are like, all of the same size, angle and shape.
 
     Attributes:
@@ -124,7 +124,7 @@ class Reference:
     size_m: tuple[float, float]
     angle_rad: float
     shape: tuple[int, int]
-    places: list[Place] = field(default_factory=list)
+    places: list[KnownPlace] = field(default_factory=list)
     first: list[TipMetrics] = field(default_factory=list)
     deviations: list[TipMetrics] = field(default_factory=list)
 
@@ -135,7 +135,7 @@ class Reference:
         turned_rad = math.remainder(region.angle_rad - self.angle_rad, math.tau)
         return same_size and abs(turned_rad) < SAME_SIZE and shape == self.shape
 
-    def place(self, region: Region) -> Place | None:
+    def place(self, region: Region) -> KnownPlace | None:
         """What is known of where a scan was taken."""
         for place in reversed(self.places):
             away = (abs(a - b) / size for a, b, size in zip(region.center_m, place.center_m, self.size_m, strict=True))
@@ -145,7 +145,7 @@ class Reference:
 
     def add(self, region: Region, seen: TipMetrics, correlation: Array) -> None:
         """A place that was not known, seen with a good tip."""
-        self.places.append(Place(region.center_m, replace(seen, ghost=0.0), correlation))
+        self.places.append(KnownPlace(region.center_m, replace(seen, ghost=0.0), correlation))
         del self.places[:-MOST_PLACES]
 
     def spread(self, name: str) -> float:
@@ -181,10 +181,10 @@ class Reference:
         }
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Reference:
+    def from_dict(cls, values: Mapping[str, Any]) -> TipReference:
         (width, height), (rows, columns) = values["size_m"], values["shape"]
         places = [
-            Place(
+            KnownPlace(
                 (place["center_m"][0], place["center_m"][1]),
                 TipMetrics.from_dict(place["usual"]),
                 np.asarray(place["expected"]),
@@ -205,13 +205,13 @@ class TipJudge:
         tolerance: see there.
     """
 
-    def __init__(self, reference_scans: int, tolerance: Tolerance | None = None) -> None:
+    def __init__(self, reference_scans: int, tolerance: TipTolerance | None = None) -> None:
         if reference_scans < 2:
             raise ConfigError(f"{reference_scans} reference scans have no spread", hint="2 at least", where="tip")
         self.reference_scans = reference_scans
-        self.tolerance = tolerance or Tolerance()
-        self.reference: Reference | None = None
-        self._others: list[Reference] = []  # begun, of scans of other sizes: an overview may come first
+        self.tolerance = tolerance or TipTolerance()
+        self.reference: TipReference | None = None
+        self._others: list[TipReference] = []  # begun, of scans of other sizes: an overview may come first
         self._suspect = False
 
     @property
@@ -225,8 +225,8 @@ class TipJudge:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take up what `state` gave."""
-        self.reference = Reference.from_dict(state["reference"]) if state["reference"] else None
-        self._others = [Reference.from_dict(one) for one in state.get("others", ())]
+        self.reference = TipReference.from_dict(state["reference"]) if state["reference"] else None
+        self._others = [TipReference.from_dict(one) for one in state.get("others", ())]
         self._suspect = state["suspect"]
 
     def judge(self, trace: Array, retrace: Array | None, region: Region) -> Verdict:
@@ -257,15 +257,15 @@ class TipJudge:
             self._know(self.reference, place, seen, correlation, region)
         return verdict
 
-    def _begun(self, region: Region, shape: tuple[int, int]) -> Reference:
+    def _begun(self, region: Region, shape: tuple[int, int]) -> TipReference:
         """What is known so far of scans like this one, which the last was not; that is put by."""
         known = next((one for one in self._others if one.fits(region, shape)), None)
         self._others = [one for one in (*self._others, self.reference) if one is not None and one is not known]
         del self._others[: -MOST_KINDS + 1]
-        return known or Reference(region.size_m, region.angle_rad, shape)
+        return known or TipReference(region.size_m, region.angle_rad, shape)
 
     def _learn(
-        self, reference: Reference, place: Place | None, seen: TipMetrics, correlation: Array, region: Region
+        self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics, correlation: Array, region: Region
     ) -> Verdict:
         if place is not None:
             reference.deviations.append(_relative(seen, place.usual))
@@ -276,14 +276,14 @@ class TipJudge:
         return Verdict(Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans}", seen)
 
     def _know(
-        self, reference: Reference, place: Place | None, seen: TipMetrics, correlation: Array, region: Region
+        self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics, correlation: Array, region: Region
     ) -> None:
         if place is None:
             reference.add(region, seen, correlation)
         else:
             place.follow(seen, correlation)
 
-    def _compare(self, reference: Reference, place: Place | None, seen: TipMetrics) -> Verdict:
+    def _compare(self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics) -> Verdict:
         faults = self._faults_anywhere(reference, seen)
         if place is not None:
             faults += self._faults_here(reference, place, seen)
@@ -301,7 +301,7 @@ class TipJudge:
         self._suspect = False
         return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
 
-    def _faults_anywhere(self, reference: Reference, seen: TipMetrics) -> list[tuple[float, str]]:
+    def _faults_anywhere(self, reference: TipReference, seen: TipMetrics) -> list[tuple[float, str]]:
         usual, tolerance = reference.usual_anywhere(), self.tolerance
         now = _relative(seen, usual)
         worn = f"worn: {now.detail:.0%} of the first scans' fine detail is left"
@@ -312,7 +312,7 @@ class TipJudge:
             faults.append(((now.unrest_m - 1.0) / (limit - 1.0), f"unsteady: trace and retrace disagree by {what}"))
         return faults
 
-    def _faults_here(self, reference: Reference, place: Place, seen: TipMetrics) -> list[tuple[float, str]]:
+    def _faults_here(self, reference: TipReference, place: KnownPlace, seen: TipMetrics) -> list[tuple[float, str]]:
         tolerance, now = self.tolerance, _relative(seen, place.usual)
         loss = max(1.0 - tolerance.detail, tolerance.sigmas * reference.spread("detail"))
         ghost = max(tolerance.ghost, tolerance.sigmas * reference.spread("ghost"))
@@ -325,7 +325,7 @@ class TipJudge:
         ]
 
 
-class Counter:
+class VerdictCounter:
     """Turns opinions into a flag: a number of bad ones in a row sets it, a number of good ones clears it."""
 
     def __init__(self, flag_after: int, clear_after: int) -> None:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from afspm import wire
+from afspm.client.link import ExperimentLink
+from afspm.client.parameter_values import from_parameter, to_parameter
 from afspm.dashboard.watch import Watch
 from afspm.dashboard.words import position
 from afspm.formatting import quantity
@@ -26,8 +28,6 @@ from afspm.model import (
 )
 from afspm.model.geometry import XY
 from afspm.record.overview import Overview
-from afspm.runtime.link import Link
-from afspm.runtime.values import from_parameter, to_parameter
 
 ANSWER_S = 20.0  # real time that an answer may take
 FREE_S = 60.0  # that the microscope may take to get to a place
@@ -45,7 +45,7 @@ class ActionResult:
 class Actions:
     """Actions in the name of one person, for one thread. None raises for a refusal; it is in the result."""
 
-    def __init__(self, link: Link, watch: Watch) -> None:
+    def __init__(self, link: ExperimentLink, watch: Watch) -> None:
         self._link = link
         self._watch = watch
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from afspm.addresses import Listens
+from afspm.client.component import Component
 from afspm.clock import ExperimentClock
 from afspm.dashboard.access import Access, is_loopback
 from afspm.dashboard.archive import Archive, allowed_region
@@ -14,13 +15,12 @@ from afspm.dashboard.server import USUAL_PORT, PageServer, listening, url_of
 from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.watch import Watch
 from afspm.errors import ConfigError
+from afspm.process.priority import step_back
 from afspm.record.run_json import experiment_name
 from afspm.record.run_lock import cut_off_message
-from afspm.runtime.component import Component
-from afspm.runtime.priority import step_back
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
 
@@ -62,7 +62,7 @@ class Dashboard(Component):
         self._certificate_key = None if certificate_key is None else Path(certificate_key)
         self._server: PageServer | None = None
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         step_back()
         self._context = context
         return super().run_process(context)

@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from afspm.client.connect import guest_of
 from afspm.clock import ExperimentClock
 from afspm.dashboard.dashboard import Dashboard
 from afspm.errors import FileError
+from afspm.process.context import ProcessActivity, ProcessContext, new_session
+from afspm.process.memory import Memory
+from afspm.process.message_types import register_all
 from afspm.record.run_json import STATE_DIR
-from afspm.runtime.connect import guest_of
-from afspm.runtime.memory import Memory
-from afspm.runtime.messages import register_all
-from afspm.runtime.process import Activity, Context, new_session
 from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
 
@@ -36,12 +36,12 @@ def join(folder: Path, dashboard: Dashboard, name: str) -> int:
     launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / STATE_DIR))
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
-    context = Context(
+    context = ProcessContext(
         launch,
         clock,
         open_port=lambda: port,
         log=logging.getLogger(f"afspm.{name}"),
-        activity=Activity(clock),
+        activity=ProcessActivity(clock),
         session=new_session(launch.run),
     )
     with _ended_by_ctrl_c(port):

@@ -9,15 +9,15 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
+from afspm.client.link import ExperimentLink
 from afspm.clock import Clock
 from afspm.dashboard.access import Access, Visitor, check_name
 from afspm.dashboard.actions import ActionResult, Actions
 from afspm.dashboard.watch import Watch
 from afspm.errors import AfspmError
+from afspm.launch import Launch
 from afspm.model.journal import PERSON
-from afspm.runtime.launch import Launch
-from afspm.runtime.link import Link
-from afspm.runtime.process import new_session
+from afspm.process.context import new_session
 from afspm.transport.network import Network
 from afspm.transport.port import ParentGone
 from afspm.transport.zmq_port import ZmqPort
@@ -99,7 +99,7 @@ class Steering:
         name = f"{launch.name}{PERSON}{person}"
         network = Network.from_launch(launch.name, launch.keys)
         port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
-        link = Link(
+        link = ExperimentLink(
             port,
             name,
             session=new_session(launch.run),

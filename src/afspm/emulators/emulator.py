@@ -23,7 +23,7 @@ from afspm.transport.port import Killed
 from afspm.transport.wakeup import WakeUp
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 LOOPBACK = "127.0.0.1"
 LONGEST_WAIT_S = 60.0
@@ -232,7 +232,7 @@ class Emulator(ABC):
         if failed:
             raise failed[0]
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         """Be a process of an experiment (what the host calls): with its clock, and its files in the run's folder."""
         context.when_stopping(self.stop)
         threading.Thread(target=self._until_the_end_of, args=(context,), name="experiment", daemon=True).start()
@@ -245,7 +245,7 @@ class Emulator(ABC):
                 )
             return self._run_telling(context, notice)
 
-    def _run_telling(self, context: Context, notice: AddressNotice | None) -> int:
+    def _run_telling(self, context: ProcessContext, notice: AddressNotice | None) -> int:
         def listening(address: str) -> None:
             if address:
                 context.log.warning("SIMULATED: an emulated %s controller listens at %s", self.vendor, address)
@@ -259,7 +259,7 @@ class Emulator(ABC):
             return ExitCode.CRASHED
         return ExitCode.ORPHAN if self._stop.is_set() else ExitCode.ENDED
 
-    def _until_the_end_of(self, context: Context) -> None:
+    def _until_the_end_of(self, context: ProcessContext) -> None:
         """Hears of the end of the experiment; in a thread of its own, since `serve` waits for the vendor's clients."""
         port = open_port(context.launch, context.clock)
         while not any(isinstance(incoming, Killed) for incoming in port.poll(None)):

@@ -22,7 +22,7 @@ from afspm.experiment.published import GUIDE
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),
     ("afspm.translator", Role.TRANSLATOR),
-    ("afspm.runtime.component", Role.COMPONENT),
+    ("afspm.client.component", Role.COMPONENT),
 )
 
 

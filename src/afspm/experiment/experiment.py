@@ -15,7 +15,7 @@ from afspm.experiment import parts as sorting
 from afspm.experiment import recording
 from afspm.experiment.findings import Finding, Findings
 from afspm.experiment.parts import Role
-from afspm.runtime.launch import Launch
+from afspm.launch import Launch
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved import Resolved

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from afspm import wire
+from afspm.client.component import Component
+from afspm.client.dispatch import HANDLERS, snake_case
 from afspm.experiment.findings import closest
 from afspm.experiment.parts import Part, Role
 from afspm.experiment.resolved import Resolved
-from afspm.runtime.component import Component
-from afspm.runtime.dispatch import HANDLERS, snake_case
 
 _NEARLY = 0.8
 _CALLED = ("run", *(name for name in vars(Component) if name.startswith("on_")))

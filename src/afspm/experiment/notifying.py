@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from afspm.components.notices import END, OCCASIONS, Targets, address
+from afspm.components.notifications import END, OCCASIONS, Targets, address
 from afspm.errors import ConfigError
 from afspm.experiment.parts import Part, Role
 

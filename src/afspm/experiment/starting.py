@@ -15,10 +15,10 @@ from afspm.experiment.experiment import Start
 from afspm.experiment.findings import nearest
 from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
 from afspm.experiment.parts import Part, Role
+from afspm.launch import Launch, Sockets
 from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Frame
-from afspm.runtime.launch import Launch, Sockets
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm.clock import Clock
-from afspm.components import notices
-from afspm.components.notices import END, GIVEN_UP, NotDelivered, Notice, Targets, Way
+from afspm.components import notifications
+from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
 from afspm.errors import ConfigError
 from afspm.experiment import Role, notifying
 from afspm.logic.supervisor_registry import LOGGED_AS
@@ -96,7 +96,7 @@ def tell(ended: Ended, targets: Targets, on: tuple[str, ...], clock: Clock, log:
     what = GIVEN_UP if is_lost and GIVEN_UP in on else END
     if what not in on:
         return
-    notice = Notice(
+    notice = Notification(
         what, ended.name, str(ended.folder), clock.now_ns(), _text(ended.outcome), simulated=ended.simulated
     )
     until_s = clock.monotonic_s() + TOLD_WITHIN_S
@@ -104,7 +104,7 @@ def tell(ended: Ended, targets: Targets, on: tuple[str, ...], clock: Clock, log:
         _tell(notice, targets, way, clock, until_s, log)
 
 
-def _tell(notice: Notice, targets: Targets, way: Way, clock: Clock, until_s: float, log: RunLog) -> None:
+def _tell(notice: Notification, targets: Targets, way: Way, clock: Clock, until_s: float, log: RunLog) -> None:
     tries = 0
     while True:
         try:
@@ -115,7 +115,7 @@ def _tell(notice: Notice, targets: Targets, way: Way, clock: Clock, until_s: flo
             return
         except NotDelivered as error:
             tries += 1
-            delay_s = notices.delay_s(tries)
+            delay_s = notifications.delay_s(tries)
             if clock.monotonic_s() + delay_s >= until_s:
                 log.write(LOGGED_AS, logging.ERROR, f"nobody could be told by the {way}: {error}")
                 return

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, WireError
+from afspm.launch import Launch
 from afspm.model import CLOCK_REQUEST, ControlResponse, Request, Response
-from afspm.runtime.launch import Launch
 from afspm.transport.launching import open_port
 from afspm.transport.port import ControlConnected, ReplyReceived
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
-from afspm.runtime.parent import TIP_WITHIN_S
+from afspm.process.parent import TIP_WITHIN_S
 
 OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and may finish a file
 AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later

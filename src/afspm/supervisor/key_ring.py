@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from afspm.addresses import connectable, reaches
+from afspm.client.connect import GUEST_KEYS
 from afspm.experiment import Experiment, Role, Start
 from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.record.run_json import STATE_DIR
-from afspm.runtime.connect import GUEST_KEYS
 from afspm.storage.atomic import replace_file
 from afspm.storage.disk import run_bounded
 from afspm.transport import keys

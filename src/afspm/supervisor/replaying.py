@@ -14,15 +14,15 @@ from typing import Any
 
 from afspm import wire
 from afspm.addresses import is_address
+from afspm.client.connect import GUEST
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
+from afspm.launch import Launch, Sockets
 from afspm.model import Frame, Packet
+from afspm.process.message_types import register_all
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
 from afspm.record.run_lock import lock_run
-from afspm.runtime.connect import GUEST
-from afspm.runtime.launch import Launch, Sockets
-from afspm.runtime.messages import register_all
 from afspm.scheduler.replayer import Replayer
 from afspm.supervisor import run_folder, signals
 from afspm.supervisor.ports import FreePorts

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from afspm import wire
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import AfspmError, WireError
+from afspm.launch import Launch
 from afspm.logic.supervisor_registry import LONGEST
 from afspm.model import (
     OTHER_RUN_RESPONSE,
@@ -28,8 +29,7 @@ from afspm.model import (
     Response,
     Told,
 )
-from afspm.runtime.launch import Launch
-from afspm.runtime.process import new_session
+from afspm.process.context import new_session
 from afspm.transport.launching import open_port
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
 from afspm.transport.zmq_port import ZmqPort

@@ -12,8 +12,8 @@ from typing import Any
 from afspm.addresses import connectable
 from afspm.clock import Clock
 from afspm.experiment import Experiment, Role, Start
+from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import SUPERVISOR
-from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.reporter import Reporter
 
 _LONGEST = 60

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
 
+from afspm.client.connect import find_run
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load_expanded
@@ -19,7 +20,6 @@ from afspm.record import ahead
 from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
 from afspm.record.run_lock import lock_run
-from afspm.runtime.connect import find_run
 from afspm.storage.atomic import load_checkpoint
 from afspm.supervisor import edited
 from afspm.supervisor import run as running

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import TextIO
 
 from afspm.addresses import connectable
+from afspm.client.connect import GUEST, guest_facts
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start
+from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record import ahead
 from afspm.record.run_json import ENDED, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
-from afspm.runtime.connect import GUEST, guest_facts
-from afspm.runtime.launch import Launch, Sockets
 from afspm.storage.disk import run_bounded
 from afspm.supervisor import aftermath, common_clock, key_ring, reporting, run_folder
 from afspm.supervisor.aftermath import Ended

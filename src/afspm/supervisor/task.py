@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from afspm.experiment import Role, Start
-from afspm.runtime.launch import Launch
+from afspm.launch import Launch
 
-HOST = "afspm.runtime.host"
-GUARD = "afspm.runtime.guard"
+HOST = "afspm.process.host"
+GUARD = "afspm.process.foreign"
 
 
 @dataclass(frozen=True)

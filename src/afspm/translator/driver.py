@@ -19,7 +19,7 @@ from afspm.translator.polling import EAGER_S
 from afspm.units import Duration
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 
@@ -334,7 +334,7 @@ class Driver(ABC):
                 found[mark.name] = replace(mark, do=getattr(self, attribute))
         return found
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         """Be the translator of an experiment (what the host calls)."""
         from afspm.translator.process import run_translator
 

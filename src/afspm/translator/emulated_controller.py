@@ -18,7 +18,7 @@ from afspm.file_lock import lock
 from afspm.translator.driver import ControllerLost
 
 if TYPE_CHECKING:
-    from afspm.runtime.launch import Launch
+    from afspm.launch import Launch
     from afspm.translator.driver import Driver
 
 _LOCKED_BYTES = 1

@@ -23,7 +23,7 @@ from afspm.logic.forwarder import NOT_SENT
 from afspm.logic.sessions import run_of
 from afspm.logic.watchdog import feedback_of
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus, names
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 from afspm.translator import settings
 from afspm.translator.controller_lock import ControllerTaken, commanding
 from afspm.translator.driver import LOST, MEASURING, ControllerLost, Driver
@@ -45,7 +45,7 @@ from afspm.translator.sequence import (
 from afspm.transport.port import ParentGone, RequestReceived, ServerPort, SubscriberJoined
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 _RECONNECT_S = 1.0
 _TIP_S = 8.0
@@ -530,7 +530,7 @@ def _only_asks(request: Request) -> bool:
     return request.kind == ControlRequest.ACTION_SUPPORT
 
 
-def run_translator(microscope: Driver, context: Context, make: Callable[..., Translator] = Translator) -> int:
+def run_translator(microscope: Driver, context: ProcessContext, make: Callable[..., Translator] = Translator) -> int:
     """What the host runs. While another run commands the controller, it is said which, and the process ends."""
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, microscope)
@@ -543,7 +543,7 @@ def run_translator(microscope: Driver, context: Context, make: Callable[..., Tra
         return _run_alone(microscope, context, partial(make, controller=controller))
 
 
-def _run_alone(microscope: Driver, context: Context, make: Callable[..., Translator]) -> int:
+def _run_alone(microscope: Driver, context: ProcessContext, make: Callable[..., Translator]) -> int:
     """The sockets, the memory and the translator itself."""
     from afspm.transport.launching import open_server_port
 

@@ -16,7 +16,7 @@ import zmq
 
 from afspm.clock import ExperimentClock
 from afspm.exit_codes import ExitCode
-from afspm.runtime.launch import Launch, Sockets
+from afspm.launch import Launch, Sockets
 
 DEADLINE_S = 30.0
 HERE = Path(__file__).parent
@@ -93,7 +93,7 @@ def beginning(
     with zmq.Context() as context, context.socket(zmq.XPUB) as scheduler:
         scheduler.setsockopt(zmq.LINGER, 0)
         port = scheduler.bind_to_random_port("tcp://127.0.0.1")
-        with started("afspm.runtime.host", cwd=tmp_path) as process:
+        with started("afspm.process.host", cwd=tmp_path) as process:
             assert process.stdin is not None
             process.stdin.write(launched(settings, f"tcp://127.0.0.1:{port}", tmp_path, class_))
             process.stdin.flush()

@@ -64,7 +64,7 @@ from collections import Counter
 from pathlib import Path
 
 from afspm.model import ScopeState
-from afspm.runtime.component import Component
+from afspm.client.component import Component
 
 
 class Witness(Component):

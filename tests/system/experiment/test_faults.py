@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from experiment_lab import AfspmRun, Run, require_each_once, require_each_row_once
 
+from afspm.client.connect import connect
 from afspm.model import ScopeState
-from afspm.runtime.connect import connect
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 

@@ -10,14 +10,14 @@ from experiment_lab import Run, require_each_once
 
 import afspm
 from afspm import wire
+from afspm.client.connect import guest_of
 from afspm.errors import AfspmError
 from afspm.model import ControlRequest, Request
-from afspm.runtime.connect import guest_of
 
 THIEF = """
 from afspm import wire
 from afspm.model import ControlRequest, Request
-from afspm.runtime.component import Component
+from afspm.client.component import Component
 from afspm.transport.network import Network
 import zmq
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from experiment_lab import AfspmRun, require_each_once
 
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 
 MODULE = """
 import os

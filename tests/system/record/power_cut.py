@@ -30,9 +30,9 @@ from typing import Any
 
 import afspm
 from afspm import wire
+from afspm.client.connect import connect
 from afspm.clock import ExperimentClock
 from afspm.model import ControlMode, Packet, ScopeState
-from afspm.runtime.connect import connect
 from afspm.wire import KILL, decode_packet
 
 CLOCK = ExperimentClock.real()

@@ -15,10 +15,10 @@ import pytest
 
 import afspm
 from afspm import wire
+from afspm.client.follower import Follower
 from afspm.errors import ConfigError, RequestError, TransportError
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.store import RecordSettings, RecordStore
-from afspm.runtime.following import Follower
 from afspm.supervisor import replaying, resuming
 
 START_NS = 1_773_518_400_000_000_000

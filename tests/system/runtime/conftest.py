@@ -11,11 +11,11 @@ from queue import Empty, Queue
 
 import pytest
 
-from afspm.runtime.launch import Launch
+from afspm.launch import Launch
 
 HERE = Path(__file__).parent
 PATIENCE_S = 20.0
-HOST = [sys.executable, "-m", "afspm.runtime.host"]
+HOST = [sys.executable, "-m", "afspm.process.host"]
 
 
 class Child:

@@ -8,8 +8,8 @@ import threading
 import weakref
 from pathlib import Path
 
+from afspm.client.component import Component
 from afspm.model import Region, Scan
-from afspm.runtime.component import Component
 
 
 def say(*words: object) -> None:

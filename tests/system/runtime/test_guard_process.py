@@ -9,7 +9,7 @@ import pytest
 
 from afspm.exit_codes import ExitCode
 
-GUARD = [sys.executable, "-m", "afspm.runtime.guard"]
+GUARD = [sys.executable, "-m", "afspm.process.foreign"]
 
 # other languages have no Python: these use nothing of ours
 ECHO = "import sys; print(sys.stdin.readline().strip(), flush=True); print('eof', repr(sys.stdin.read()), flush=True)"

@@ -12,8 +12,8 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.exit_codes import ExitCode
-from afspm.runtime.host import MOST_FILES
-from afspm.runtime.launch import Launch, Sockets
+from afspm.launch import Launch, Sockets
+from afspm.process.host import MOST_FILES
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 
 Host = Callable[[Launch], Any]
@@ -104,7 +104,7 @@ def test_settings_that_can_not_work_are_told_and_not_tried_again(host: Host, lau
 
 @pytest.mark.parametrize("line", ["", "{", "5", '{"name": "x", "setings": {}}'])
 def test_a_line_that_is_none_is_told(start: Any, line: str) -> None:
-    child = start([sys.executable, "-m", "afspm.runtime.host"], line)
+    child = start([sys.executable, "-m", "afspm.process.host"], line)
     assert child.exit_code() == ExitCode.CONFIG
     assert child.error_text.startswith("ERROR ")
 

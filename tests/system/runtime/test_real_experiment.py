@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 import afspm
+from afspm.client import connect
+from afspm.client.connect import guest_facts
 from afspm.clock import ExperimentClock
 from afspm.errors import ControlLost, ExperimentEnded, FileError, NoResponse, Refused
 from afspm.exit_codes import ExitCode
+from afspm.launch import Launch, Sockets
 from afspm.model import ControlMode, Region, ScopeState
-from afspm.runtime import connect
-from afspm.runtime.connect import guest_facts
-from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
 SPEED = 300.0
@@ -154,7 +154,7 @@ def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment, monke
 def test_a_run_is_found_by_its_experiment_file_or_the_folder_of_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from afspm.runtime.connect import find_run
+    from afspm.client.connect import find_run
 
     monkeypatch.chdir(tmp_path)
     for name in ("a-1", "a-2", "b-1"):

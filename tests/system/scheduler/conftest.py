@@ -13,8 +13,8 @@ import pytest
 
 from afspm import wire
 from afspm.clock import ExperimentClock
+from afspm.launch import Launch, Sockets
 from afspm.model import ControlRequest, ControlResponse, Request, Response
-from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys
 from afspm.transport.network import Network
@@ -106,7 +106,7 @@ class Rig:
 
     def start(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
+            [sys.executable, "-m", "afspm.process.host"], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
         assert self.process.stdin is not None
         self.process.stdin.write(self.launch().to_json().encode() + b"\n")

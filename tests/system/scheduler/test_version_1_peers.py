@@ -13,7 +13,9 @@ import zmq
 from version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
 
 from afspm import wire
+from afspm.client.link import ExperimentLink
 from afspm.clock import ExperimentClock
+from afspm.launch import Launch, Sockets
 from afspm.model import (
     TELL_REQUEST,
     ControlRequest,
@@ -30,8 +32,6 @@ from afspm.model import (
     ScopeStatus,
     Told,
 )
-from afspm.runtime.launch import Launch, Sockets
-from afspm.runtime.link import Link
 from afspm.supervisor import common_clock
 from afspm.supervisor.reporter import Complaint, Reporter
 from afspm.transport.network import Network
@@ -299,7 +299,7 @@ class Pumped:
 
 
 def test_our_component_asks_their_scheduler_what_version_1_has(port: ZmqPort, router: Router) -> None:
-    link = Link(Pumped(port, router), "Ours", session="a")  # type: ignore[arg-type]
+    link = ExperimentLink(Pumped(port, router), "Ours", session="a")  # type: ignore[arg-type]
     requests = [
         (ControlRequest.REQUEST_CTRL, 0),
         (ControlRequest.ACTION, "start-scan"),

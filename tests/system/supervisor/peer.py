@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from afspm.clock import ExperimentClock
-from afspm.runtime.launch import Launch
+from afspm.launch import Launch
 from afspm.transport.heartbeat import HeartbeatSender
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from afspm.experiment import Role
+from afspm.launch import Launch
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.restart import RestartPolicy
 from afspm.logic.supervision import ChildPolicy
-from afspm.runtime.launch import Launch
 from afspm.supervisor.supervisor import Outcome, Supervisor
 from afspm.supervisor.task import Task
 

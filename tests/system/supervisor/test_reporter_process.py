@@ -15,6 +15,7 @@ from supervisor_lab import BEAT_S, DEADLINE_S, Running, RunTasks, peer
 from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.experiment import Role
+from afspm.launch import Launch, Sockets
 from afspm.model import (
     RESTART_REQUEST,
     ControlRequest,
@@ -26,7 +27,6 @@ from afspm.model import (
     Request,
     Response,
 )
-from afspm.runtime.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.reporter import Reporter
 from afspm.supervisor.task import HOST, Task

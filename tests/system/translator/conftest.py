@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 from afspm.clock import ExperimentClock
-from afspm.runtime.launch import Launch, Sockets
+from afspm.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
@@ -143,7 +143,7 @@ class Running:
         # into a file: a pipe that nobody reads fills up and holds the process
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "afspm.runtime.host"], stdin=subprocess.PIPE, stderr=log
+                [sys.executable, "-m", "afspm.process.host"], stdin=subprocess.PIPE, stderr=log
             )
         assert self.process.stdin is not None
         self.process.stdin.write(self._launch.to_json().encode() + b"\n")

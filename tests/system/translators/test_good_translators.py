@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from afspm.errors import ConfigError
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators import Options, Outcome, Report, bench, run
 from afspm.testing.translators.registry import all_checks

@@ -33,10 +33,10 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on_and_one_that_runs_what_may_b
     (tmp_path / "night-1" / "run.json").write_text(
         f'{{"name": "night", "guest": {{"keys": {keys}}}}}', encoding="utf-8"
     )
-    monkeypatch.setattr("afspm.runtime.connect.connect", nobody)
-    monkeypatch.setattr("afspm.runtime.following.Follower.__init__", lambda *_: None)
-    monkeypatch.setattr("afspm.runtime.following.Follower.close", lambda *_: None)
-    monkeypatch.setattr("afspm.runtime.following.Follower.catch_up", nobody)
+    monkeypatch.setattr("afspm.client.connect.connect", nobody)
+    monkeypatch.setattr("afspm.client.follower.Follower.__init__", lambda *_: None)
+    monkeypatch.setattr("afspm.client.follower.Follower.close", lambda *_: None)
+    monkeypatch.setattr("afspm.client.follower.Follower.catch_up", nobody)
     with lock_run(tmp_path / "night-1"):
         pass
     held = lock_run(tmp_path / "night-1") if runs else nullcontext()

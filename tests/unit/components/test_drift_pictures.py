@@ -12,8 +12,8 @@ import pytest
 from runtime_lab import Lab, context_of, run
 
 from afspm import wire
-from afspm.components import records
-from afspm.components.drift_pictures import DriftPictures, Told, parts
+from afspm.components import line_file
+from afspm.components.drift_pictures import DriftPictures, TabledScan, parts
 from afspm.components.simulated_truth import true_drift
 from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan
@@ -36,10 +36,10 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -> None:
-    told = [Told(str(k), k >= 3) for k in range(6)]
+    told = [TabledScan(str(k), k >= 3) for k in range(6)]
     assert parts(told) == [("off", 0, 3), ("on", 4, 6)]
-    assert parts([Told("0", True), Told("1", True)]) == [("on", 0, 2)]
-    assert parts([Told("0", False)]) == [("off", 0, 1)]
+    assert parts([TabledScan("0", True), TabledScan("1", True)]) == [("on", 0, 2)]
+    assert parts([TabledScan("0", False)]) == [("off", 0, 1)]
     assert parts([]) == []
 
 
@@ -174,14 +174,14 @@ def test_a_table_that_can_not_be_written_for_a_while_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab = night(tmp_path)
-    append, can_write = records._append, [False]
+    append, can_write = line_file._append, [False]
 
     def locked(path: Path, text: str) -> None:
         if not can_write[0]:
             raise PermissionError(errno.EACCES, "another program has it open", str(path))
         append(path, text)
 
-    monkeypatch.setattr(records, "_append", locked)
+    monkeypatch.setattr(line_file, "_append", locked)
     lab.at(450.0, lambda: can_write.__setitem__(0, True))
     lab.at(1500.0, lab.kill)
     component = DriftPictures(estimator="correlation", features="correlation")

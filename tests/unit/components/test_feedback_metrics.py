@@ -12,7 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.components.feedback_metrics import Following, FollowingLimits, feedback_error, gain_search, relative_error
+from afspm.components.feedback_metrics import (
+    FeedbackLimits,
+    FeedbackQuality,
+    feedback_error,
+    gain_search,
+    relative_error,
+)
 from afspm.components.feedback_signal import FeedbackSignal
 from afspm.errors import ConfigError
 from afspm.model import Feedback, Region, Scan
@@ -75,17 +81,17 @@ def scanned(sample: Sample, gain: float) -> tuple[Scan, Scan]:
 
 
 @cache
-def following(name: str, gain: float) -> Following:
+def following(name: str, gain: float) -> FeedbackQuality:
     sample = {**SAMPLES, **FLAT}[name]
     signal, height = scanned(sample, gain)
     scope: Any = type("Scope", (), {"get": lambda *_, **__: sample.setpoint})()
-    return FollowingLimits().judge(FeedbackSignal(None, None).error(signal, height, sample.setpoint, scope))
+    return FeedbackLimits().judge(FeedbackSignal(None, None).error(signal, height, sample.setpoint, scope))
 
 
 @pytest.mark.parametrize("gain", TOO_LOW)
 @pytest.mark.parametrize("sample", SAMPLES)
 def test_a_gain_a_hundred_times_too_low_is_seen_on_every_surface(sample: str, gain: float) -> None:
-    assert following(sample, gain) is Following.TOO_SLOW
+    assert following(sample, gain) is FeedbackQuality.TOO_SLOW
 
 
 @pytest.mark.parametrize("gain", FINE)
@@ -97,7 +103,7 @@ def test_usual_gains_follow(sample: str, gain: float) -> None:
 @pytest.mark.parametrize("gain", TOO_HIGH)
 @pytest.mark.parametrize("sample", [*SAMPLES, *FLAT])
 def test_an_oscillation_is_seen_and_not_taken_for_slow(sample: str, gain: float) -> None:
-    assert following(sample, gain) is Following.OSCILLATES
+    assert following(sample, gain) is FeedbackQuality.OSCILLATES
 
 
 @pytest.mark.parametrize("gain", [*TOO_LOW, 50.0])
@@ -107,7 +113,7 @@ def test_where_there_is_nothing_to_follow_no_gain_is_too_low(sample: str, gain: 
 
 
 def found(
-    follows: Callable[[float], Following | None],
+    follows: Callable[[float], FeedbackQuality | None],
     start: float,
     lowest: float = 1.0,
     highest: float = 1e6,
@@ -137,13 +143,13 @@ def test_the_search_finds_a_gain_on_every_surface_and_never_steps_the_wrong_way(
         assert max(tried) == start
 
 
-def by(slow_to: float, fast_from: float, well: tuple[float, float] = (0.0, 1e9)) -> Callable[[float], Following]:
-    def follows(gain: float) -> Following:
+def by(slow_to: float, fast_from: float, well: tuple[float, float] = (0.0, 1e9)) -> Callable[[float], FeedbackQuality]:
+    def follows(gain: float) -> FeedbackQuality:
         if gain <= slow_to:
-            return Following.TOO_SLOW
+            return FeedbackQuality.TOO_SLOW
         if gain >= fast_from:
-            return Following.OSCILLATES
-        return Following.WELL if well[0] <= gain <= well[1] else Following.BARELY
+            return FeedbackQuality.OSCILLATES
+        return FeedbackQuality.WELL if well[0] <= gain <= well[1] else FeedbackQuality.BARELY
 
     return follows
 
@@ -174,7 +180,7 @@ def test_a_gain_that_barely_follows_is_kept_where_there_is_none_better() -> None
     ids=["slow", "fast", "gap", "refused"],
 )
 def test_where_no_gain_is_good_the_search_ends_with_none_and_stays_in_its_bounds(
-    follows: Callable[[float], Following | None],
+    follows: Callable[[float], FeedbackQuality | None],
 ) -> None:
     kept, tried = found(follows, 30.0, lowest=8.0, highest=500.0)
     assert kept is None

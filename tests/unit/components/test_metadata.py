@@ -12,8 +12,8 @@ import pytest
 from runtime_lab import REGION, Lab, Nothing, context_of, run
 
 from afspm.clock import iso_utc
+from afspm.components.line_file import LineFile
 from afspm.components.metadata import COLUMNS, Metadata
-from afspm.components.records import LineFile
 from afspm.exit_codes import ExitCode
 from afspm.logic import arbitration as a
 from afspm.model import ControlMode, ControlState, Problem, Scan, ScopeState, ScopeStatus, Spectrum

@@ -12,7 +12,7 @@ from runtime_lab import REGION, Lab, context_of, run
 
 from afspm import wire
 from afspm.components.night_picture import NightPicture
-from afspm.components.verdicts import BAD, MESSAGE, verdict_message
+from afspm.components.tip_verdict import BAD, MESSAGE, verdict_message
 from afspm.exit_codes import ExitCode
 from afspm.model import ControlMode, ControlState, Problem, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.night_record import (

@@ -14,15 +14,17 @@ import pytest
 from runtime_lab import FakeClock
 
 from afspm import model
-from afspm.components import notices, notifier
-from afspm.components.notices import NotDelivered, Notice, Targets
+from afspm.components import notifications, notifier
+from afspm.components.notifications import NotDelivered, Notification, Targets
 from afspm.components.notifier import Notifier
 from afspm.errors import ConfigError
 from afspm.model import ControlMode, ControlState, ProblemNames, ProcessCondition
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 
 SECRET = "T0PSECRET"
-NOTICE = Notice("end", "night", "runs/night-1", 1_700_000_000_000_000_000, "the experiment has ended", simulated=True)
+NOTICE = Notification(
+    "end", "night", "runs/night-1", 1_700_000_000_000_000_000, "the experiment has ended", simulated=True
+)
 
 
 class Hook(ThreadingHTTPServer):
@@ -180,7 +182,7 @@ def test_what_fails_is_tried_again_later_and_later(tmp_path: Path, hook: Hook) -
     night.given_up("judge")
     night.passes(60)
     assert len(hook.got) == 1
-    assert [notices.delay_s(tries) for tries in (1, 2, 3, 20)] == [2.0, 4.0, 8.0, notices.LONGEST_DELAY_S]
+    assert [notifications.delay_s(tries) for tries in (1, 2, 3, 20)] == [2.0, 4.0, 8.0, notifications.LONGEST_DELAY_S]
 
 
 def test_what_never_succeeds_is_given_up_and_said(tmp_path: Path, hook: Hook, caplog: pytest.LogCaptureFixture) -> None:
@@ -258,7 +260,7 @@ def test_a_command_gets_the_notice(tmp_path: Path) -> None:
     [("import sys; sys.exit('no network')", "ended with 1: no network"), ("while True: pass", "took longer")],
 )
 def test_a_command_that_fails_is_said(monkeypatch: pytest.MonkeyPatch, code: str, said: str) -> None:
-    monkeypatch.setattr(notices, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(notifications, "TIMEOUT_S", 0.5)
     with pytest.raises(NotDelivered, match=said):
         Targets([sys.executable, "-c", code]).deliver(NOTICE, "command")
 
@@ -269,9 +271,9 @@ def test_a_program_that_is_not_there_is_said() -> None:
 
 
 def test_a_webhook_may_be_named_by_the_environment() -> None:
-    assert notices.address("$HOOK", {"HOOK": "https://chat.example.org/x"}) == "https://chat.example.org/x"
+    assert notifications.address("$HOOK", {"HOOK": "https://chat.example.org/x"}) == "https://chat.example.org/x"
     with pytest.raises(ConfigError, match="no environment variable 'HOOK'"):
-        notices.address("$HOOK", {})
+        notifications.address("$HOOK", {})
 
 
 @pytest.mark.parametrize(
@@ -279,7 +281,7 @@ def test_a_webhook_may_be_named_by_the_environment() -> None:
 )
 def test_what_is_no_address_is_refused_without_repeating_it(wrong: str) -> None:
     with pytest.raises(ConfigError) as refused:
-        notices.address(wrong)
+        notifications.address(wrong)
     assert wrong not in str(refused.value)
 
 

@@ -8,11 +8,11 @@ import pytest
 from runtime_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
 
 from afspm import wire
+from afspm.client.component import Component
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.exit_codes import ExitCode
 from afspm.model import TELL_REQUEST, ControlRequest, Problem, Progress
-from afspm.runtime.component import Component
 
 
 def series(scans: int = 3, *, keep_control: bool = False, end_when_done: bool = True) -> ScanSeries:

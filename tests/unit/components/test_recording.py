@@ -19,16 +19,16 @@ import afspm
 from afspm import wire
 from afspm.clock import ExperimentClock
 from afspm.components import recorder, recording
-from afspm.components.recording import Writer
+from afspm.components.recording import RecordWriter
 from afspm.errors import FileError
 from afspm.exit_codes import ExitCode
+from afspm.launch import Launch
 from afspm.model import ControlMode, ControlState, Packet
+from afspm.process.context import ProcessActivity, ProcessContext
 from afspm.record import ahead
 from afspm.record.ahead import Ahead, expect_record, recorded_until
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.store import RecordSettings, RecordStore
-from afspm.runtime.launch import Launch
-from afspm.runtime.process import Activity, Context
 from afspm.transport.port import Incoming, ParentGone
 
 DEADLINE_S = 20.0
@@ -48,10 +48,10 @@ class Bench:
         self.state.mkdir()
         expect_record(self.state)
         self.woken = threading.Event()
-        self.writers: list[Writer] = []
+        self.writers: list[RecordWriter] = []
 
-    def writer(self) -> Writer:
-        writer = Writer(
+    def writer(self) -> RecordWriter:
+        writer = RecordWriter(
             self.folder,
             self.state,
             RecordSettings(),
@@ -260,11 +260,11 @@ def test_what_wakes_the_recorder_is_the_port_that_is_open_now(tmp_path: Path, mo
 
         start = check = finish = lambda self, **_: None
 
-    monkeypatch.setattr(recording, "Writer", _Writer)
+    monkeypatch.setattr(recording, "RecordWriter", _Writer)
     clock = ExperimentClock.real()
     log = logging.getLogger("recorder")
     launch = Launch("recorder", run_dir=str(tmp_path))
-    context = Context(launch, clock, open_port=_Port, log=log, activity=Activity(clock))  # type: ignore[arg-type]
+    context = ProcessContext(launch, clock, open_port=_Port, log=log, activity=ProcessActivity(clock))  # type: ignore[arg-type]
     monkeypatch.setattr(recorder, "step_back", lambda: None)
     assert recorder.Recorder().run_process(context) == ExitCode.ORPHAN
     assert [port.woken for port in ports] == [1, 1]

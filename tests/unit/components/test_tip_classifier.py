@@ -11,7 +11,7 @@ from tip_scans_lab import channels
 
 from afspm import wire
 from afspm.components.tip_classifier import TipClassifier
-from afspm.components.verdicts import BAD, GOOD, MESSAGE, read_verdict
+from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, read_verdict
 from afspm.exit_codes import ExitCode
 from afspm.logic.arbitration import ControlEvent
 from afspm.model import ControlRequest, Problem, Region, Scan

@@ -15,7 +15,7 @@ from tip_scans_lab import HOME, channels
 
 from afspm import wire
 from afspm.components.tip_corrector import TipCorrector
-from afspm.components.verdicts import BAD, GOOD, MESSAGE, UNCLEAR, verdict_message
+from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, UNCLEAR, verdict_message
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
 from afspm.model import (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tip_scans_lab import ELSEWHERE, HOME, PIXELS, channels
 
-from afspm.components.tip_judge import Counter, Opinion, TipJudge, Tolerance, Verdict
+from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
 from afspm.components.tip_metrics import autocorrelation, ghost, slopes
 from afspm.errors import ConfigError, InvalidValue
 from afspm.model import Region, Scan
@@ -164,7 +164,7 @@ def test_a_ghost_is_found_where_it_is() -> None:
 
 
 def test_opinions_in_a_row_set_and_clear_a_flag_and_unclear_ones_do_not_count() -> None:
-    counter = Counter(flag_after=2, clear_after=1)
+    counter = VerdictCounter(flag_after=2, clear_after=1)
     for opinion in (Opinion.BAD, Opinion.GOOD, Opinion.BAD, Opinion.UNCLEAR):
         counter.count(opinion)
         assert not counter.wants_flag
@@ -178,7 +178,7 @@ def test_opinions_in_a_row_set_and_clear_a_flag_and_unclear_ones_do_not_count() 
 @pytest.mark.parametrize("wrong", [{"detail": 1.5}, {"ghost": 0.0}, {"unrest": 1.0}, {"sigmas": -1.0}, {"margin": 0.0}])
 def test_tolerances_without_sense_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError):
-        Tolerance(**wrong)
+        TipTolerance(**wrong)
 
 
 def test_one_reference_scan_is_too_few() -> None:

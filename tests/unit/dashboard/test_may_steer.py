@@ -12,7 +12,7 @@ from afspm.dashboard.actions import ActionResult
 from afspm.dashboard.sessions import Sessions
 from afspm.dashboard.steering import Steering
 from afspm.dashboard.watch import Watch
-from afspm.runtime.launch import Launch
+from afspm.launch import Launch
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from afspm.addresses import ListeningAddress
 from afspm.translator.driver import Driver
-from afspm.runtime.component import Component
+from afspm.client.component import Component
 from afspm.units import Angle, Duration, Length, Voltage
 
 

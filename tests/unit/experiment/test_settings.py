@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from afspm.experiment import classes, load
-from afspm.runtime import loading
-from afspm.runtime.launch import Launch
+from afspm.launch import Launch
+from afspm.process import loading
 
 from .conftest import Write, errors, line_of, only_error
 
@@ -166,7 +166,7 @@ def test_a_class_that_can_t_be_had_is_an_error(write: Write, tmp_path: Path, nam
 
 def test_modules_of_two_experiments_with_the_same_name_are_kept_apart(write: Write, tmp_path: Path) -> None:
     text = '[a]\ncomponent = true\nclass = "own.Own"\n'
-    own = "from afspm.runtime.component import Component\nclass Own(Component):\n    def __init__(self, {}: int): ...\n"
+    own = "from afspm.client.component import Component\nclass Own(Component):\n    def __init__(self, {}: int): ...\n"
     (tmp_path / "own.py").write_text(own.format("first"))
     assert "'first'" in only_error(write(text)).what
     (tmp_path / "own.py").write_text(own.format("another"))

@@ -11,7 +11,7 @@ import pytest
 
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
-from afspm.runtime.launch import Launch
+from afspm.launch import Launch
 from afspm.transport.keys import generate
 
 from .conftest import FRAME, PYTHON, Write, errors, only_error

@@ -9,8 +9,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from runtime_lab import SOURCE, Lab, LabPort
 
-from afspm.runtime.link import Link
-from afspm.runtime.scope import Scope
+from afspm.client.link import ExperimentLink
+from afspm.client.scope import Scope
 
 
 @pytest.fixture
@@ -20,4 +20,4 @@ def lab() -> Lab:
 
 @pytest.fixture
 def scope(lab: Lab) -> Scope:
-    return Scope(Link(LabPort(lab), lab.name, source=SOURCE))
+    return Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE))

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from afspm import wire
+from afspm.client.component import Component
+from afspm.launch import Launch, Sockets
 from afspm.logic import arbitration as a
 from afspm.model import (
     TELL_REQUEST,
@@ -33,9 +35,7 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
-from afspm.runtime.component import Component
-from afspm.runtime.launch import Launch, Sockets
-from afspm.runtime.process import Activity, Context
+from afspm.process.context import ProcessActivity, ProcessContext
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -383,14 +383,14 @@ class LabPort:
         return done
 
 
-def context_of(lab: Lab, state_dir: Path | None = None, **launch: Any) -> Context:
+def context_of(lab: Lab, state_dir: Path | None = None, **launch: Any) -> ProcessContext:
     """What the host would give to a component in this laboratory."""
-    return Context(
+    return ProcessContext(
         Launch(lab.name, sockets=Sockets(subscribe=(SOURCE,)), state_dir=str(state_dir or ""), **launch),
         lab.clock,
         open_port=lambda: LabPort(lab),  # type: ignore[arg-type,return-value]
         log=logging.getLogger("afspm.test"),
-        activity=Activity(lab.clock),
+        activity=ProcessActivity(lab.clock),
     )
 
 

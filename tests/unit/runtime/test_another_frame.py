@@ -8,10 +8,10 @@ import pytest
 from runtime_lab import OTHER_REGION, REGION, SOURCE, Lab, LabPort
 
 from afspm import model
+from afspm.client.link import ExperimentLink
+from afspm.client.scope import Scope
 from afspm.errors import NoResponse
 from afspm.model import ControlRequest
-from afspm.runtime.link import Link
-from afspm.runtime.scope import Scope
 
 
 def test_a_frame_of_somebody_else_is_not_taken_for_what_ours_was_rounded_to(lab: Lab, scope: Scope) -> None:
@@ -56,7 +56,7 @@ def test_a_frame_that_is_never_scanned_is_given_up(lab: Lab, scope: Scope) -> No
 def test_where_drift_is_corrected_a_scan_lies_where_it_turned_out_to_be(
     lab: Lab, off: float, scale: float, scans: int
 ) -> None:
-    scope = Scope(Link(LabPort(lab), lab.name, source=SOURCE), frame=model.Frame.SAMPLE)
+    scope = Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE), frame=model.Frame.SAMPLE)
     wrong = model.Region((off * 1e-6, 0.0), (scale * 1e-6, scale * 1e-6), frame=model.Frame.SAMPLE)
 
     def first_elsewhere() -> None:

@@ -10,11 +10,11 @@ import pytest
 from runtime_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
 
 from afspm import model, wire
+from afspm.client.component import Component
 from afspm.errors import ConfigError, ExperimentEnded, Refused
 from afspm.exit_codes import ExitCode
+from afspm.launch import Launch
 from afspm.model import HAS_ENDED, ControlResponse, Problem, Response, Scan, ScopeState, ScopeStatus
-from afspm.runtime.component import Component
-from afspm.runtime.launch import Launch
 from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
 from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
 
@@ -268,7 +268,7 @@ def test_a_script_without_handlers_keeps_nothing_in_memory() -> None:
             self.scope.scan(REGION)
 
     lab = Lab()
-    from afspm.runtime.loop import ComponentLoop
+    from afspm.client.loop import ComponentLoop
 
     loop = ComponentLoop(Script(), context_of(lab))
     loop.run()

@@ -11,17 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 
+from afspm.client.link import ExperimentLink
+from afspm.client.scope import Scope
 from afspm.errors import InvalidValue, NoResponse, Refused
 from afspm.logic.arbitration import ControlEvent
 from afspm.model import ControlRequest, ControlResponse, Problem, Request, Response, ScanSet
-from afspm.runtime.link import Link
-from afspm.runtime.scope import Scope
 
 TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
 
 
 def scope_of(lab: Lab, folder: Path, life: int, port: LabPort | None = None) -> Scope:
-    return Scope(Link(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
+    return Scope(ExperimentLink(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
 
 
 def kill_in(lab: Lab, seconds: float, port: LabPort) -> None:

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
+from afspm.launch import Launch, Sockets
 from afspm.logic.supervision import ChildPolicy
-from afspm.runtime.launch import Launch, Sockets
 
 FULL = Launch(
     name="tip classifier",

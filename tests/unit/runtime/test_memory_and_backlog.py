@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from afspm.client.backlog import Backlog
 from afspm.errors import FileError, InvalidValue
 from afspm.model import Packet
-from afspm.runtime.backlog import Backlog
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 
 
 def test_what_is_saved_is_there_after_a_restart(tmp_path: Path) -> None:

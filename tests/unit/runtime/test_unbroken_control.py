@@ -6,9 +6,9 @@ import pytest
 from runtime_lab import REGION, Lab
 
 from afspm import model
+from afspm.client.scope import Scope
 from afspm.errors import ControlLost, NoResponse
 from afspm.model import ControlMode, ControlResponse, Problem, Response
-from afspm.runtime.scope import Scope
 
 TIP = Problem.TIP_SHAPE_CHANGED
 

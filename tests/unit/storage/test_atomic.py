@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import FileError
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 from afspm.scheduler.state_file import StateFile
 from afspm.storage import atomic
 from afspm.storage.atomic import CheckpointFile, load_checkpoint, previous_generation

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.components import notices
-from afspm.components.notices import OCCASIONS, Targets
+from afspm.components import notifications
+from afspm.components.notifications import OCCASIONS, Targets
 from afspm.experiment import load
 from afspm.record.report import REPORT_FILE
 from afspm.record.store import RecordStore
@@ -77,7 +77,7 @@ class TenSeconds:
 
 
 def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(notices, "FIRST_DELAY_S", 0.01)
+    monkeypatch.setattr(notifications, "FIRST_DELAY_S", 0.01)
     log, count = Log(), tmp_path / "count"
     code = "import sys; open(sys.argv[1], 'a').write('x'); sys.exit('no network')"
     ended = Ended("night", tmp_path, Outcome(Why.ALL_DONE, "all is done", (), 1.0), False)

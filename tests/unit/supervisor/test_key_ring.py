@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
+from afspm.client.connect import GUEST_KEYS, _keys_in
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, load
-from afspm.runtime.connect import GUEST_KEYS, _keys_in
 from afspm.supervisor.key_ring import Handed, hand_over
 from afspm.transport.keys import Keys, from_launch, generate
 

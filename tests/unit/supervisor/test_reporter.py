@@ -7,9 +7,9 @@ import logging
 import pytest
 
 from afspm.clock import ExperimentClock
+from afspm.launch import Launch
 from afspm.logic.supervisor_registry import LONGEST
 from afspm.model import ControlResponse, Response
-from afspm.runtime.launch import Launch
 from afspm.supervisor import reporter as reporting
 from afspm.supervisor.reporter import Reporter
 from afspm.wire import encode

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from afspm.client.connect import guest_of
 from afspm.clock import ExperimentClock
 from afspm.experiment import load
-from afspm.runtime.connect import guest_of
 from afspm.supervisor.common_clock import Common
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import run_facts

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import pytest
 
 from afspm.experiment import Role
+from afspm.launch import Launch
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.supervision import ChildPolicy, ChildWatch
 from afspm.model import ProcessCondition
-from afspm.runtime.launch import Launch
 from afspm.supervisor.standing import Standing
 from afspm.supervisor.task import Task
 from afspm.transport.heartbeat import Heartbeat

@@ -27,7 +27,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.runtime.memory import Memory
+from afspm.process.memory import Memory
 from afspm.translator import Driver, Value, action
 from afspm.translator.process import Translator
 from afspm.transport.port import RequestReceived, Served

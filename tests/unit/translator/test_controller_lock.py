@@ -15,12 +15,12 @@ import pytest
 
 from afspm.clock import ExperimentClock
 from afspm.exit_codes import ExitCode
+from afspm.launch import Launch, Sockets
 from afspm.microscopes.asylum import Asylum
 from afspm.microscopes.gxsm import Gxsm
 from afspm.microscopes.nanonis import Nanonis
 from afspm.microscopes.simulator import Simulator
-from afspm.runtime.launch import Launch, Sockets
-from afspm.runtime.process import Activity, Context
+from afspm.process.context import ProcessActivity, ProcessContext
 from afspm.translator import controller_lock
 from afspm.translator.controller_lock import ControllerTaken, commanding
 from afspm.translator.process import run_translator
@@ -155,7 +155,7 @@ def test_the_translator_of_a_second_run_says_which_has_it_and_ends_to_be_tried_a
 ) -> None:
     launch = Launch("microscope", sockets=Sockets(), run_dir="runs/second")
     clock, log = ExperimentClock.from_dict(launch.clock), logging.getLogger("afspm.test")
-    context = Context(launch, clock, open_port=pytest.fail, log=log, activity=Activity(clock))
+    context = ProcessContext(launch, clock, open_port=pytest.fail, log=log, activity=ProcessActivity(clock))
     with commanding("lab:6501", "runs/first"):
         code = run_translator(Nanonis(address="lab:6501"), context, make=pytest.fail)
     assert code == ExitCode.CRASHED

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from afspm.errors import ConfigError
-from afspm.runtime.launch import Launch
+from afspm.launch import Launch
 from afspm.translator.driver import ControllerLost
 from afspm.translator.emulated_controller import AddressNotice, EmulatedController, notice_file, wired_to
 

@@ -24,7 +24,7 @@ from afspm.model import (
     ScopeState,
     names,
 )
-from afspm.runtime.parent import TIP_WITHIN_S
+from afspm.process.parent import TIP_WITHIN_S
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.wire.generated import feedback_pb2, scan_pb2
 

@@ -26,7 +26,7 @@ from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.units import Duration
 
 if TYPE_CHECKING:
-    from afspm.runtime.process import Context
+    from afspm.process.context import ProcessContext
 
 T = TypeVar("T")
 
@@ -290,7 +290,7 @@ class Simulator(Driver):
         found = super().own_actions()
         return found if self._fault_action else {name: a for name, a in found.items() if name != _FAULT}
 
-    def run_process(self, context: Context) -> int:
+    def run_process(self, context: ProcessContext) -> int:
         """Be the translator, with the faults that are not the controller's."""
         from afspm.microscopes.simulator.faulty import FaultyTranslator
         from afspm.translator.process import run_translator

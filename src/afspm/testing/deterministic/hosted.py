@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from afspm import wire
+from afspm.client.component import Component
+from afspm.client.published_state import STATE_MESSAGES
+from afspm.launch import Launch, Sockets
 from afspm.model import Packet, Request, Response
-from afspm.runtime.component import Component
-from afspm.runtime.host import MEASURED
-from afspm.runtime.launch import Launch, Sockets
-from afspm.runtime.memory import Memory
-from afspm.runtime.process import Activity, Context
-from afspm.runtime.view import KEPT
+from afspm.process.context import ProcessActivity, ProcessContext
+from afspm.process.host import MEASURED
+from afspm.process.memory import Memory
 from afspm.testing.deterministic.baton import Baton
 from afspm.testing.deterministic.network import ControlLine, Feed, Weather
 from afspm.testing.deterministic.process import Process
@@ -157,7 +157,7 @@ class HostedComponent(HostedProcess):
         self._inbox = []
         self._newest = {}
         self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.name)
-        self._feed = Feed(self.timeline, self._weather, self, self._scheduler, sorted({*KEPT, *MEASURED}))
+        self._feed = Feed(self.timeline, self._weather, self, self._scheduler, sorted({*STATE_MESSAGES, *MEASURED}))
 
     def disconnect(self) -> None:
         self._line.close()
@@ -171,12 +171,12 @@ class HostedComponent(HostedProcess):
             run_dir=str(self._folder),
             simulated=True,
         )
-        context = Context(
+        context = ProcessContext(
             launch,
             self.timeline,
             open_port=lambda: MemoryPort(self),
             log=logging.getLogger(f"afspm.{self.name}"),
-            activity=Activity(self.timeline),
+            activity=ProcessActivity(self.timeline),
             session=f"life{self.life}",
         )
         return self._make().run_process(context)

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from typing import Any
 
 from afspm import wire
+from afspm.client.link import ExperimentLink
 from afspm.clock import Clock
 from afspm.errors import ExperimentEnded, NoResponse, WireError
 from afspm.model import ControlRequest, ControlResponse, Parameter, Response, ScopeState, ScopeStatus, names
-from afspm.runtime.link import Link
-from afspm.runtime.stopping import StopRequested
+from afspm.process.stopping import StopRequested
 from afspm.testing.translators.story import Heard, Story, told
 from afspm.testing.translators.verdicts import Failed, Lost, expect
 
@@ -45,7 +45,7 @@ class Bench:
         at_start: what of it was there before anything was asked.
     """
 
-    def __init__(self, link: Link, direct: Link | None, lost: Callable[[], str]) -> None:
+    def __init__(self, link: ExperimentLink, direct: ExperimentLink | None, lost: Callable[[], str]) -> None:
         self._link = link
         self._direct = direct or link
         self._lost = lost
@@ -111,7 +111,7 @@ class Bench:
         """As `ask`, past the scheduler: for what the translator has to refuse by itself."""
         return self._asked_by(self._direct, kind, subject)
 
-    def _asked_by(self, link: Link, kind: ControlRequest, subject: Any) -> Response:
+    def _asked_by(self, link: ExperimentLink, kind: ControlRequest, subject: Any) -> Response:
         self._heed()
         try:
             with self._alive():

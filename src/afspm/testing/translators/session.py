@@ -13,16 +13,16 @@ from datetime import datetime
 from pathlib import Path
 
 from afspm.addresses import connectable
+from afspm.client.component import Component
+from afspm.client.link import ExperimentLink
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, Role, Start, load
+from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Frame
+from afspm.process.context import new_session
 from afspm.record.run_json import STATE_DIR
-from afspm.runtime.component import Component
-from afspm.runtime.launch import Launch, Sockets
-from afspm.runtime.link import Link
-from afspm.runtime.process import new_session
 from afspm.supervisor import common_clock, run_folder
 from afspm.supervisor.common_clock import Common
 from afspm.supervisor.log import RunLog
@@ -241,8 +241,8 @@ def _translator_address(experiment: Experiment, starts: Sequence[Start]) -> str 
     return None
 
 
-def _link(port: Port, own: Launch, log: logging.Logger) -> Link:
-    return Link(
+def _link(port: Port, own: Launch, log: logging.Logger) -> ExperimentLink:
+    return ExperimentLink(
         port,
         NAME,
         source=own.sockets.subscribe[0],

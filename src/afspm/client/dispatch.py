@@ -1,0 +1,113 @@
+"""Which handler of a component a packet is for."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from afspm import wire
+from afspm.errors import WireError
+from afspm.model import ControlState, Packet, Problem
+
+if TYPE_CHECKING:
+    from afspm.client.component import Component
+
+HANDLERS = {
+    "Scan2d": "on_scan",
+    "Spec1d": "on_spectrum",
+    "ScopeStateMsg": "on_state",
+    "ControlState": "on_control",
+    "ScanParameters2d": "on_scan_parameters",
+    "ZCtrlParameters": "on_feedback",
+    "ProbePosition": "on_probe_position",
+}
+
+
+class Dispatcher:
+    """Brings packets to the handlers of `component`, of which `base` has the empty ones.
+
+    Args:
+        prefixes: of the envelopes that the component subscribed to; None: all. (More may arrive: what `Scope` needs.)
+    """
+
+    def __init__(
+        self, component: Component, base: type[Component], prefixes: tuple[str, ...] | None, log: logging.Logger
+    ) -> None:
+        self._component = component
+        self._base = base
+        self._prefixes = prefixes
+        self._log = log
+        self._problems: frozenset[int] = frozenset()
+        self._wanted: dict[str, bool] = {}
+
+    def wants(self, packet: Packet) -> bool:
+        """Whether there is a handler for a packet; only those need to be kept."""
+        try:
+            message = wire.message_of(packet.envelope)
+        except WireError:
+            return False
+        if self._prefixes is not None and not packet.envelope.startswith(self._prefixes):
+            return False
+        if message not in self._wanted:
+            self._wanted[message] = self._wants_message(message)
+        return self._wanted[message]
+
+    @property
+    def wants_anything(self) -> bool:
+        """Whether there is any handler at all."""
+        return any(self._wants_message(message) for message in wire.known_messages())
+
+    def give(self, packet: Packet) -> None:
+        """Call the handlers of a packet. What can't be read is told and dropped."""
+        try:
+            message = wire.message_of(packet.envelope)
+            thing = wire.decode(message, packet.payload)
+        except WireError as error:
+            self._log.warning("a packet that can't be read: %s", error)
+            return
+        self._component.packet = packet
+        try:
+            if (handler := self._handler(message)) is not None:
+                handler(packet.envelope, thing)
+            if isinstance(thing, ControlState):
+                self._give_problems(thing)
+        finally:
+            self._component.packet = None
+
+    def _give_problems(self, state: ControlState) -> None:
+        before, self._problems = self._problems, frozenset(state.problems)
+        if not self._has("on_problem"):
+            return
+        for number in sorted(before ^ self._problems):
+            flagged = number in self._problems
+            self._component.on_problem(_problem(number), flagged)
+
+    def _wants_message(self, message: str) -> bool:
+        return self._handler(message) is not None or (message == "ControlState" and self._has("on_problem"))
+
+    def _handler(self, message: str) -> Callable[[str, Any], None] | None:
+        name = HANDLERS.get(message) or f"on_{snake_case(message)}"
+        if self._has(name):
+            handle: Callable[[Any], None] = getattr(self._component, name)
+            return lambda envelope, thing: handle(thing)
+        return self._component.on_message if self._has("on_message") else None
+
+    def _has(self, name: str) -> bool:
+        """Whether the component's class has a handler of its own."""
+        return hasattr(type(self._component), name) and overrides(self._component, self._base, name)
+
+
+def overrides(thing: object, base: type, name: str) -> bool:
+    """Whether the class of `thing` has another `name` than `base`."""
+    return getattr(type(thing), name, None) is not getattr(base, name, None)
+
+
+def snake_case(name: str) -> str:
+    """ "SpatialROIWithScoreList" as "spatial_roi_with_score_list"."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
+
+
+def _problem(number: int) -> int:
+    return Problem(number) if number in Problem._value2member_map_ else number

@@ -1,0 +1,119 @@
+"""Looking on at a running experiment: what is published, reduced to an `Overview`, and nothing asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+from pathlib import Path
+
+from afspm import wire
+from afspm.client.connect import guest_of
+from afspm.client.link import ExperimentLink
+from afspm.clock import Clock, ExperimentClock
+from afspm.errors import ExperimentEnded, NoResponse, WireError
+from afspm.launch import Launch
+from afspm.model import Packet, ProblemNames
+from afspm.process.message_types import register_all
+from afspm.record.overview import Overview
+from afspm.record.run_lock import cut_off_message
+from afspm.transport.launching import open_port
+
+SMALL = (
+    "ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "DriftMapping",
+    "JournalEntries", "ProcessStates", "LogLines", "Progress",
+)  # fmt: skip
+"""Envelopes of what carries no values of scans and spectra."""
+LINES = "ScanLines"
+HEARD_WITHIN_S = 5.0
+
+
+class Follower:
+    """Follows the run in a folder, from one thread. It can't disturb it: it asks nobody for anything.
+
+    Args:
+        folder: of the run.
+        name: in whose name (and with whose key) it looks on.
+        envelopes: what is subscribed to, or how it begins.
+
+    Attributes:
+        ended: the experiment has ended.
+        heard_s: when something came last, in real monotonic time; None before the first.
+
+    Raises:
+        FileError: there is no run in the folder.
+        ConfigError: it has nobody to connect to.
+    """
+
+    def __init__(self, folder: Path, name: str = "terminal", envelopes: tuple[str, ...] = SMALL) -> None:
+        guest = guest_of(folder, name)
+        register_all(guest.messages)
+        # no control: whoever only looks on need not be known to the scheduler
+        sockets = dataclasses.replace(guest.sockets, control=None)
+        self.launch: Launch = dataclasses.replace(guest, sockets=sockets, envelopes=envelopes)
+        self.folder = folder
+        self.clock: Clock = ExperimentClock.from_dict(guest.clock)
+        self.overview = Overview(ProblemNames(guest.problems))
+        self.ended = False
+        self.heard_s: float | None = None
+        self._port = open_port(self.launch, self.clock)
+        self._link = ExperimentLink(
+            self._port,
+            name,
+            source=guest.sockets.subscribe[0],
+            session=os.urandom(4).hex(),
+            log=logging.getLogger(f"afspm.{name}"),
+        )
+        self._link.listen(self._take)
+
+    def pump(self, timeout_s: float | None) -> None:
+        """Wait for what comes, once, and take it in."""
+        try:
+            self._link.pump(timeout_s)
+        except ExperimentEnded:
+            self.ended = True
+
+    def catch_up(self, within_s: float = HEARD_WITHIN_S) -> None:
+        """Take in all that the scheduler has cached.
+
+        Raises:
+            NoResponse: nothing came.
+        """
+        until_s = self.clock.monotonic_s() + within_s
+        while not (self.ended or self._link.is_caught_up()):
+            left_s = until_s - self.clock.monotonic_s()
+            if left_s <= 0.0:
+                break
+            self.pump(left_s)
+        if self.heard_s is None and not self._link.is_caught_up():
+            hint = self.cut_off() or "is the experiment still running?"
+            raise NoResponse("nobody is there", where=str(self.folder), hint=hint)
+
+    def silent_s(self) -> float:
+        """Real seconds since anything came."""
+        return 0.0 if self.heard_s is None else self.clock.monotonic_s() - self.heard_s
+
+    def cut_off(self) -> str:
+        """What to say if nobody runs it any more; empty if somebody does, or it has ended."""
+        return cut_off_message(self.folder)
+
+    def close(self) -> None:
+        """Look away."""
+        self._port.close()
+
+    def __enter__(self) -> Follower:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _take(self, packet: Packet, ours: bool) -> None:
+        self.heard_s = self.clock.monotonic_s()
+        if not ours or packet.time_ns is None:
+            return
+        try:
+            message = wire.message_of(packet.envelope)
+            thing = wire.decode(message, packet.payload)
+        except WireError:
+            return  # of no interest here; those whom it concerns say so
+        self.overview.take(message, thing, packet.time_ns, packet.envelope)

@@ -1,0 +1,429 @@
+"""`Scope`: the blocking handle on an experiment, for scripts, notebooks and `Component.run`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+from afspm import wire
+from afspm.client.command_retry import SETTLED_WITHIN_S, CommandRetry, refused
+from afspm.client.control_hold import ControlHold
+from afspm.client.events import Events, PublishedEvent
+from afspm.client.keyed_results import KeyedResults, check_key
+from afspm.client.link import ExperimentLink
+from afspm.client.measurement import MeasurementRunner
+from afspm.client.parameter_values import Value, from_parameter, to_parameter
+from afspm.client.plans import MEASURED, MeasurementPlans, fits
+from afspm.errors import ExperimentEnded, InvalidValue
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    ControlState,
+    Feedback,
+    Frame,
+    Parameter,
+    ProbePosition,
+    Problem,
+    ProblemNames,
+    Progress,
+    Region,
+    Response,
+    ScanParameters,
+    ScanSet,
+    ScopeState,
+    Spectrum,
+)
+
+__all__ = ["PublishedEvent", "Events", "Scope"]
+
+ANSWER_S = 60.0  # by default; what waits for control or for a measurement has no limit by default
+
+
+class Scope:
+    """What an experiment asks of the microscope. A call returns when what it asks for is done.
+
+    Control is asked for by itself and given back after each call; `with scope.control():` keeps it over several. Where
+    it is refused or taken away, calls wait until it is back. Timeouts are in real seconds; None waits for ever.
+
+    Every call may raise:
+        Refused: the scheduler, a limit or the microscope said no; `reason` says why.
+        NoResponse: the time given was up, or nobody answers.
+        ControlLost: control was not given within the timeout, or is lost in an unbroken block.
+        ExperimentEnded: there is nothing more to ask.
+
+    Args:
+        link: to the experiment.
+        state_dir: where keyed measurements are kept; None: only in memory.
+        between: called after each outermost call, when nothing is under way.
+        frame: of all places.
+    """
+
+    def __init__(
+        self,
+        link: ExperimentLink,
+        problems: ProblemNames | None = None,
+        state_dir: Path | None = None,
+        between: Callable[[], None] = lambda: None,
+        frame: Frame = Frame.TIP,
+    ) -> None:
+        self._link = link
+        self._between = between
+        self._depth = 0
+        self._begun: tuple[int, int] | None = None  # what was done when progress was first told, and when
+        self._flagged: dict[int, int] = {}  # by us, and how many control states had been published before
+        self.problems = problems or ProblemNames()
+        self._holding = ControlHold(link, self.problems)
+        self._asker = CommandRetry(link, self._holding)
+        self._plans = MeasurementPlans(link.view, self._asker, frame)
+        self._results = KeyedResults(state_dir, link.name)
+        self._measuring = MeasurementRunner(link, self._holding, self._asker, self._results)
+        self._measuring.resume(MEASURED, fits)
+
+    def __repr__(self) -> str:
+        """How it is, as far as it was heard of: asks nobody, as a notebook may want it at any time."""
+        view = self._link.view
+        control = view.control or ControlState(ControlMode.UNDEFINED)
+        flagged = "".join(f", {self.problems.name(number)} is flagged" for number in control.problems)
+        holder = control.holder or "nobody"
+        return f"<Scope {self._link.name!r}: {view.state.name}, {control.mode.name}, {holder} is in control{flagged}>"
+
+    # --- measuring ---
+
+    def scan(
+        self,
+        region: Region | None = None,
+        *,
+        shape: tuple[int, int] | None = None,
+        key: str | None = None,
+        timeout_s: float | None = None,
+    ) -> ScanSet:
+        """Take a scan and return all its channels.
+
+        A scan that is interrupted (a problem, MANUAL, a restart of anything) is taken again when control is back;
+        `ScanSet.interruptions` says when and why.
+
+        Args:
+            region: where; None: what is set.
+            shape: (rows, columns); None: what is set.
+            key: makes it happen once in this run: a component that is killed and started again gets the scan of its
+                earlier life. Keys are the component's own, each for one measurement. What is kept of it takes the space
+                of the scan, until `forget`.
+        """
+        with self._call():
+            plan = self._plans.scan(region, shape)
+            result = self._measuring.take(plan, key, self._link.until(timeout_s))
+            return ScanSet(result.things, result.interruptions)
+
+    def spectrum(
+        self,
+        at: tuple[float, float] | None = None,
+        *,
+        kind: str | None = None,
+        key: str | None = None,
+        timeout_s: float | None = None,
+    ) -> Spectrum:
+        """Take a spectrum; interruptions and `key` as with `scan`.
+
+        Args:
+            at: (x, y) in m, where the probe is moved to; None: where it stands.
+            kind: e.g. "IV" (the parameter `x-spec-kind`); None: what is set.
+        """
+        with self._call():
+            plan = self._plans.spectrum(at, kind)
+            result = self._measuring.take(plan, key, self._link.until(timeout_s))
+            spectrum: Spectrum = result.things[0]
+            return spectrum
+
+    def forget(self, key: str) -> None:
+        """Remove what is kept of a keyed measurement that will not be asked for again, which a long series needs."""
+        self._results.forget(check_key(key))
+
+    # --- setting and getting ---
+
+    def set(self, parameter: str, value: Value, unit: str | None = None, *, timeout_s: float | None = None) -> Value:
+        """Set a parameter and return what is then in force, in the same unit.
+
+        Args:
+            value: a number, in `unit` (SI without one), a quantity as text ("0.5 V"), True, "on" …
+        """
+        with self._call():
+            asked = to_parameter(parameter, value, unit)
+            response = self._command(ControlRequest.PARAM, asked, timeout_s)
+            return self._value_in(response, asked, asked.unit)
+
+    def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
+        """The value of a parameter in `unit`; without one in SI, or as it came if it is not a base one."""
+        with self._call():
+            asked = Parameter(parameter)
+            response = self._read(ControlRequest.PARAM, asked, timeout_s)
+            if not response.ok:
+                raise refused(ControlRequest.PARAM, response, parameter)
+            return self._value_in(response, asked, unit)
+
+    def set_feedback(
+        self,
+        *,
+        on: bool | None = None,
+        proportional_gain: float | None = None,
+        integral_gain: float | None = None,
+        setpoint: float | None = None,
+        timeout_s: float | None = None,
+    ) -> None:
+        """Set what is given of the z feedback; the rest stays as it is."""
+        with self._call():
+            feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
+            view, count = self._link.view, self._link.view.count("ZCtrlParameters")
+            changes = _changes(view.feedback, feedback)
+            self._command(ControlRequest.SET_ZCTRL_PARAMS, feedback, timeout_s)
+            if changes:  # so that `feedback` then tells it
+                self._link.wait(lambda: view.count("ZCtrlParameters") != count, self._link.until(SETTLED_WITHIN_S))
+
+    def move_probe(self, xy_m: tuple[float, float], *, timeout_s: float | None = None) -> None:
+        """Move the probe to (x, y) in m; returns when it stands there."""
+        with self._call():
+            until_s = self._link.until(timeout_s)
+            with self._holding.hold(until_s=until_s):
+                self._plans.move_probe(xy_m, until_s)
+
+    def set_scan_region(
+        self, region: Region, *, shape: tuple[int, int] | None = None, timeout_s: float | None = None
+    ) -> None:
+        """Set where the next scan is taken, and with `shape` (rows, columns) its pixels, all at once: one after the
+        other, they would be frames of their own, that may be refused. Returns when it is in force."""
+        with self._call():
+            until_s = self._link.until(timeout_s)
+            with self._holding.hold(until_s=until_s):
+                self._plans.set_scan(region, shape, until_s)
+
+    def action(self, name: str, *, timeout_s: float | None = None) -> None:
+        """Have the microscope do something by its name; returns when it has accepted it."""
+        with self._call():
+            self._command(ControlRequest.ACTION, name, timeout_s)
+
+    def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:
+        """Whether the microscope has an action of this name."""
+        with self._call():
+            response = self._read(ControlRequest.ACTION_SUPPORT, action, timeout_s)
+            if response.code in (ControlResponse.ACTION_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED):
+                return False
+            if not response.ok:
+                raise refused(ControlRequest.ACTION_SUPPORT, response, action)
+            return True
+
+    # --- control ---
+
+    @contextmanager
+    def control(
+        self, *, solving: int | str | None = None, timeout_s: float | None = None, unbroken: bool = False
+    ) -> Iterator[None]:
+        """Keep control over all calls in the block; waits for it first.
+
+        Within the block control may still be lost: to a problem, to MANUAL. The next call then waits until it is back.
+        When the problem being solved has been cleared, it raises ControlLost: there is nothing left to do.
+
+        Args:
+            solving: the flagged problem that will be solved, by name or number.
+            unbroken: what the block does hangs together, as a pulse does with the place that the probe was moved to.
+                Where control is lost, the next call in the block raises ControlLost, and nothing more is done: begin
+                the block again, whoever was in control meanwhile may have changed anything. `action` raises NoResponse
+                if the loss came before the answer, so that it is not known whether it was done. Within another block,
+                control is waited for when this one begins.
+        """
+        number = Problem.NONE if solving is None else self.problems.number(solving)
+        with self._holding.hold(solving=number, until_s=self._link.until(timeout_s), unbroken=unbroken):
+            yield
+
+    @property
+    def in_control(self) -> bool:
+        """Whether control is ours now."""
+        self._catch_up()
+        return self._holding.held
+
+    def flag(self, problem: int | str) -> None:
+        """Flag a problem, by name or number: control is taken from whoever has it, until the problem is cleared."""
+        number, states = self.problems.number(problem), self._link.view.count("ControlState")
+        self._tell(ControlRequest.ADD_EXP_PRBLM, number)
+        self._flagged[number] = states
+
+    def clear(self, problem: int | str) -> None:
+        """Remove the flag of a problem; that it was not flagged is no error."""
+        number = self.problems.number(problem)
+        if self._link.version is wire.Version.OURS or self._is_seen_flagged(number):
+            self._tell(ControlRequest.RMV_EXP_PRBLM, number)
+
+    def _is_seen_flagged(self, problem: int) -> bool:
+        """Whether a problem is known to be flagged: a scheduler of version 1 ends over clearing one that is not."""
+        link, states = self._link, self._flagged.get(problem)
+        if states == link.view.count("ControlState"):  # that we have flagged it ourselves is to be published yet
+            link.wait(lambda: link.view.count("ControlState") != states, link.until(SETTLED_WITHIN_S))
+        return self.is_flagged(problem)
+
+    def clear_all(self) -> tuple[str, ...]:
+        """Remove the flag of every problem that is flagged, and return their names."""
+        flagged = sorted(self.control_state.problems)
+        for problem in flagged:
+            self.clear(problem)
+        return tuple(map(self.problems.name, flagged))
+
+    def is_flagged(self, problem: int | str) -> bool:
+        """Whether a problem is, by name or number, as far as it was heard."""
+        return self.problems.number(problem) in self.control_state.problems
+
+    def set_mode(self, mode: ControlMode) -> None:
+        """Set MANUAL (nobody has control) or AUTOMATED."""
+        self._tell(ControlRequest.SET_CONTROL_MODE, int(mode))
+
+    def end_experiment(self) -> None:
+        """End the experiment for everybody, this process included: the next call raises ExperimentEnded."""
+        self._link.wait_caught_up()  # else the signal might pass before we listen
+        with suppress(ExperimentEnded):  # it may come before the answer
+            self._tell(ControlRequest.END_EXPERIMENT, None)
+
+    def progress(self, done: int, of: int, *, left_s: float | None = None) -> None:
+        """Say how far one is with what one set out to do, for those who look on. Costs nothing, and waits for nobody.
+
+        Args:
+            done, of: how many of how many, of whatever is counted.
+            left_s: experiment time that the rest will take; None: as it went since this was first said.
+        """
+        now_ns = self._link.clock.now_ns()
+        begun, begun_ns = self._begun = self._begun or (done, now_ns)
+        if left_s is None and done > begun:
+            left_s = (now_ns - begun_ns) * 1e-9 / (done - begun) * (of - done)
+        self._link.tell(Progress(now_ns, self._link.name, done, of, left_s))
+
+    # --- looking ---
+
+    @property
+    def state(self) -> ScopeState:
+        """What the microscope is doing."""
+        self._catch_up()
+        return self._link.view.state
+
+    @property
+    def control_state(self) -> ControlState:
+        """Mode, holder and problems."""
+        self._catch_up()
+        return self._link.view.control or ControlState(ControlMode.UNDEFINED)
+
+    @property
+    def mode(self) -> ControlMode:
+        """MANUAL or AUTOMATED."""
+        return self.control_state.mode
+
+    @property
+    def scan_parameters(self) -> ScanParameters | None:
+        """Where and how the next scan will be taken; None if the microscope has not said."""
+        self._catch_up()
+        return self._link.view.scan_parameters
+
+    @property
+    def feedback(self) -> Feedback | None:
+        """The z feedback; None if the microscope has not said."""
+        self._catch_up()
+        return self._link.view.feedback
+
+    @property
+    def probe_position(self) -> ProbePosition | None:
+        """Where the probe stands; None if the microscope has not said."""
+        self._catch_up()
+        return self._link.view.probe_position
+
+    def events(self, *envelopes: str, timeout_s: float | None = None) -> Events:
+        """Iterate over what is published from now on, as `PublishedEvent(envelope, message, time_ns)`.
+
+        Args:
+            envelopes: prefixes of those wanted; none: all.
+            timeout_s: ends the iteration when nothing came for that long.
+        """
+        return Events(self._link, envelopes, timeout_s)
+
+    def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> bool:
+        """Wait until `condition()`, tried whenever something was published; False when the time is up."""
+        with self._call():
+            return self._link.wait(condition, self._link.until(timeout_s))
+
+    def sleep(self, experiment_s: float) -> None:
+        """Let time pass in the experiment. Unlike `time.sleep` it ends with the experiment, and keeps its clock."""
+        if not (isinstance(experiment_s, Real) and experiment_s >= 0.0):
+            raise InvalidValue(f"can't wait for {experiment_s!r}", hint="a number of seconds, zero or more")
+        clock = self._link.clock
+        end_s = clock.now_s() + experiment_s
+        with self._call():
+            while (left_s := end_s - clock.now_s()) > 0.0:
+                self._link.wait(lambda: False, self._link.until(clock.real_s(left_s)))
+
+    # --- leaving ---
+
+    def close(self) -> None:
+        """Leave the experiment; control that is held is given back. `with afspm.connect() as scope:` does it by itself.
+
+        In a component this is done for you.
+        """
+        self._holding.leave()
+        self._link.leave()
+
+    def __enter__(self) -> Scope:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # --- within ---
+
+    def give_back_inherited(self) -> None:
+        """Never keep control that an earlier life of this component died with. Called by the component's loop."""
+        self._holding.gives_back_inherited = True
+        self._holding.release_inherited()
+
+    @contextmanager
+    def _call(self) -> Iterator[None]:
+        """A call of the user; when the outermost is done, what arrived meanwhile is handled."""
+        self._link.check()
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+        if self._depth == 0:
+            self._between()
+
+    def _catch_up(self) -> None:
+        """Take in what has arrived, so that what is told is not from before the last computation."""
+        self._link.wait_caught_up()
+        self._link.pump(0.0)
+
+    def _command(self, kind: ControlRequest, subject: Any, timeout_s: float | None) -> Response:
+        until_s = self._link.until(timeout_s)
+        with self._holding.hold(until_s=until_s):
+            return self._asker.ask(kind, subject, until_s=until_s)
+
+    def _read(self, kind: ControlRequest, subject: Any, timeout_s: float | None) -> Response:
+        """Ask for what anybody may know; schedulers of version 1 tell only who is in control."""
+        until_s = self._link.until(timeout_s)
+        response = self._asker.send(kind, subject, until_s=until_s)
+        if response.code != ControlResponse.NOT_IN_CONTROL:
+            return response
+        with self._holding.hold(until_s=until_s):
+            return self._asker.send(kind, subject, until_s=until_s)
+
+    def _tell(self, kind: ControlRequest, subject: int | None) -> None:
+        """Ask the scheduler itself, which needs no control."""
+        with self._call():
+            response = self._link.request(kind, subject)
+            if not response.ok:
+                raise refused(kind, response, self._link.name)
+
+    def _value_in(self, response: Response, asked: Parameter, unit: str | None) -> Value:
+        if not response.payload:  # a peer that only says that it did it
+            return from_parameter(asked, unit)
+        return from_parameter(wire.decode_parameter(response.payload), unit)
+
+
+def _changes(now: Feedback | None, wanted: Feedback) -> bool:
+    """Whether setting `wanted` changes anything."""
+    return now is None or any(value is not None and value != getattr(now, name) for name, value in vars(wanted).items())

@@ -1,0 +1,59 @@
+"""From the channels of a scan, which are published one by one, to what a `TipJudge` is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from afspm.components.tip_judge import TipJudge, Verdict
+from afspm.model import Scan
+from afspm.units import convert
+
+
+@dataclass(frozen=True)
+class HeightPair:
+    """Trace and, where it is recorded, retrace of one scan."""
+
+    trace: Scan
+    retrace: Scan | None
+
+    def judged_by(self, judge: TipJudge) -> Verdict:
+        """What it tells of the tip.
+
+        Raises:
+            UnitError: the channels are no heights.
+        """
+        retrace = None if self.retrace is None else self.retrace.values * convert(1.0, self.retrace.unit, "m")
+        return judge.judge(self.trace.values * convert(1.0, self.trace.unit, "m"), retrace, self.trace.region)
+
+
+class ChannelPairing:
+    """Collects channels until those of one scan are together.
+
+    Args:
+        channel, retrace_channel: of the heights; the latter empty where it is not recorded.
+    """
+
+    def __init__(self, channel: str, retrace_channel: str) -> None:
+        self._channel, self._retrace_channel = channel, retrace_channel
+        self._seen: dict[str, Scan] = {}
+
+    @property
+    def channels(self) -> tuple[str, str]:
+        return self._channel, self._retrace_channel
+
+    def add(self, scan: Scan) -> HeightPair | None:
+        """One more channel; a pair if it completes one."""
+        if scan.channel not in (self._channel, self._retrace_channel) or not scan.values.size:
+            return None
+        self._seen[scan.channel] = scan
+        trace, retrace = self._seen.get(self._channel), self._seen.get(self._retrace_channel)
+        if trace is None or (self._retrace_channel and (retrace is None or not _belong_together(trace, retrace))):
+            return None
+        self._seen.clear()
+        return HeightPair(trace, retrace)
+
+
+def _belong_together(one: Scan, other: Scan) -> bool:
+    if one.region != other.region or one.shape != other.shape:
+        return False
+    return one.time_ns == other.time_ns or bool(one.filename and one.filename == other.filename)

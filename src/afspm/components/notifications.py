@@ -1,0 +1,171 @@
+"""What people are told outside of the experiment: by a command that is run, by a webhook, tried again if that fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from afspm.errors import AfspmError, ConfigError
+
+END: Final = "end"
+UNSOLVED: Final = "unsolved-problem"
+GIVEN_UP: Final = "given-up"
+CRITICAL: Final = "critical"
+OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL)
+
+TIMEOUT_S = 10.0  # of one try
+FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0
+MOST_TRIES = 12  # half an hour
+MOST_WAITING = 50
+
+Way = Literal["command", "webhook"]
+
+
+class NotDelivered(AfspmError):
+    """Nobody was told, for now."""
+
+
+@dataclass(frozen=True)
+class Notification:
+    """Something that people are to be told.
+
+    Attributes:
+        what: one of OCCASIONS.
+        experiment: its name.
+        run: the folder of the run.
+        time_ns: experiment time.
+        text: for people, a sentence.
+    """
+
+    what: str
+    experiment: str
+    run: str
+    time_ns: int
+    text: str
+    simulated: bool = False
+
+    def body(self) -> bytes:
+        """As JSON: what, experiment, run, time (ISO 8601, UTC), text, simulated."""
+        time = datetime.fromtimestamp(self.time_ns / 1e9, UTC).isoformat()
+        told = {**asdict(self), "time": time}
+        del told["time_ns"]
+        return json.dumps(told, ensure_ascii=False).encode()
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Who is told.
+
+    Attributes:
+        command: program and arguments; it gets the JSON on its standard input.
+        webhook: an address that the JSON is posted to, or "$NAME" of the environment variable that holds it. It may
+            be a secret: no log names more of it than the host.
+        folder: where the command is run.
+    """
+
+    command: Sequence[str] = ()
+    webhook: str = ""
+    folder: str = ""
+
+    @property
+    def ways(self) -> tuple[Way, ...]:
+        """Those that there are."""
+        known: tuple[tuple[Way, object], ...] = (("command", self.command), ("webhook", self.webhook))
+        return tuple(way for way, target in known if target)
+
+    def deliver(self, notice: Notification, way: Way) -> None:
+        """Tell it, once.
+
+        Raises:
+            NotDelivered: it could not be told; a secret is not in the error.
+        """
+        if way == "command":
+            _run(self.command, notice, self.folder)
+        else:
+            _post(address(self.webhook), notice)
+
+
+def address(webhook: str, environment: Mapping[str, str] = os.environ) -> str:
+    """The address that is meant by a webhook of the experiment file.
+
+    Raises:
+        ConfigError: its environment variable is not set, or it is no address; a secret is not in the error.
+    """
+    from urllib.parse import urlsplit
+
+    where = "[notify] webhook"
+    if webhook.startswith("$"):
+        name = webhook[1:]
+        where = f"{where} = {webhook!r}"
+        webhook = environment.get(name, "")
+        if not webhook:
+            raise ConfigError(f"there is no environment variable {name!r}", where=where, hint="set it before the run")
+    try:
+        parts = urlsplit(webhook)
+        valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.username is None
+    except ValueError:
+        valid = False
+    if not valid:
+        raise ConfigError("it is not an address", where=where, hint='as in "https://chat.example.org/hooks/night"')
+    return webhook
+
+
+def _run(command: Sequence[str], notice: Notification, folder: str) -> None:
+    program = Path(command[0]).name  # its arguments may hold a secret
+    environment = {**os.environ, "AFSPM_WHAT": notice.what, "AFSPM_TEXT": notice.text, "AFSPM_RUN": notice.run}
+    try:
+        done = subprocess.run(
+            list(command),
+            input=notice.body(),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            timeout=TIMEOUT_S,
+            env=environment,
+            cwd=folder or None,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise NotDelivered(f"{program} took longer than {TIMEOUT_S:g} s and was ended") from None
+    except OSError as error:
+        raise NotDelivered(f"{program} can't be run: {error.strerror or type(error).__name__}") from None
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        raise NotDelivered(f"{program} ended with {done.returncode}{f': {said[-1][:200]}' if said else ''}")
+
+
+def _post(url: str, notice: Notification) -> None:
+    from http.client import HTTPException
+    from urllib.error import HTTPError, URLError
+    from urllib.parse import urlsplit
+    from urllib.request import Request, urlopen
+
+    host = urlsplit(url).hostname
+    headers = {"Content-Type": "application/json; charset=utf-8", "User-Agent": "afspm"}
+    try:
+        with urlopen(Request(url, notice.body(), headers, method="POST"), timeout=TIMEOUT_S) as answer:
+            answer.read(1000)
+    except HTTPError as error:
+        error.close()
+        raise NotDelivered(f"{host} answers {error.code}") from None
+    except URLError as error:
+        raise NotDelivered(f"{host} can't be reached: {_short(error.reason)}") from None
+    except (OSError, HTTPException, ValueError) as error:
+        raise NotDelivered(f"{host} can't be reached: {_short(error)}") from None
+
+
+def _short(reason: Any) -> str:
+    """Why, without what was asked for."""
+    if isinstance(reason, OSError):
+        return reason.strerror or type(reason).__name__
+    return type(reason).__name__
+
+
+def delay_s(tries: int) -> float:
+    """How long to wait after so many tries that failed, in real time."""
+    return float(min(LONGEST_DELAY_S, FIRST_DELAY_S * 2 ** max(0, tries - 1)))

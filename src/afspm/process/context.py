@@ -1,0 +1,138 @@
+"""What a process of an experiment is to the one that hosts it, and what it is given to run with."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from afspm.clock import Clock
+from afspm.errors import ConfigError, InvalidValue
+from afspm.launch import Launch
+from afspm.model import ProblemNames
+from afspm.transport.port import Port
+
+DEFAULT_LONGEST_STEP_S = 30.0
+
+
+class ProcessActivity:
+    """How long the current step has been running: what tells a busy process from a frozen one.
+
+    Written by the process, read by the thread that sends its heartbeats.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self.since_s: float | None = None
+        self.longest_step_s = DEFAULT_LONGEST_STEP_S
+
+    def step(self) -> AbstractContextManager[None]:
+        """Something is being worked on in this block."""
+        return _Step(self, self._clock)
+
+    def waiting(self) -> AbstractContextManager[None]:
+        """Within a step: this block only waits. The step counts anew afterwards."""
+        return _Waiting(self, self._clock)
+
+    def age_s(self) -> float:
+        """Real seconds since the current step began; 0 when idle."""
+        since_s = self.since_s
+        return 0.0 if since_s is None else max(0.0, self._clock.monotonic_s() - since_s)
+
+
+class _Block:
+    """Classes and no generators: these are around everything that a process does."""
+
+    __slots__ = ("_activity", "_before", "_clock")
+
+    def __init__(self, activity: ProcessActivity, clock: Clock) -> None:
+        self._activity = activity
+        self._clock = clock
+        self._before = activity.since_s
+
+
+class _Step(_Block):
+    __slots__ = ()
+
+    def __enter__(self) -> None:
+        self._activity.since_s = self._clock.monotonic_s()
+
+    def __exit__(self, *_: object) -> None:
+        self._activity.since_s = self._before
+
+
+class _Waiting(_Block):
+    __slots__ = ()
+
+    def __enter__(self) -> None:
+        self._activity.since_s = None
+
+    def __exit__(self, *_: object) -> None:
+        self._activity.since_s = None if self._before is None else self._clock.monotonic_s()
+
+
+def new_session(run: str) -> str:
+    """What tells this life of a process from all others, with the identity of its run (empty: none is known)."""
+    return "-".join(filter(None, [run, os.urandom(4).hex()]))
+
+
+def _never(_: Callable[[], object]) -> None:
+    """Nobody asks a process to stop that has no host."""
+
+
+@dataclass
+class ProcessContext:
+    """What the host gives to a process.
+
+    Attributes:
+        launch: the line that we were started with.
+        clock: the experiment's.
+        open_port: connects to the experiment as a component does (scheduler and translators have sockets of their own).
+        log: records go to the supervisor, and to the log collector if there is one.
+        activity: to be told of steps that take time.
+        when_stopping: registers what is called, from another thread, when the parent has gone or wants us to stop
+            (a port made by `open_port` is told by itself).
+        tip_in_danger: registers what says, then and from another thread, whether there is a tip to see to, which takes
+            longer than an end is given.
+        session: differs between two lives of a process, for ids that must not meet.
+        problems: the problems of the experiment by name.
+
+    Raises:
+        ConfigError: two problems have the same number, say.
+    """
+
+    launch: Launch
+    clock: Clock
+    open_port: Callable[[], Port]
+    log: logging.Logger
+    activity: ProcessActivity
+    when_stopping: Callable[[Callable[[], None]], None] = _never
+    tip_in_danger: Callable[[Callable[[], bool]], None] = _never
+    session: str = "0"
+    problems: ProblemNames = field(init=False)
+
+    def __post_init__(self) -> None:
+        try:
+            self.problems = ProblemNames(self.launch.problems)
+        except InvalidValue as error:
+            raise ConfigError(error.what, where=error.where, hint=error.hint) from error
+
+    @property
+    def name(self) -> str:
+        return self.launch.name
+
+
+@runtime_checkable
+class ExperimentProcess(Protocol):
+    """What the host can run: a component, a scheduler, a translator. It is made with the settings as arguments."""
+
+    def run_process(self, context: ProcessContext) -> int:
+        """Run until done, ended or stopped; returns an `ExitCode`.
+
+        Called on the main thread. To end within a second of a stop it must wait in one poller that
+        `context.when_stopping` (or the port) can wake.
+        """
+        ...

@@ -1,0 +1,83 @@
+"""What a person is told of an exception: what happened, and where in their own code."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from afspm.errors import AfspmError
+
+PACKAGE = Path(__file__).parents[1]  # not resolved: as the paths in tracebacks
+_BELOW_START = 2  # of `python -m`: what Python itself does first
+
+
+def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
+    """An exception in words: its message on the first line, and below it the lines of code that led to it.
+
+    How we came to call somebody's component is left out; where we refused on purpose what it asked for, how we came to
+    do that as well. An error that comes from nobody's code but ours is told whole, unless it is one that we foresaw.
+
+    Args:
+        name: of the component, which whoever reads this knows already.
+        package: the folder of the code that is ours.
+    """
+    trace = traceback.TracebackException.from_exception(error)
+    if isinstance(error, AfspmError) and all(_is_passage(frame, package) for frame in trace.stack):
+        return _words(error, name)  # no code of anybody's: how we came to say so helps nobody to put it right
+    is_chained = False
+    link: traceback.TracebackException | None = trace
+    seen: set[int] = set()
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
+        kept = _kept(link.stack, package, is_foreseen=link is trace and _is_foreseen(error, link.stack, package))
+        link.stack = traceback.StackSummary.from_list(kept)
+        link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
+        is_chained = is_chained or link is not None
+    what = _words(error, name) if isinstance(error, AfspmError) else "".join(trace.format_exception_only()).strip()
+    where = trace.format() if is_chained else trace.stack.format()
+    return "\n".join([what, *"".join(where).rstrip("\n").splitlines()])
+
+
+def where_now(thread_id: int, package: Path = PACKAGE) -> str:
+    """The lines of code that a thread is in just now, those of whoever wrote the component first."""
+    frame = sys._current_frames().get(thread_id)
+    stack = traceback.extract_stack(frame) if frame is not None else []
+    return "".join(traceback.format_list(_kept(stack[_BELOW_START:], package, is_foreseen=False))).rstrip("\n")
+
+
+def _is_foreseen(error: BaseException, frames: Sequence[traceback.FrameSummary], package: Path) -> bool:
+    """Whether we raised it on purpose, for what was asked of us; then its message says all."""
+    last = frames[-1] if frames else None
+    return isinstance(error, AfspmError) or (
+        last is not None and _is_ours(last, package) and (last.line or "").startswith("raise ")
+    )
+
+
+def _words(error: AfspmError, name: str) -> str:
+    said = str(error)
+    return said.removeprefix(f"{name}: ") if name else said
+
+
+def _kept(
+    frames: Iterable[traceback.FrameSummary], package: Path, *, is_foreseen: bool
+) -> list[traceback.FrameSummary]:
+    everything = list(frames)
+    first = next((i for i, frame in enumerate(everything) if not _is_passage(frame, package)), None)
+    if first is None:
+        return everything
+    below = everything[first:]
+    if not is_foreseen:
+        return below
+    last = max(i for i, frame in enumerate(below) if not _is_passage(frame, package))
+    return [frame for frame in below[: last + 1] if not _is_ours(frame, package)]
+
+
+def _is_ours(frame: traceback.FrameSummary, package: Path) -> bool:
+    return frame.filename.startswith("<") or Path(frame.filename).is_relative_to(package)
+
+
+def _is_passage(frame: traceback.FrameSummary, package: Path) -> bool:
+    """Ours, or what Python does between two calls of ours."""
+    return _is_ours(frame, package) or Path(frame.filename).name == "contextlib.py"

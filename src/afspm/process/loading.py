@@ -1,0 +1,88 @@
+"""Makes the object of a launch line: imports its class, and calls it with the settings."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+from typing import Any
+
+from afspm.errors import AfspmError, ConfigError
+from afspm.launch import Launch
+from afspm.process.context import ExperimentProcess
+
+
+def load(launch: Launch) -> ExperimentProcess:
+    """The component, scheduler or translator of a launch line.
+
+    Raises:
+        ConfigError: there is no such class, or it can't be made with these settings. A restart would not help.
+    """
+    class_ = find_class(launch.class_, launch.name)
+    _check_settings(class_, launch)
+    try:
+        plain = getattr(class_, "plain_settings", ())  # tables in which it looks for a `class` by itself
+        made = class_(
+            **{name: value if name in plain else made_of(value, launch.name) for name, value in launch.settings.items()}
+        )
+    except AfspmError as error:
+        where = f"{launch.name}: {error.where}" if error.where else launch.name
+        raise ConfigError(error.what, where=where, hint=error.hint) from error
+    if not isinstance(made, ExperimentProcess):
+        raise ConfigError(
+            f"{launch.class_} can't be run",
+            where=launch.name,
+            hint="derive it from afspm.Component",
+        )
+    return made
+
+
+def made_of(value: Any, where: str) -> Any:
+    """A setting; a table in it with a `class` (an intermediary class of the experiment file) as the object it means."""
+    if isinstance(value, list | tuple):
+        return [made_of(item, where) for item in value]
+    if not isinstance(value, dict):
+        return value
+    inside = {key: made_of(item, where) for key, item in value.items()}
+    path = inside.pop("class", None)
+    if isinstance(path, str):
+        return find_class(path, where)(**inside)
+    return inside if path is None else {"class": path, **inside}
+
+
+def find_class(path: str, where: str) -> type[Any]:
+    """The class "package.module.Name". Raises ConfigError if there is none."""
+    module_name, _, class_name = path.rpartition(".")
+    if not module_name:
+        raise ConfigError(f"{path!r} names no class", where=where, hint='write class = "module.Name"')
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"the class {path} can't be imported: {error}", where=where, hint="is it installed, or on the path?"
+        ) from error
+    class_ = getattr(module, class_name, None)
+    if not isinstance(class_, type):
+        near = difflib.get_close_matches(class_name, vars(module), n=1)
+        raise ConfigError(
+            f"the module {module_name} has no class {class_name}",
+            where=where,
+            hint=f"did you mean {near[0]!r}?" if near else "",
+        )
+    return class_
+
+
+def _check_settings(class_: type[Any], launch: Launch) -> None:
+    """So that a typo is told as one, and a TypeError from within a constructor is not taken for it."""
+    try:
+        signature = inspect.signature(class_)
+        signature.bind(**launch.settings)
+    except ValueError:
+        return  # a class of C code without a signature
+    except TypeError as error:
+        names = [name for name in signature.parameters if name not in ("args", "kwargs")]
+        raise ConfigError(
+            f"{launch.class_} can't be made with these settings: {error}",
+            where=launch.name,
+            hint=f"it takes {', '.join(names) or 'none'}",
+        ) from error

@@ -1,0 +1,91 @@
+"""The bond to the process that started us: its end of our standard input.
+
+It closes when the parent wants us to stop, and when the parent dies, however it dies: on every system.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+
+STDIN = 0
+END_WITHIN_S = 1.5
+TIP_WITHIN_S = 14.0  # with a tip to see to first: its controller may answer slowly, or have to be found again
+_CHUNK = 1 << 16
+
+
+def read_launch_line() -> bytes:
+    """The first line of standard input; empty if it ends before one came.
+
+    Read past Python's own buffering: a thread that waits in that one would block the end of the interpreter.
+    """
+    line = bytearray()
+    while (chunk := os.read(STDIN, _CHUNK)) and b"\n" not in chunk:
+        line += chunk
+    return bytes(line + chunk).partition(b"\n")[0]
+
+
+class ParentWatch:
+    """Watches over the parent. What was registered is called, from another thread, when it has gone or lets us go.
+
+    Should the process not have ended `END_WITHIN_S` later (a handler that computes, a library that hangs), it is ended
+    the hard way, with `code_if_late`; `TIP_WITHIN_S` later, if the tip is in danger then.
+    """
+
+    def __init__(self, code_if_late: int) -> None:
+        self._code = code_if_late
+        self._tip_in_danger: Callable[[], bool] = lambda: False
+        self._callbacks: list[Callable[[], None]] = []
+        self._lock = threading.Lock()
+        self._gone = threading.Event()
+
+    def watch(self) -> None:
+        """Begin; returns at once."""
+        threading.Thread(target=self._watch, name="parent", daemon=True).start()
+
+    @property
+    def gone(self) -> bool:
+        return self._gone.is_set()
+
+    def when_gone(self, callback: Callable[[], None]) -> None:
+        """Register what to call: at once, if the parent has gone already."""
+        with self._lock:
+            self._callbacks.append(callback)
+            gone = self.gone
+        if gone:
+            callback()
+
+    def tip_in_danger(self, whether: Callable[[], bool]) -> None:
+        """Register what says so; it is called once, from another thread."""
+        self._tip_in_danger = whether
+
+    def let_go(self) -> None:
+        """Behave as if the parent had gone. May be called from a signal handler."""
+        threading.Thread(target=self._went, name="let-go", daemon=True).start()
+
+    def _watch(self) -> None:
+        try:
+            while os.read(STDIN, _CHUNK):
+                pass  # nothing more is said to us; it is only held open
+        except OSError:
+            pass
+        self._went()
+
+    def _went(self) -> None:
+        with self._lock:
+            if self.gone:
+                return
+            self._gone.set()
+            callbacks = tuple(self._callbacks)
+        end_within(TIP_WITHIN_S if self._tip_in_danger() else END_WITHIN_S, self._code)
+        for callback in callbacks:
+            callback()
+
+
+def end_within(seconds: float, code: int) -> None:
+    """End the process with `code` in `seconds`, whatever it is doing then."""
+    # a thread of its own and not a signal: there is no alarm on Windows
+    timer = threading.Timer(seconds, os._exit, (code,))
+    timer.daemon = True
+    timer.start()

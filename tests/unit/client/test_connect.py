@@ -1,0 +1,92 @@
+"""Joining a run: which one is meant, and what is left behind where it fails."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+import afspm
+from afspm.client import connect
+from afspm.client.connect import GUEST, find_run, guest_facts
+from afspm.clock import Clock, ExperimentClock
+from afspm.errors import FileError
+from afspm.launch import Launch, Sockets
+from afspm.transport.port import ControlConnected, Incoming
+
+
+class Port:
+    """Brings one thing, or is interrupted."""
+
+    def __init__(self, brings: Incoming | None) -> None:
+        self.clock: Clock = ExperimentClock.real()
+        self.is_closed = False
+        self._brings = brings
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        pass
+
+    def poll(self, timeout_s: float | None) -> list[Incoming]:
+        if self._brings is None:
+            raise KeyboardInterrupt
+        return [self._brings]
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def run_folder(runs: Path, name: str, origin_s: float = 0.0) -> Path:
+    folder = runs / name
+    (folder / "state").mkdir(parents=True)
+    launch = Launch("scheduler", sockets=Sockets(subscribe=("tcp://127.0.0.1:1",), control="tcp://127.0.0.1:2"))
+    facts = {"name": "night", "clock": {"origin_s": origin_s}, GUEST: guest_facts(launch)}
+    (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("damaged", ["{", "[]", ""])
+def test_an_old_run_that_is_damaged_does_not_hide_the_newest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damaged: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    runs = tmp_path / "runs"
+    run_folder(runs, "night-1", 1.0)
+    run_folder(runs, "night-2", 2.0)
+    (runs / "night-0").mkdir()
+    (runs / "night-0" / "run.json").write_text(damaged, encoding="utf-8")
+    file = tmp_path / "night.toml"
+    file.write_text("", encoding="utf-8")
+    assert find_run(file).name == "night-2"
+
+
+def test_a_run_is_found_by_a_file_that_begins_as_editors_of_windows_let_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_folder(tmp_path / "runs", "night-1")
+    file = tmp_path / "other.toml"
+    file.write_text('name = "night"\n', encoding="utf-8-sig")
+    assert find_run(file).name == "night-1"
+
+
+def test_who_is_interrupted_while_joining_leaves_no_connection_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = Port(None)
+    monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
+    with pytest.raises(KeyboardInterrupt):
+        afspm.connect(run_folder(tmp_path, "night"))
+    assert port.is_closed
+
+
+def test_who_can_not_read_what_it_kept_leaves_no_connection_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port, folder = Port(ControlConnected()), run_folder(tmp_path, "night")
+    monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
+    (folder / "state" / "notebook.scope.json").write_text("nonsense", encoding="utf-8")
+    with pytest.raises(FileError):
+        afspm.connect(folder)
+    assert port.is_closed

@@ -1,0 +1,725 @@
+"""Scope, over a scheduler that decides by the real table and a microscope in memory."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from runtime_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
+
+from afspm import model, wire
+from afspm.client.link import ExperimentLink
+from afspm.client.scope import Scope
+from afspm.errors import ControlLost, ExperimentEnded, InvalidValue, NoResponse, Refused, UnitError
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Problem,
+    Region,
+    Response,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+)
+from afspm.process.stopping import StopRequested
+
+TIP = Problem.TIP_SHAPE_CHANGED
+
+
+def test_a_scan_comes_with_all_channels_at_the_place_that_was_asked_for(lab: Lab, scope: Scope) -> None:
+    scans = scope.scan(REGION, shape=(4, 6))
+    assert list(scans) == ["Height", "Phase"]
+    assert scans.region == REGION
+    assert scans.first.shape == (4, 6)
+    assert scans.interruptions == ()
+
+
+def test_control_is_asked_for_by_itself_and_given_back(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    assert lab.control.holder is None
+    assert lab.count(ControlRequest.REQUEST_CTRL) == lab.count(ControlRequest.RELEASE_CTRL) == 1
+
+
+def test_an_explicit_block_keeps_control_over_several_calls(lab: Lab, scope: Scope) -> None:
+    with scope.control():
+        scope.scan(REGION)
+        assert lab.control.holder == lab.name
+        assert scope.in_control
+        scope.scan(OTHER_REGION)
+    assert lab.control.holder is None
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 1
+
+
+def test_the_region_is_set_only_when_it_differs(lab: Lab, scope: Scope) -> None:
+    for _ in range(3):
+        scope.scan(REGION, shape=(8, 8))
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 1
+    scope.scan(OTHER_REGION)
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 2
+
+
+def test_a_region_in_sample_coordinates_is_set_each_time(lab: Lab, scope: Scope) -> None:
+    region = model.Region((0.0, 0.0), (1e-6, 1e-6), frame=model.Frame.SAMPLE)
+    scope.scan(region)
+    scope.scan(region)
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 2
+
+
+def test_a_controller_that_rounds_is_not_set_again_and_again(lab: Lab, scope: Scope) -> None:
+    coarse = model.Region((1e-9, 0.0), (1e-6, 1e-6))
+    publish = lab._move
+    lab._move = lambda thing: publish(model.ScanParameters(coarse, (8, 8)))  # type: ignore[method-assign]
+    scope.scan(REGION)
+    scope.scan(REGION)
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 1
+
+
+def test_a_problem_interrupts_and_the_scan_is_taken_when_it_is_cleared(lab: Lab, scope: Scope) -> None:
+    lab.at(30.0, lambda: lab.flag(TIP))
+    lab.at(500.0, lambda: lab.clear(TIP))
+    scans = scope.scan(REGION)
+    assert lab.clock.passed_s == pytest.approx(500.0 + SCAN_S, abs=5.0)
+    assert len(scans.interruptions) == 1
+    assert "tip-shape-changed" in scans.interruptions[0]
+    assert lab.begun_scans == 2
+
+
+def test_manual_mode_interrupts_and_says_so(lab: Lab, scope: Scope) -> None:
+    lab.at(30.0, lambda: lab.set_mode(ControlMode.MANUAL))
+    lab.at(60.0, lambda: lab.set_mode(ControlMode.AUTOMATED))
+    scans = scope.scan(REGION)
+    assert "MANUAL" in scans.interruptions[0]
+
+
+def test_a_scan_asked_for_while_a_problem_is_flagged_waits_without_asking_again_and_again(
+    lab: Lab, scope: Scope
+) -> None:
+    lab.flag(TIP)
+    lab.at(3600.0, lambda: lab.clear(TIP))
+    scans = scope.scan(REGION)
+    assert scans.interruptions == ()
+    # once at the beginning, once at the end, and now and then in between should a message have been lost
+    assert lab.count(ControlRequest.REQUEST_CTRL) <= 2 + 3600.0 / 10.0
+
+
+def test_another_solver_in_control_is_waited_for(lab: Lab, scope: Scope) -> None:
+    from afspm.logic.arbitration import ControlEvent
+
+    lab.does(ControlEvent.REQUEST_CONTROL, "other")
+    lab.at(7.0, lambda: lab.does(ControlEvent.RELEASE_CONTROL, "other"))
+    scope.scan(REGION)
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 2
+
+
+def test_the_region_is_set_again_after_somebody_else_has_moved_the_tip(lab: Lab, scope: Scope) -> None:
+    def repair() -> None:
+        lab.parameters = model.ScanParameters(OTHER_REGION, (8, 8))
+        lab.publish(lab.parameters)
+        lab.clear(TIP)
+
+    lab.at(30.0, lambda: lab.flag(TIP))
+    lab.at(60.0, repair)
+    assert scope.scan(REGION).region == REGION
+
+
+def test_a_translator_that_starts_anew_in_the_middle_costs_one_attempt(lab: Lab, scope: Scope) -> None:
+    lab.at(50.0, lab.restart_translator)
+    scans = scope.scan(REGION)
+    assert lab.begun_scans == 2
+    assert "started anew" in scans.interruptions[0]
+
+
+def test_a_scan_that_was_accepted_and_never_begins_is_asked_for_anew(lab: Lab, scope: Scope) -> None:
+    swallowed = []
+
+    def swallow(request: model.Request) -> Response | str:
+        if request.subject == "start-scan" and not swallowed:
+            swallowed.append(request.id)
+            return Response(ControlResponse.SUCCESS)
+        return "go on"
+
+    lab.intercept = swallow
+    scope.scan(REGION)
+    ids = [request.id for request in lab.requests if request.subject == "start-scan"]
+    assert len(set(ids)) == 2
+
+
+def test_a_scan_of_the_shape_that_was_asked_for_is_the_one_even_without_values(lab: Lab, scope: Scope) -> None:
+    """Of a translator that tells what was taken and leaves the values in its files."""
+
+    def publish(region: Region, shape: tuple[int, int] = (8, 8)) -> None:
+        lab.publish(Scan(region, "Height", "m", np.empty((0, 0)), lab.clock.now_ns(), "a.dat", shape))
+
+    lab.publish_scan = publish  # type: ignore[method-assign]
+    scans = scope.scan(REGION, shape=(8, 8))
+    assert (scans.first.shape, scans.first.values.size, scans.first.filename) == ((8, 8), 0, "a.dat")
+    assert lab.begun_scans == 1
+
+
+def test_channels_that_got_lost_with_the_translator_are_noticed(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+
+    def die_while_publishing() -> None:
+        lab.publish(Scan(REGION, "Height", "m", np.zeros((8, 8)), lab.clock.now_ns()))
+        lab.restart_translator()
+
+    lab.at(50.0, die_while_publishing)
+    scans = scope.scan(REGION)
+    assert list(scans) == ["Height", "Phase"]
+    assert "without Phase" in scans.interruptions[0]
+
+
+def test_a_channel_that_is_switched_off_costs_one_scan_and_no_more(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    lab.channels = ("Height",)
+    assert list(scope.scan(REGION)) == ["Height"]
+    scope.scan(REGION)
+    assert lab.begun_scans == 4
+
+
+def test_a_scan_that_somebody_stops_again_and_again_is_given_up(lab: Lab, scope: Scope) -> None:
+    for i in range(20):
+        lab.at(50.0 * (i + 1), lab.stop)
+    with pytest.raises(NoResponse, match="failed 5 times"):
+        scope.scan(REGION)
+
+
+def test_what_was_published_before_is_not_taken_for_the_scan(lab: Lab, scope: Scope) -> None:
+    lab.publish_scan(OTHER_REGION)
+    lab.publish(ScopeStatus(ScopeState.FREE))
+    assert scope.scan(REGION).region == REGION
+
+
+def test_a_scan_whose_beginning_was_lost_with_the_connection_is_recognised(lab: Lab, scope: Scope) -> None:
+    lose = lab._go
+
+    def without_busy(state: ScopeState) -> None:
+        if state is ScopeState.SCANNING:
+            lab.state = state
+        else:
+            lose(state)
+
+    lab._go = without_busy  # type: ignore[method-assign]
+    lab.at(2.0, lambda: lab.publish_scan(REGION))
+    lab.at(2.1, lambda: lose(ScopeState.FREE))
+    scope.scan(REGION)
+    assert lab.begun_scans == 1
+
+
+def test_a_notebook_shows_how_it_is(lab: Lab, scope: Scope) -> None:
+    with scope.control():
+        name = scope.control_state.holder
+        assert repr(scope) == f"<Scope {name!r}: FREE, AUTOMATED, {name} is in control>"
+    lab.flag(Problem.TIP_SHAPE_CHANGED)
+    assert scope.control_state.problems
+    assert "nobody is in control, tip-shape-changed is flagged" in repr(scope)
+    assert "'tip-shape-changed': 1" in repr(scope.problems)
+
+
+def test_a_refusal_is_raised_with_its_reason(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: (
+        Response(ControlResponse.PARAM_ERROR, reason="the limit of scan-size-x is 1 um")
+        if request.kind == ControlRequest.SET_SCAN_PARAMS
+        else "go on"
+    )
+    with pytest.raises(Refused, match="limit of scan-size-x") as caught:
+        scope.scan(REGION)
+    assert caught.value.response == ControlResponse.PARAM_ERROR
+    assert lab.control.holder is None
+
+
+def test_a_microscope_that_is_busy_is_waited_for(lab: Lab, scope: Scope) -> None:
+    lab.state = ScopeState.BUSY_PARAM
+    lab.at(12.0, lambda: lab._go(ScopeState.FREE))
+    scope.scan(REGION)
+    assert lab.begun_scans == 1
+    assert lab.clock.passed_s > 12.0 + SCAN_S
+    assert lab.count(ControlRequest.SET_SCAN_PARAMS) <= 4, "asked when it is free, not again and again"
+
+
+def test_a_lost_answer_repeats_the_request_with_its_id_and_executes_it_once(lab: Lab, scope: Scope) -> None:
+    lost: list[str] = []
+
+    def lose_first(request: model.Request) -> Response | str | None:
+        if request.subject == "start-scan" and not lost:
+            lost.append(request.id)
+            lab._answer_once(request)
+            return None
+        return "go on"
+
+    lab.intercept = lose_first
+    scope.scan(REGION)
+    starts = [request.id for request in lab.requests if request.subject == "start-scan"]
+    assert len(starts) == 2
+    assert len(set(starts)) == 1
+    assert lab.begun_scans == 1
+
+
+def test_a_scan_that_went_on_unheard_while_control_was_lost_is_not_taken_again(lab: Lab, scope: Scope) -> None:
+    lab.begin_unheard(REGION, in_s=20.0)
+    lab.at(5.0, lambda: lab.flag(TIP))
+    lab.at(40.0, lambda: lab.clear(TIP))
+    scope.scan(REGION, shape=(8, 8))
+    assert lab.begun_scans == 1
+    assert len({request.id for request in lab.requests if request.subject == "start-scan"}) == 1
+
+
+def test_a_scan_that_never_began_before_control_was_lost_is_asked_for_with_the_same_id(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: (
+        Response(ControlResponse.NO_RESPONSE)
+        if request.subject == "start-scan" and lab.clock.passed_s < 20.0
+        else "go on"
+    )
+    lab.at(5.0, lambda: lab.flag(TIP))
+    lab.at(40.0, lambda: lab.clear(TIP))
+    scope.scan(REGION, shape=(8, 8))
+    assert lab.begun_scans == 1
+    assert len({request.id for request in lab.requests if request.subject == "start-scan"}) == 1
+
+
+def test_a_scan_of_somebody_else_while_control_was_lost_is_not_ours(lab: Lab, scope: Scope) -> None:
+    lab.begin_unheard(OTHER_REGION, in_s=20.0)  # a test scan of the repair; ours was begun and is lost
+    lab.at(5.0, lambda: lab.flag(TIP))
+    lab.at(40.0, lambda: lab.clear(TIP))
+    assert scope.scan(REGION, shape=(8, 8)).region == REGION
+    assert lab.begun_scans == 2
+
+
+def test_a_translator_that_is_silent_for_a_while_is_asked_with_the_same_id(lab: Lab, scope: Scope) -> None:
+    def silent(request: model.Request) -> Response | str:
+        late = lab.clock.passed_s < 20.0 and request.kind == ControlRequest.SET_SCAN_PARAMS
+        return Response(ControlResponse.NO_RESPONSE) if late else "go on"
+
+    lab.intercept = silent
+    scope.scan(REGION)
+    sets = {request.id for request in lab.requests if request.kind == ControlRequest.SET_SCAN_PARAMS}
+    assert len(sets) == 1
+
+
+def test_a_translator_that_stays_silent_is_told(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: (
+        Response(ControlResponse.NO_RESPONSE) if request.kind == ControlRequest.PARAM else "go on"
+    )
+    with pytest.raises(NoResponse, match="does not answer"):
+        scope.set("tip-bias-voltage", 1.0)
+
+
+def test_what_the_scheduler_says_of_a_slow_translator_is_heard_before_it_is_asked_again(lab: Lab, scope: Scope) -> None:
+    done_s = lab.clock.passed_s + 25.0
+    unanswered: set[float] = set()
+
+    def slow(request: model.Request) -> str | None:
+        if request.subject != "x-pulse":
+            return "go on"
+        assert not unanswered, "asked again too soon"
+        asked_s, left_s = lab.clock.passed_s, done_s - lab.clock.passed_s
+        unanswered.add(asked_s)
+        code = ControlResponse.SUCCESS if left_s < 5.0 else ControlResponse.NO_RESPONSE
+
+        def answer() -> None:
+            unanswered.remove(asked_s)
+            lab.answer_now(Response(code, id=request.id))
+
+        lab.at(min(left_s, 5.0) + 0.01, answer)
+        return None
+
+    lab.intercept = slow
+    scope.action("x-pulse")
+    assert lab.clock.passed_s == pytest.approx(done_s, abs=0.1)
+
+
+def test_a_scheduler_that_never_answers_is_told(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: None
+    with pytest.raises(NoResponse, match="asked 4 times"):
+        scope.flag(TIP)
+
+
+def test_a_scheduler_that_is_restarted_is_asked_again_with_the_same_id(lab: Lab, scope: Scope) -> None:
+    down: list[str] = []
+
+    def dies(request: model.Request) -> str | None:
+        if request.kind == ControlRequest.ADD_EXP_PRBLM and not down:
+            down.append(request.id)
+            lab.at(0.1, lab.disconnect)
+            lab.at(90.0, lab.connect)
+            return None
+        return "go on"
+
+    lab.intercept = dies
+    scope.flag(TIP)
+    assert [request.id for request in lab.requests] == down * 2
+    assert 90.0 < lab.clock.passed_s < 92.0
+    assert TIP in lab.control.problems
+
+
+def test_the_answer_to_an_earlier_request_is_not_taken_for_this_ones(lab: Lab, scope: Scope) -> None:
+    from afspm.transport.port import ReplyReceived
+
+    late = Response(ControlResponse.FAILURE, reason="of another", id="experiment/0/other")
+    lab.intercept = lambda request: (lab._inbox.append(ReplyReceived(late)), "go on")[1]
+    scope.flag(TIP)
+
+
+def test_a_version_1_scheduler_is_never_asked_twice_for_an_action(lab: Lab, scope: Scope) -> None:
+    """It knows no ids: it would execute the action twice."""
+    from afspm.transport.port import ReplyReceived
+
+    def version_1(request: model.Request) -> None:
+        if request.subject != "x-pulse":
+            code = lab._answer(request).code
+            lab.at(0.01, lambda: lab._inbox.append(ReplyReceived(Response(code))))
+
+    lab.intercept = version_1
+    with pytest.raises(NoResponse, match="asked 1 times"):
+        scope.action("x-pulse")
+    assert sum(request.subject == "x-pulse" for request in lab.requests) == 1
+
+
+def test_a_version_1_scheduler_is_asked_to_clear_only_what_is_flagged(lab: Lab, scope: Scope) -> None:
+    """It ends over clearing a problem that is not set."""
+    lab.echoes_ids = False
+    scope.clear(TIP)
+    scope.flag(TIP)
+    scope.clear(TIP)
+    scope.clear(TIP)
+    assert lab.count(ControlRequest.RMV_EXP_PRBLM) == 1
+    assert not lab.control.problems
+
+
+def test_a_scheduler_of_ours_is_asked_to_clear_what_may_be_flagged_unheard(lab: Lab, scope: Scope) -> None:
+    scope.flag(Problem.THERMAL_DRIFT)
+    scope.clear(TIP)
+    assert lab.count(ControlRequest.RMV_EXP_PRBLM) == 1
+
+
+def test_that_the_microscope_tells_no_state_is_said_once(
+    lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As a translator of version 1 that was there before the scheduler."""
+    lab._inbox = [one for one in lab._inbox if getattr(getattr(one, "packet", None), "envelope", "") != "ScopeStateMsg"]
+    lab.at(20.0, lambda: lab.publish(ScopeStatus(ScopeState.FREE)))
+    scope.set("tip-bias-voltage", "1 V")
+    assert [record.message for record in caplog.records if "has told no state yet" in record.message]
+    assert lab.clock.passed_s == pytest.approx(20.0, abs=1.0)
+
+
+def test_timeouts_are_told_in_words(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(NoResponse, match="not finished in time"):
+        scope.scan(REGION, timeout_s=50.0)
+    lab.stop()
+    lab.flag(TIP)
+    with pytest.raises(ControlLost, match="not given in time"), scope.control(timeout_s=5.0):
+        pass
+    assert lab.clock.passed_s < 60.0
+
+
+def test_all_problems_are_cleared_and_none_that_is_not_flagged(lab: Lab, scope: Scope) -> None:
+    assert scope.clear_all() == ()
+    lab.flag(TIP)
+    lab.flag(4)
+    assert set(scope.clear_all()) == {"tip-shape-changed", "thermal-drift"}
+    assert not lab.control.problems
+
+
+def test_a_solver_gets_control_and_loses_it_when_it_has_solved(lab: Lab, scope: Scope) -> None:
+    lab.flag(TIP)
+    with scope.control(solving="tip-shape-changed"):
+        scope.action("x-pulse")
+        scope.clear("EP_TIP_SHAPE_CHANGED")
+        with pytest.raises(ControlLost, match="nothing to solve"):
+            scope.action("x-pulse")
+    assert lab.control.holder is None
+    assert not lab.control.problems
+
+
+def test_solving_what_is_not_flagged_is_refused_at_once(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(ControlLost, match="not flagged"), scope.control(solving=TIP):
+        pass
+    assert lab.clock.passed_s < 1.0
+
+
+def test_a_solver_that_waits_is_told_when_another_has_solved_it(lab: Lab, scope: Scope) -> None:
+    from afspm.logic.arbitration import ControlEvent
+
+    lab.flag(TIP)
+    lab.does(ControlEvent.REQUEST_CONTROL, "other", TIP)
+    lab.at(5.0, lambda: lab.clear(TIP))
+    with pytest.raises(ControlLost, match="nothing to solve"), scope.control(solving=TIP):
+        pass
+    assert lab.clock.passed_s < 6.0
+
+
+def test_an_error_in_the_block_still_gives_control_back(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(ZeroDivisionError), scope.control():
+        _ = 1 / 0
+    assert lab.control.holder is None
+
+
+def test_an_old_control_state_is_not_taken_for_a_loss(lab: Lab, scope: Scope) -> None:
+    """Control was granted; a state from before that arrives only now."""
+
+    def grant_quietly(request: model.Request) -> Response | str:
+        if request.kind != ControlRequest.REQUEST_CTRL:
+            return "go on"
+        lab.at(0.5, lambda: lab.publish(model.ControlState(ControlMode.AUTOMATED, None, ())))
+        lab.at(0.6, lambda: lab.publish(lab.control.published()))
+        publish, lab.publish = lab.publish, lambda thing, envelope=None: None  # type: ignore[assignment,misc]
+        response = lab._answer(request)
+        lab.publish = publish  # type: ignore[method-assign]
+        return response
+
+    lab.intercept = grant_quietly
+    with scope.control():
+        scope.scan(REGION)
+        assert scope.in_control
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 1
+
+
+def test_changes_that_leave_the_obstacle_are_no_reason_to_ask(lab: Lab, scope: Scope) -> None:
+    lab.flag(TIP)
+    for second in range(1, 9):
+        lab.at(second, lambda second=second: lab.flag(second + 10))  # type: ignore[misc]
+        lab.at(second + 0.5, lambda second=second: lab.clear(second + 10))  # type: ignore[misc]
+    lab.at(9.5, lambda: lab.clear(TIP))
+    scope.scan(REGION)
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 2
+
+
+def test_a_scheduler_that_is_restarted_again_and_again_is_waited_for(lab: Lab, scope: Scope) -> None:
+    lives: list[str] = []
+
+    def dies(request: model.Request) -> str | None:
+        lives.append(request.id)
+        if len(lives) > 8:
+            return "go on"
+        lab.at(0.1, lab.disconnect)
+        lab.at(2.0, lab.connect)
+        return None
+
+    lab.intercept = dies
+    scope.flag(TIP)
+    assert len(set(lives)) == 1
+
+
+def test_a_spectrum_is_taken_where_it_was_asked_for(lab: Lab, scope: Scope) -> None:
+    spectrum = scope.spectrum((2e-7, 3e-7), kind="IV")
+    assert spectrum.position_m == (2e-7, 3e-7)
+    assert lab.values["x-spec-kind"] == "IV"
+    assert lab.control.holder is None
+
+
+def test_a_spectrum_of_another_kind_than_the_last_is_taken_once(lab: Lab, scope: Scope) -> None:
+    assert [scope.spectrum((2e-7, 3e-7), kind=kind).kind for kind in ("IV", "force", "IV")] == ["IV", "force", "IV"]
+    assert len(lab.executed) == 4, "more than the probe's move and three spectra"
+
+
+def test_the_probe_stands_where_it_was_moved_to_when_the_call_returns(lab: Lab, scope: Scope) -> None:
+    scope.move_probe((1e-7, 2e-7))
+    assert scope.probe_position == model.ProbePosition((1e-7, 2e-7))
+    assert scope.state is ScopeState.FREE
+
+
+@pytest.mark.parametrize("shape", [np.array([4, 6]), (np.int64(4), np.int64(6)), [4, 6]])
+def test_a_shape_may_be_of_numpy(lab: Lab, scope: Scope, shape: tuple[int, int]) -> None:
+    assert scope.scan(REGION, shape=shape, key="once").first.shape == (4, 6)
+
+
+def test_after_it_was_closed_a_scope_says_that_it_was(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    scope.close()
+    for call in (lambda: scope.scan(REGION), lambda: scope.state, lambda: next(scope.events())):
+        with pytest.raises(NoResponse, match=r"left, by close\(\)"):
+            call()
+
+
+def test_a_place_may_be_an_array(lab: Lab, scope: Scope) -> None:
+    place = np.array([2e-7, 3e-7])
+    scope.move_probe(place)  # type: ignore[arg-type]
+    assert scope.spectrum(place).position_m == (2e-7, 3e-7)  # type: ignore[arg-type]
+
+
+def test_what_is_no_place_region_or_time_is_told_with_what_would_be_right(lab: Lab, scope: Scope) -> None:
+    for wrong, hint in (
+        (lambda: scope.spectrum(0), "(1e-7, 0)"),  # type: ignore[arg-type]
+        (lambda: scope.move_probe((0.0, 0.0, 0.0)), "(1e-7, 0)"),  # type: ignore[arg-type]
+        (lambda: scope.scan(1e-6), "Region("),  # type: ignore[arg-type]
+        (lambda: scope.sleep("1 min"), "seconds"),  # type: ignore[arg-type]
+        (lambda: scope.sleep(math.nan), "seconds"),
+    ):
+        with pytest.raises(InvalidValue) as refused:
+            wrong()
+        assert hint in refused.value.hint
+    assert lab.executed == []
+
+
+def test_parameters_have_units_both_ways(lab: Lab, scope: Scope) -> None:
+    assert scope.set("tip-bias-voltage", 250.0, "mV") == pytest.approx(250.0)
+    assert scope.get("tip-bias-voltage", "mV") == pytest.approx(250.0e3)  # the laboratory told V
+    assert scope.set("tip-bias-voltage", "1.5 V") == 1.5
+    assert scope.get("tip-bias-voltage") == 1.5
+
+
+def test_a_unit_of_another_kind_is_refused(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(UnitError):
+        scope.get("tip-bias-voltage", "nm")
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_number_that_is_none_is_not_even_sent(lab: Lab, scope: Scope, value: float) -> None:
+    with pytest.raises(InvalidValue):
+        scope.set("tip-bias-voltage", value)
+    assert not any(request.kind == ControlRequest.PARAM for request in lab.requests)
+
+
+def test_switches_and_words_are_set_too(lab: Lab, scope: Scope) -> None:
+    assert scope.set("x-light", True, "") is True
+    assert lab.values["x-light"] == "true"
+    assert scope.set("x-mode", "tapping", "") == "tapping"
+    assert scope.set("x-count", np.float64(3.0), "") == 3.0
+    assert lab.values["x-count"] == "3.0"
+
+
+def test_reading_needs_no_control(lab: Lab, scope: Scope) -> None:
+    lab.flag(TIP)
+    assert scope.get("tip-bias-voltage") == 0.5
+    assert scope.supports("x-pulse")
+    assert not scope.supports("x-crash")
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 0
+
+
+def test_a_version_1_scheduler_tells_values_only_in_control(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: (
+        Response(ControlResponse.NOT_IN_CONTROL)
+        if request.kind == ControlRequest.PARAM and lab.control.holder != lab.name
+        else "go on"
+    )
+    assert scope.get("tip-bias-voltage") == 0.5
+
+
+def test_feedback_is_known_once_it_is_set(lab: Lab, scope: Scope) -> None:
+    scope.set_feedback(on=False, setpoint=2.0)
+    assert scope.feedback == model.Feedback(on=False, setpoint=2.0)
+
+
+def test_mode_and_problems_are_seen(lab: Lab, scope: Scope) -> None:
+    scope.flag(TIP)
+    scope.set_mode(ControlMode.MANUAL)
+    assert scope.mode is ControlMode.MANUAL
+    assert scope.control_state.problems == (TIP,)
+
+
+def test_the_end_of_the_experiment_ends_every_call(lab: Lab, scope: Scope) -> None:
+    lab.at(30.0, lab.kill)
+    with pytest.raises(ExperimentEnded):
+        scope.scan(REGION)
+    with pytest.raises(ExperimentEnded):
+        scope.get("tip-bias-voltage")
+
+
+def test_a_stop_goes_through_a_script_that_catches_everything(lab: Lab, scope: Scope) -> None:
+    lab.at(30.0, lab.parent_goes)
+
+    def script() -> None:
+        try:
+            scope.scan(REGION)
+        except Exception:
+            pytest.fail("a script would have gone on")
+
+    with pytest.raises(StopRequested):
+        script()
+    assert lab.requests[-1].kind == ControlRequest.RELEASE_CTRL
+
+
+def test_events_are_iterated_over_and_none_is_lost_in_the_body(lab: Lab, scope: Scope) -> None:
+    seen = []
+    lab.at(1.0, lambda: lab.publish_scan(REGION))
+    with scope.events("Scan2d", timeout_s=500.0) as events:
+        for event in events:
+            assert isinstance(event.message, Scan)
+            seen.append((event.message.region, event.message.channel))
+            if len(seen) == 1:
+                scope.scan(OTHER_REGION)
+    assert seen == [(region, channel) for region in (REGION, OTHER_REGION) for channel in ("Height", "Phase")]
+
+
+def test_the_end_of_the_experiment_ends_an_iteration(lab: Lab, scope: Scope) -> None:
+    lab.at(5.0, lab.kill)
+    assert [event.envelope for event in scope.events("Scan2d")] == []
+
+
+def test_waiting_until_something_is_so(lab: Lab, scope: Scope) -> None:
+    lab.at(40.0, lambda: lab.flag(TIP))
+    assert scope.wait_until(lambda: TIP in scope.control_state.problems, timeout_s=100.0)
+    assert 40.0 <= lab.clock.passed_s < 41.0
+    assert not scope.wait_until(lambda: False, timeout_s=5.0)
+
+
+def test_sleeping_passes_the_time_of_the_experiment(lab: Lab, scope: Scope) -> None:
+    scope.sleep(900.0)
+    assert lab.clock.passed_s == pytest.approx(900.0)
+
+
+def test_a_microscope_that_says_nothing_of_itself_can_still_be_asked() -> None:
+    lab = Lab()
+    lab._inbox = lab._inbox[:1]  # connected, and neither states nor the end of the replay: a scheduler of version 1
+    scope = Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE))
+    assert scope.scan(REGION).region == REGION
+
+
+def test_control_that_is_lost_while_the_microscope_is_silent_is_waited_for(lab: Lab, scope: Scope) -> None:
+    """Then the answer is never coming: nobody asks for somebody who is not in control."""
+    lab.intercept = lambda request: (
+        Response(ControlResponse.NO_RESPONSE)
+        if request.subject == "start-scan" and lab.clock.passed_s < 300.0
+        else "go on"
+    )
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(400.0, lambda: lab.clear(TIP))
+    scope.scan(REGION)
+    assert lab.begun_scans == 1
+
+
+def test_an_action_whose_answer_and_control_were_lost_is_not_done_twice(lab: Lab, scope: Scope) -> None:
+    done: list[str] = []
+
+    def silent(request: model.Request) -> Response | str:
+        if request.subject != "x-pulse":
+            return "go on"
+        if not done:
+            lab._answer_once(request)
+            lab.flag(TIP)
+            lab.at(30.0, lambda: lab.clear(TIP))
+        done.append(request.id)
+        return Response(ControlResponse.NO_RESPONSE) if lab.clock.passed_s < 20.0 else "go on"
+
+    lab.intercept = silent
+    scope.action("x-pulse")
+    assert len(set(done)) == 1
+    assert lab.executed.count(done[0]) == 1
+
+
+def test_a_scan_that_is_seen_to_begin_needs_no_answer(lab: Lab, scope: Scope) -> None:
+    """A translator of version 1 whose answer was lost: the scheduler can't ask it again."""
+
+    def lost(request: model.Request) -> Response | str:
+        if request.subject != "start-scan":
+            return "go on"
+        lab._answer_once(request)
+        return Response(ControlResponse.NO_RESPONSE, reason="outcome unknown")
+
+    lab.intercept = lost
+    assert scope.scan(REGION).region == REGION
+    assert lab.begun_scans == 1
+
+
+def test_of_progress_told_in_a_tight_loop_a_few_wait_and_the_newest_arrives(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    for done in range(10_000):
+        scope.progress(done, 10_000)
+    assert lab.count(model.TELL_REQUEST) == 4
+    scope.sleep(1.0)
+    told = [request.subject for request in lab.requests if request.kind == model.TELL_REQUEST]
+    assert len(told) == 5
+    assert wire.decode(told[-1].message, told[-1].payload).done == 9_999
