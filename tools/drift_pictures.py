@@ -145,7 +145,7 @@ def shear() -> Figure:
     at_m = np.zeros(2)
     down = taken(world, (0.0, 0.0), up.end_s + 2.0, 1e-6, direction="down")
     from afspm.drift.shear import velocity_from_up_down
-    from afspm.model.undistort import undistorted
+    from afspm.model.drift_removal import undistorted
 
     told = velocity_from_up_down(up, down, estimator())
     v = (float(told.velocity_m_s[0]), float(told.velocity_m_s[1]))

@@ -90,7 +90,7 @@ _SHARED = struct.Struct(f"<{2 + _MOST_LATE}q")  # real time, experiment time the
 _CHECKSUM = struct.Struct("<I")
 
 
-class WaitingTime:
+class SharedSimulationTime:
     """The time of a simulated run, which waits for those who are late; shared by its processes in a small file.
 
     Since a moment of real time it has gone at the speed of real time until another, and at full speed from then on. Who
@@ -153,10 +153,10 @@ def _shared_bytes(real_ns: int, shown_ns: int, *until_ns: int) -> bytes:
     return told + _CHECKSUM.pack(zlib.crc32(told))
 
 
-def _waiting_in(path: str | None) -> WaitingTime | None:
+def _waiting_in(path: str | None) -> SharedSimulationTime | None:
     """Return the time that is shared in a file; None where that is gone with its run, or was cut off."""
     try:
-        return WaitingTime(Path(path)) if path else None
+        return SharedSimulationTime(Path(path)) if path else None
     except (OSError, ValueError):
         return None
 
@@ -178,7 +178,7 @@ class ExperimentClock:
     start_s: float = 0.0
     speed: float = 1.0
     _wall_at_zero_s: float = field(default_factory=_anchor_s, repr=False, compare=False)
-    _waiting: WaitingTime | None = field(default=None, repr=False, compare=False)
+    _waiting: SharedSimulationTime | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def real(cls) -> ExperimentClock:
@@ -228,7 +228,7 @@ class ExperimentClock:
         if self.speed <= 1.0 or self._waiting is not None:
             return self
         path.write_bytes(_shared_bytes(time.monotonic_ns(), self.now_ns(), *[0] * _MOST_LATE))
-        return replace(self, _waiting=WaitingTime(path))
+        return replace(self, _waiting=SharedSimulationTime(path))
 
     def late(self) -> AbstractContextManager[None]:
         """Let the experiment's time go no faster than real time in the block, at most for `LONGEST_LATE_S`.

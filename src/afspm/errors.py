@@ -46,10 +46,10 @@ class ConfigErrors(ConfigError):
         self.errors = tuple(errors)
 
 
-class Gathered:
+class ErrorCollector:
     """Errors that are raised together at the end, so that whoever mends one hears of all::
 
-        errors = Gathered()
+        errors = ErrorCollector()
         for name in names:
             with errors:
                 check(name)
@@ -62,7 +62,7 @@ class Gathered:
         self.errors: list[AfspmError] = []
 
     def add(self, error: AfspmError) -> None:
-        self.errors += each(error)
+        self.errors += individual_errors(error)
 
     def __enter__(self) -> None:
         return None
@@ -79,7 +79,7 @@ class Gathered:
             raise self.errors[0] if len(self.errors) == 1 else ConfigErrors(self.errors)
 
 
-def each(error: AfspmError) -> tuple[AfspmError, ...]:
+def individual_errors(error: AfspmError) -> tuple[AfspmError, ...]:
     """The errors that one stands for: those that it gathers, or itself."""
     return error.errors if isinstance(error, ConfigErrors) else (error,)
 

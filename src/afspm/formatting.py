@@ -14,7 +14,7 @@ PREFIXABLE = frozenset({"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "
 _LENGTHS = ((1e-3, "mm"), (1e-6, "um"), (1e-9, "nm"), (1e-12, "pm"))
 
 
-def lasting(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """A duration, as exactly as it matters.
 
     >>> [lasting(s) for s in (8.2, 200, 725, 7500, 300_000)]
@@ -34,7 +34,7 @@ def lasting(seconds: float) -> str:
     return f"{hours // 24} d {hours % 24} h"
 
 
-def lengths(values_m: Sequence[float], joined: str = ", ") -> str:
+def lengths_text(values_m: Sequence[float], joined: str = ", ") -> str:
     """Lengths in the unit that suits the largest of them, as they may be written in an experiment file, too.
 
     >>> lengths([5e-7, 2.5e-7], " x ")
@@ -45,22 +45,22 @@ def lengths(values_m: Sequence[float], joined: str = ", ") -> str:
     return joined.join(f"{value_m / unit_m:.5g}" for value_m in values_m) + f" {unit}"
 
 
-def area(size_m: Sequence[float]) -> str:
+def area_text(size_m: Sequence[float]) -> str:
     """(width, height) of a region.
 
     >>> area((2e-6, 1e-6))
     '2 x 1 um'
     """
-    return lengths(size_m, " x ")
+    return lengths_text(size_m, " x ")
 
 
-def place(xy_m: tuple[float, float]) -> str:
+def position_text(xy_m: tuple[float, float]) -> str:
     """(x, y).
 
     >>> place((1.2e-6, -5e-7))
     '(1.2, -0.5) um'
     """
-    numbers, unit = lengths(xy_m).rsplit(" ", 1)
+    numbers, unit = lengths_text(xy_m).rsplit(" ", 1)
     return f"({numbers}) {unit}"
 
 
@@ -88,7 +88,7 @@ def day(time_ns: int, zone: tzinfo | None = None) -> str:
     return f"{_moment(time_ns, zone):%Y-%m-%d}"
 
 
-def from_to(begin_ns: int, end_ns: int, zone: tzinfo | None = None) -> str:
+def period_text(begin_ns: int, end_ns: int, zone: tzinfo | None = None) -> str:
     """ "2026-11-20 22:04 to 23:10 UTC"; the day of the end where it is another."""
     same = day(begin_ns, zone) == day(end_ns, zone)
     until = (

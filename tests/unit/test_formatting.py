@@ -32,7 +32,7 @@ HOUR_NS = 3600 * NS_PER_S
     ],
 )
 def test_durations_are_told_as_exactly_as_it_matters(seconds: float, told: str) -> None:
-    assert formatting.lasting(seconds) == told
+    assert formatting.duration_text(seconds) == told
 
 
 @pytest.mark.parametrize(
@@ -47,12 +47,12 @@ def test_durations_are_told_as_exactly_as_it_matters(seconds: float, told: str) 
     ],
 )
 def test_lengths_are_in_the_unit_of_the_largest(values_m: tuple[float, ...], told: str) -> None:
-    assert formatting.lengths(values_m) == told
+    assert formatting.lengths_text(values_m) == told
 
 
 def test_areas_and_places_and_the_same_for_pages() -> None:
-    assert formatting.area((2e-6, 1e-6)) == "2 x 1 um"
-    assert formatting.place((1.2e-6, -5e-7)) == "(1.2, -0.5) um"
+    assert formatting.area_text((2e-6, 1e-6)) == "2 x 1 um"
+    assert formatting.position_text((1.2e-6, -5e-7)) == "(1.2, -0.5) um"
     assert formatting.typeset("2 x 1 um at (1.2, -0.5) um") == "2 × 1 µm at (1.2, −0.5) µm"
 
 
@@ -68,8 +68,8 @@ def test_times_are_those_of_the_zone_that_is_given_and_utc_is_named() -> None:
 
 
 def test_the_day_of_an_end_is_told_where_it_is_another() -> None:
-    assert formatting.from_to(EVENING, EVENING + HOUR_NS, UTC) == "2026-11-20 22:04 to 23:04 UTC"
-    assert formatting.from_to(EVENING, EVENING + 3 * HOUR_NS, UTC) == "2026-11-20 22:04 to 2026-11-21 01:04 UTC"
+    assert formatting.period_text(EVENING, EVENING + HOUR_NS, UTC) == "2026-11-20 22:04 to 23:04 UTC"
+    assert formatting.period_text(EVENING, EVENING + 3 * HOUR_NS, UTC) == "2026-11-20 22:04 to 2026-11-21 01:04 UTC"
 
 
 @pytest.mark.parametrize(

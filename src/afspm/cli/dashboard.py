@@ -9,7 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from afspm.experiment import Experiment
-    from afspm.supervisor.resuming import Resumable
+    from afspm.supervisor.resume import ResumableRun
 
 RUNS = Path("runs")
 NAME_OF_CLASS = "Dashboard"
@@ -64,7 +64,7 @@ def with_dashboard(files: list[Path]) -> Experiment:
     return experiment if _has_dashboard(experiment) else load(*files, _overlay())
 
 
-def resumed_with_dashboard(found: Resumable) -> Resumable:
+def resumed_with_dashboard(found: ResumableRun) -> ResumableRun:
     """The run that is to go on, with a dashboard if it has none."""
     return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
 
@@ -155,9 +155,9 @@ def _start_part(file: Path) -> int:
     experiment = with_dashboard([file])
     names = [name for name, path in experiment.resolved.class_paths.items() if path.endswith(f".{NAME_OF_CLASS}")]
     try:
-        running.dry_run(experiment, running.Options(only=tuple(names)))
+        running.dry_run(experiment, running.RunOptions(only=tuple(names)))
     except ConfigError as error:
         what = f"nothing of it runs here, and where its scheduler would be is not in the file: {error.what}"
         raise ConfigError(what, where=str(file), hint="start it with `afspm run`") from error
-    ended = running.run(experiment, running.Options(only=tuple(names)), terminal=sys.stdout)
+    ended = running.run(experiment, running.RunOptions(only=tuple(names)), terminal=sys.stdout)
     return ended.outcome.exit_code

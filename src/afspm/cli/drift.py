@@ -62,7 +62,7 @@ def files(
     """
     _one_thread_a_process()
     from afspm.cli import drift_files
-    from afspm.experiment.classes import importing_from
+    from afspm.experiment.class_loader import importing_from
 
     with importing_from([Path.cwd()]):
         drift_files.run(paths, channel, estimator, tracker, output, jobs)
@@ -88,7 +88,7 @@ def study(
     """Simulate many nights over a grid of settings, and say which are best and whether the defaults hold."""
     _one_thread_a_process()
     from afspm.cli import drift_study
-    from afspm.experiment.classes import importing_from
+    from afspm.experiment.class_loader import importing_from
 
     with importing_from([Path.cwd()]):
         drift_study.run(settings or [], nights, seed, cluster, jobs)

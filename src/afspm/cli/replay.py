@@ -47,8 +47,8 @@ def replay(
     It can be joined like a running experiment: afspm.connect, afspm dashboard, afspm run FILE --only COMPONENT. Who
     comes late gets what was kept. Requests are refused: nobody measures.
     """
-    from afspm.supervisor import replaying
+    from afspm.supervisor import replay
 
-    options = replaying.Options(speed, names_in(only), publish, serve, stay=stay, runs=runs)
-    count = replaying.replay(run, options, typer.echo)
+    options = replay.ReplayOptions(speed, names_in(only), publish, serve, stay=stay, runs=runs)
+    count = replay.replay(run, options, typer.echo)
     typer.echo(f"{count} packets were published")

@@ -10,7 +10,7 @@ import typer
 from afspm.cli.arguments import FilesUnlessResumed, names_in
 
 if TYPE_CHECKING:
-    from afspm.experiment import Experiment, Start
+    from afspm.experiment import Experiment, ProcessStart
 
 
 def run(
@@ -18,13 +18,16 @@ def run(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            "--only", metavar="NAME[,NAME…]", help="Start these processes here, and no others.", show_default=False
+            "--only",
+            metavar="NAME[,NAME…]",
+            help="ProcessStart these processes here, and no others.",
+            show_default=False,
         ),
     ] = None,
     without: Annotated[
         list[str] | None,
         typer.Option(
-            "--without", metavar="NAME[,NAME…]", help="Start all processes here but these.", show_default=False
+            "--without", metavar="NAME[,NAME…]", help="ProcessStart all processes here but these.", show_default=False
         ),
     ] = None,
     runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the run's folder.")] = Path("runs"),
@@ -67,10 +70,10 @@ def run(
 
     from afspm.cli.dashboard import resumed_with_dashboard, with_dashboard
     from afspm.experiment import load
-    from afspm.supervisor import resuming
+    from afspm.supervisor import resume
     from afspm.supervisor import run as running
 
-    options = running.Options(
+    options = running.RunOptions(
         runs=runs,
         only=names_in(only),
         without=names_in(without),
@@ -82,11 +85,11 @@ def run(
         if files or only or without or speed or dry_run:
             said = "a run is resumed as it was begun: give nothing else, but --dashboard"
             raise typer.BadParameter(said, param_hint="--resume")
-        found = resuming.find(resume)
+        found = resume.find(resume)
         if dashboard:
             found = resumed_with_dashboard(found)
         _check(found.experiment)
-        raise typer.Exit(resuming.resume(found, options, terminal=sys.stdout).outcome.exit_code)
+        raise typer.Exit(resume.resume(found, options, terminal=sys.stdout).outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
     experiment = with_dashboard(files) if dashboard else load(*files)
@@ -112,6 +115,6 @@ def _check(experiment: Experiment) -> None:
         raise typer.Exit(1)
 
 
-def _told(start: Start) -> str:
+def _told(start: ProcessStart) -> str:
     what = " ".join(start.command) or start.launch.class_
     return f"{start.launch.name} ({start.role.value}): {what}"

@@ -79,12 +79,12 @@ def problems(
 def _list(where: Path) -> None:
     from afspm.cli.telling import flagged
     from afspm.clock import NS_PER_S
-    from afspm.formatting import lasting
+    from afspm.formatting import duration_text
 
     with looking(where) as follower:
         now_ns, found = follower.clock.now_ns(), list(flagged(follower.overview))
         for _, name, span in found:
-            since = f", for {lasting((now_ns - span.start_ns) / NS_PER_S)}" if span else ""
+            since = f", for {duration_text((now_ns - span.start_ns) / NS_PER_S)}" if span else ""
             typer.echo(f"{name}{since}{f', flagged by {span.by}' if span and span.by else ''}")
         if not found:
             typer.echo(f"no problem is flagged; there are {', '.join(follower.overview.problems)}")

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from afspm.clock import NS_PER_S
-from afspm.formatting import area, day_and_time, lasting, time_of_day
+from afspm.formatting import area_text, day_and_time, duration_text, time_of_day
 from afspm.model import JournalEntry, LogLine, ProcessCondition, ProcessState, Region, ScopeState
 from afspm.record.overview import OLD_S, OVER, Overview
 from afspm.record.timeline import Span
@@ -53,7 +53,7 @@ def screen(seen: Overview, about: About, now_ns: int, *, silent_s: float = 0.0, 
 
     lines = [_head(seen, about, now_ns)]
     if silent_s > OLD_S:
-        told = f"no news for {lasting(silent_s)}: the scheduler is being started again, or can't be reached"
+        told = f"no news for {duration_text(silent_s)}: the scheduler is being started again, or can't be reached"
         lines.append(Text(told, "bold yellow"))
     lines += [_control(seen, now_ns), *_problems(seen, now_ns), _scanning(seen, about, now_ns)]
     lines += [
@@ -87,14 +87,14 @@ def _head(seen: Overview, about: About, now_ns: int) -> Text:
         line.append("  SIMULATED", "bold red")
     line.append(f"  {day_and_time(now_ns)}")
     if about.began_ns is not None:
-        line.append(f", running for {lasting((now_ns - about.began_ns) / NS_PER_S)}")
+        line.append(f", running for {duration_text((now_ns - about.began_ns) / NS_PER_S)}")
     if about.speed != 1.0:
         line.append(f", {about.speed:g} x real time")
     return line
 
 
 def _since(since_ns: int | None, now_ns: int) -> str:
-    return "" if since_ns is None else f" for {lasting((now_ns - since_ns) / NS_PER_S)}"
+    return "" if since_ns is None else f" for {duration_text((now_ns - since_ns) / NS_PER_S)}"
 
 
 def _control(seen: Overview, now_ns: int) -> Text:
@@ -151,7 +151,7 @@ def _size(seen: Overview) -> str:
     if parameters is None or not isinstance(parameters.region, Region):
         return ""
     pixels = f", {parameters.shape[1]} x {parameters.shape[0]}" if isinstance(parameters.shape, tuple) else ""
-    return f"{area(parameters.region.size_m)}{pixels}"
+    return f"{area_text(parameters.region.size_m)}{pixels}"
 
 
 def _bar(part: float, about: About) -> str:
@@ -161,8 +161,8 @@ def _bar(part: float, about: About) -> str:
 def _left(left_ns: int | None, about: About) -> str:
     if left_ns is None:
         return ""
-    real = f" ({lasting(left_ns / about.speed / NS_PER_S)} real)" if about.speed != 1.0 else ""
-    return f"{lasting(left_ns / NS_PER_S)} left{real}"
+    real = f" ({duration_text(left_ns / about.speed / NS_PER_S)} real)" if about.speed != 1.0 else ""
+    return f"{duration_text(left_ns / NS_PER_S)} left{real}"
 
 
 def _progress(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
@@ -189,7 +189,7 @@ def _processes(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
         if state.name in unheard:
             line = _label("process").append(f"{state.name} ").append("not heard of", "bold red")
             yield line.append(
-                f" for {lasting(unheard[state.name] / NS_PER_S)}: whoever started it is gone, or can't be reached"
+                f" for {duration_text(unheard[state.name] / NS_PER_S)}: whoever started it is gone, or can't be reached"
             )
         if state.name in unheard or state.condition in WELL:
             continue
@@ -203,14 +203,14 @@ def _processes(seen: Overview, about: About, now_ns: int) -> Iterator[Text]:
 def _lately(state: ProcessState, now_ns: int) -> str:
     """Since when it is so; of what is over, when that was."""
     if state.condition is ProcessCondition.ENDED and state.since_ns is not None:
-        return f" {lasting((now_ns - state.since_ns) / NS_PER_S)} ago"
+        return f" {duration_text((now_ns - state.since_ns) / NS_PER_S)} ago"
     return _since(state.since_ns, now_ns)
 
 
 def _well(state: ProcessState) -> str:
     told = []
     if state.condition is ProcessCondition.BUSY and state.step_age_s >= 1.0:
-        told.append(f"busy for {lasting(state.step_age_s)}")
+        told.append(f"busy for {duration_text(state.step_age_s)}")
     if state.starts > 1:
         told.append(f"started {state.starts} times")
     return f"{state.name} ({', '.join(told)})" if told else state.name

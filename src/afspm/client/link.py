@@ -16,12 +16,12 @@ from afspm.model import (
     CLOCK_REQUEST,
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
-    TELL_REQUEST,
+    RELAY_REQUEST,
     ControlRequest,
     Packet,
+    RelayedMessage,
     Request,
     Response,
-    Told,
     request_name,
 )
 from afspm.process.context import ProcessActivity
@@ -88,7 +88,7 @@ class ExperimentLink:
         self._answer: Response | None = None
         self.version = wire.Version.UNKNOWN
         self._told: dict[str, float] = {}  # ids of what was told and not answered yet, with the monotonic time
-        self._untold: dict[str, Told] = {}
+        self._untold: dict[str, RelayedMessage] = {}
         self._caught_up: set[str] = set()
         self._listeners: dict[int, Listener] = {}
         self._listened = 0
@@ -250,15 +250,15 @@ class ExperimentLink:
         """
         if self.version is not wire.Version.OURS:
             return  # its answer could be taken for that to the next request
-        told, since_s = Told(*wire.encode(thing)), self.clock.monotonic_s() - self.request_timeout_s
+        told, since_s = RelayedMessage(*wire.encode(thing)), self.clock.monotonic_s() - self.request_timeout_s
         self._told = {told_id: at_s for told_id, at_s in self._told.items() if at_s > since_s}
         if len(self._told) < MOST_UNANSWERED:
             self._send_told(told)
         else:
             self._untold[told.message] = told
 
-    def _send_told(self, told: Told) -> None:
-        request = Request(TELL_REQUEST, told, id=self.next_id())
+    def _send_told(self, told: RelayedMessage) -> None:
+        request = Request(RELAY_REQUEST, told, id=self.next_id())
         self._told[request.id] = self.clock.monotonic_s()
         self.port.send(wire.encode_request(request))
 

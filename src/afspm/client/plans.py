@@ -11,7 +11,7 @@ from afspm.client.command_retry import CommandRetry
 from afspm.client.measurement import MeasurementPlan
 from afspm.client.published_state import PublishedState
 from afspm.errors import InvalidValue
-from afspm.formatting import area, place
+from afspm.formatting import area_text, position_text
 from afspm.model import (
     ControlRequest,
     Frame,
@@ -169,11 +169,11 @@ _FITS: dict[str, Callable[[dict[str, Any], Any], bool]] = {"scan": _scan_fits, "
 def _scan_in_words(scan: Scan) -> str:
     region, (rows, columns) = scan.region, scan.shape
     turned = f", turned by {math.degrees(region.angle_rad):.4g} degrees" if region.angle_rad else ""
-    return f"{area(region.size_m)} at {place(region.center_m)}{turned}, {rows} x {columns} pixels"
+    return f"{area_text(region.size_m)} at {position_text(region.center_m)}{turned}, {rows} x {columns} pixels"
 
 
 def _spectrum_in_words(spectrum: Spectrum) -> str:
-    where = "somewhere" if spectrum.position_m is None else f"at {place(spectrum.position_m)}"
+    where = "somewhere" if spectrum.position_m is None else f"at {position_text(spectrum.position_m)}"
     return f"{spectrum.kind or 'of no kind'} {where}"
 
 

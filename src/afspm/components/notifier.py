@@ -19,7 +19,7 @@ from afspm.components.notifications import (
     Targets,
 )
 from afspm.errors import ConfigError
-from afspm.formatting import lasting
+from afspm.formatting import duration_text
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
 from afspm.record.run_json import experiment_name
@@ -101,7 +101,7 @@ class Notifier(Component):
         now_ns = self.clock.now_ns()
         for number, since_ns in self.memory["flagged"].items():
             if now_ns - since_ns >= self.unsolved_after * 1e9:
-                name, since = self.scope.problems.name(int(number)), lasting((now_ns - since_ns) * 1e-9)
+                name, since = self.scope.problems.name(int(number)), duration_text((now_ns - since_ns) * 1e-9)
                 text = f"{name} has been flagged for {since}, and nobody has solved it"
                 self._tell(UNSOLVED, f"{number} {since_ns}", text)
         self._deliver_what_is_due()

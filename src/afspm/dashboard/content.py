@@ -14,7 +14,7 @@ from afspm.dashboard.sample_map import MapContent, map_html
 from afspm.dashboard.watch import Watch
 from afspm.dashboard.words import colour_class, position
 from afspm.drawing.timeline import TimelineRow, timeline_html
-from afspm.formatting import day_and_time, lasting, time_of_day
+from afspm.formatting import day_and_time, duration_text, time_of_day
 from afspm.model import ControlMode, JournalEntry, LogLine, ProcessState, Region
 from afspm.record.overview import OVER, Overview
 from afspm.record.timeline import Span, Timeline
@@ -142,7 +142,7 @@ def trouble(watch: Watch) -> str:
     silent_s = watch.silent_s()
     if silent_s > OLD_AFTER_S:
         why = f" {said[0].upper()}{said[1:]}." if (said := watch.cut_off()) else ""
-        return f"No word from the experiment for {lasting(silent_s)}: what is shown is that old.{why}"
+        return f"No word from the experiment for {duration_text(silent_s)}: what is shown is that old.{why}"
     return ""
 
 
@@ -172,7 +172,9 @@ def status_html(watch: Watch, overview: Overview) -> str:
     if control is None:
         return '<span class="chip">waiting for the scheduler</span>'
     since_ns, now_ns = overview.control_since_ns, _now_ns(watch, overview)
-    since = "" if since_ns is None else f" since {time_of_day(since_ns)} ({lasting((now_ns - since_ns) / NS_PER_S)})"
+    since = (
+        "" if since_ns is None else f" since {time_of_day(since_ns)} ({duration_text((now_ns - since_ns) / NS_PER_S)})"
+    )
     mode = control.mode.name
     who = f'<b class="{colour_class(control.holder)}">{escape(control.holder)}</b>' if control.holder else "nobody"
     parts = [
@@ -199,7 +201,7 @@ def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
     state = status.state.name.lower().replace("_", " ") if status else NOT_HEARD_OF
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
-    far = "" if done is None else f" {100 * done[0]:.0f} %, {lasting(done[1] / NS_PER_S)} left"
+    far = "" if done is None else f" {100 * done[0]:.0f} %, {duration_text(done[1] / NS_PER_S)} left"
     yield _chip(f"microscope {state}{paused}{far}", "state", f"state-{state.replace(' ', '-')}")
     if overview.probe_position is not None:
         yield _chip(f"probe {position(overview.probe_position.xy_m)}", "probe", "quiet")

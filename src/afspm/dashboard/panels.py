@@ -13,7 +13,7 @@ from afspm.dashboard.charts import Chart, spectrum_chart
 from afspm.dashboard.content import NOT_HEARD_OF
 from afspm.dashboard.watch import Watch
 from afspm.dashboard.words import colour_class
-from afspm.formatting import lasting, time_of_day
+from afspm.formatting import duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState
 
 MOST_LINES = 300
@@ -200,10 +200,10 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
     condition = state.condition.name.lower().replace("_", " ")
     since = f"since {time_of_day(state.since_ns)}"
     if unheard_ns is not None:
-        gone = f"for {lasting(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
+        gone = f"for {duration_text(unheard_ns / NS_PER_S)}: whoever started it is gone, or can't be reached"
         condition, since = NOT_HEARD_OF, gone
     elif state.step_age_s >= 1.0:
-        since = f"on its step for {lasting(state.step_age_s)}"
+        since = f"on its step for {duration_text(state.step_age_s)}"
     restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"
     if state.last_exit and state.starts > 1:
         restarts += f" (last: {state.last_exit})"

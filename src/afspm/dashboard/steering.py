@@ -16,7 +16,7 @@ from afspm.dashboard.actions import ActionResult, Actions
 from afspm.dashboard.watch import Watch
 from afspm.errors import AfspmError
 from afspm.launch import Launch
-from afspm.model.journal import PERSON
+from afspm.model.events import PERSON
 from afspm.process.context import new_session
 from afspm.transport.network import Network
 from afspm.transport.port import ParentGone

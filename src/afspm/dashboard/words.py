@@ -7,12 +7,12 @@ from afspm import formatting
 
 def position(xy_m: tuple[float, float]) -> str:
     """Return a position as "(1.2, −0.5) µm"."""
-    return formatting.typeset(formatting.place(xy_m))
+    return formatting.typeset(formatting.position_text(xy_m))
 
 
 def area(size_m: tuple[float, float]) -> str:
     """Return a size as "2 × 1 µm"."""
-    return formatting.typeset(formatting.area(size_m))
+    return formatting.typeset(formatting.area_text(size_m))
 
 
 def colour_class(name: str) -> str:

@@ -9,7 +9,7 @@ from html import escape
 from typing import Protocol
 
 from afspm.clock import NS_PER_S
-from afspm.formatting import lasting, time_of_day
+from afspm.formatting import duration_text, time_of_day
 
 COLUMNS = 720  # stretches narrower than this part of the run are put together
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
@@ -131,7 +131,9 @@ def _row(row: TimelineRow, shown: Sequence[Stretch], begin_ns: int, end_ns: int,
         label = one.label.replace("_", " ")
         start_ns = begin_ns + one.begin * (end_ns - begin_ns) // COLUMNS
         by = f", by {one.by}" if one.by else ""
-        often = f", {one.count} times about here" if one.count > 1 else f" for {lasting(one.lasted_ns / NS_PER_S)}"
+        often = (
+            f", {one.count} times about here" if one.count > 1 else f" for {duration_text(one.lasted_ns / NS_PER_S)}"
+        )
         title = f"{label}{by} from {time_of_day(start_ns, zone)}{often}"
         left, width = 100 * one.begin / COLUMNS, 100 * (one.end - one.begin) / COLUMNS
         word = f"<i>{escape(label)}</i>" if width > 7 else ""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from afspm.drift.registration import DriftScan, Estimator, Prior, Registration
 from afspm.errors import InvalidValue
-from afspm.model.undistort import undistorted
+from afspm.model.drift_removal import undistorted
 
 Array = NDArray[np.float64]
 

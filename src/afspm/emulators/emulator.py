@@ -15,7 +15,7 @@ from afspm.addresses import Listens
 from afspm.clock import Clock, ExperimentClock
 from afspm.emulators.faults import Fault, Faults
 from afspm.emulators.rig import Rig
-from afspm.errors import AfspmError, Gathered
+from afspm.errors import AfspmError, ErrorCollector
 from afspm.exit_codes import ExitCode
 from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.launching import open_port
@@ -114,7 +114,7 @@ class Emulator(ABC):
         from afspm.simulation import World
         from afspm.simulation.settings import one_of
 
-        errors = Gathered()
+        errors = ErrorCollector()
         with errors:
             world = World.from_settings(self._world_settings, self.seed, 0.0)
             one_of(world.settings.feedback.mode, self.modes, "feedback.mode")

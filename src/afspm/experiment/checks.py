@@ -14,9 +14,9 @@ from afspm.experiment.handlers import check_handlers
 from afspm.experiment.known import WIRE_SETTINGS
 from afspm.experiment.parts import Role
 from afspm.experiment.published import wire_of
-from afspm.experiment.resolved import Resolved
+from afspm.experiment.resolution import ResolvedExperiment
 from afspm.model import component_of, is_process_name
-from afspm.model.journal import LONGEST_PROCESS_NAME, PERSON
+from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
 
 # What translators and schedulers publish by themselves; scans and spectra continue with their kind.
@@ -41,13 +41,13 @@ ADDRESS: Final = "address"
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
 
 
-def check(resolved: Resolved) -> None:
+def check(resolved: ResolvedExperiment) -> None:
     """Run every check; what is found goes to `resolved.findings`."""
     for one in CHECKS:
         one(resolved)
 
 
-def check_roles(resolved: Resolved) -> None:
+def check_roles(resolved: ResolvedExperiment) -> None:
     """One scheduler, one translator, and no two names that only differ in upper and lower case."""
     whole = resolved.document.place()
     for role in (Role.SCHEDULER, Role.TRANSLATOR):
@@ -73,12 +73,12 @@ def check_roles(resolved: Resolved) -> None:
             )
 
 
-def _all_loaded(resolved: Resolved) -> bool:
+def _all_loaded(resolved: ResolvedExperiment) -> bool:
     """A class that can't be loaded may be the one that is looked for."""
     return all(part.command or part.name in resolved.classes for part in resolved.parts.components)
 
 
-def check_names(resolved: Resolved) -> None:
+def check_names(resolved: ResolvedExperiment) -> None:
     """A component's name is also that of files, on every system, and of a connection."""
     for part in resolved.parts.components:
         if not is_process_name(part.name):
@@ -89,7 +89,7 @@ def check_names(resolved: Resolved) -> None:
             )
 
 
-def check_commands(resolved: Resolved) -> None:
+def check_commands(resolved: ResolvedExperiment) -> None:
     """The program of a command can be found."""
     for part in resolved.parts.components:
         if part.command and not notifying.is_program(part.command[0], resolved.document.folders[0]):
@@ -100,7 +100,7 @@ def check_commands(resolved: Resolved) -> None:
             )
 
 
-def check_intermediaries(resolved: Resolved) -> None:
+def check_intermediaries(resolved: ResolvedExperiment) -> None:
     """Each intermediary table of a known kind has settings that the kind knows, and addresses where they belong."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for name, table in resolved.parts.intermediaries.items():
@@ -123,9 +123,9 @@ def check_intermediaries(resolved: Resolved) -> None:
                         resolved.findings.error(f"[{name}] {key} = {url!r} is not an address", place, hint)
 
 
-def check_addresses(resolved: Resolved) -> None:
+def check_addresses(resolved: ResolvedExperiment) -> None:
     """No address is bound twice; none is open to the network without keys; every connection has somebody at its end."""
-    bound: dict[str, wiring.Slot] = {}
+    bound: dict[str, wiring.BoundSocket] = {}
     secure = resolved.security.keys is not None or resolved.security.insecure
     for slot in (*resolved.net.slots.values(), *resolved.listening):
         if slot.address is None:
@@ -156,7 +156,7 @@ def check_addresses(resolved: Resolved) -> None:
                 )
 
 
-def check_self_subscription(resolved: Resolved) -> None:
+def check_self_subscription(resolved: ResolvedExperiment) -> None:
     """Nobody listens to itself: each packet would be the cause of the next."""
     for name, links in resolved.net.links.items():
         own = resolved.net.slots.get(links.publish or "")
@@ -167,7 +167,7 @@ def check_self_subscription(resolved: Resolved) -> None:
             resolved.findings.error(f"[{name}] subscribes to itself", resolved.document.place(name, "subscriber"))
 
 
-def check_listens_to(resolved: Resolved) -> None:
+def check_listens_to(resolved: ResolvedExperiment) -> None:
     """`listens_to` names others that publish."""
     publishers = {slot.owner for slot in resolved.net.slots.values() if slot.use == "publish"}
     for part in resolved.parts.components:
@@ -184,7 +184,7 @@ def check_listens_to(resolved: Resolved) -> None:
                 resolved.findings.error(f"[{part.name}] listens to [{other}], which publishes nothing", place)
 
 
-def check_problems(resolved: Resolved) -> None:
+def check_problems(resolved: ResolvedExperiment) -> None:
     """Problems named by components exist, and each that is flagged is solved by somebody."""
     solved = {_number(resolved, p) for said in resolved.declared.values() for p in said.solves}
     solved |= {_number(resolved, p) for p in resolved.control.solved_by_hand}
@@ -208,14 +208,14 @@ def check_problems(resolved: Resolved) -> None:
             resolved.findings.error(f"{problem!r} is no problem", place, nearest(problem, resolved.problems))
 
 
-def _number(resolved: Resolved, problem: str) -> int | None:
+def _number(resolved: ResolvedExperiment, problem: str) -> int | None:
     try:
         return resolved.problems.number(problem)
     except InvalidValue:
         return None
 
 
-def check_envelopes(resolved: Resolved) -> None:
+def check_envelopes(resolved: ResolvedExperiment) -> None:
     """Every envelope subscribed to is published by somebody."""
     published = {*PUBLISHED, *(e for said in resolved.declared.values() for e in said.publishes)}
     published |= set(resolved.caching.envelopes)
@@ -243,7 +243,7 @@ def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bo
     )
 
 
-def check_controller(resolved: Resolved) -> None:
+def check_controller(resolved: ResolvedExperiment) -> None:
     """One emulated controller at most, and no other address for its translator."""
     for name in resolved.emulators[1:]:
         what = f"[{name}] is a second emulated controller beside [{resolved.emulators[0]}]"
@@ -259,7 +259,7 @@ def check_controller(resolved: Resolved) -> None:
             )
 
 
-def check_clock(resolved: Resolved) -> None:
+def check_clock(resolved: ResolvedExperiment) -> None:
     """Only a simulation's time may be other than real."""
     table = resolved.parts.sections.get("clock", {})
     if not resolved.with_role(Role.TRANSLATOR) or resolved.simulated:
@@ -276,7 +276,7 @@ def check_clock(resolved: Resolved) -> None:
         )
 
 
-def check_names_of_people(resolved: Resolved) -> None:
+def check_names_of_people(resolved: ResolvedExperiment) -> None:
     """Roles name components, or people who have a key."""
     names = {part.name for part in resolved.parts.components}
     keys = resolved.keys_folder
@@ -309,14 +309,14 @@ def check_names_of_people(resolved: Resolved) -> None:
         )  # fmt: skip
 
 
-def _has_password(resolved: Resolved, member: str) -> bool:
+def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
     """False for a person of a dashboard that does not know the password of this person."""
     component, _, person = member.partition(PERSON)
     operates = getattr(resolved.classes.get(component), "operates", False) is True
     return not (person and operates) or person in (resolved.settings[component].get("people") or {})
 
 
-def check_likely_typos(resolved: Resolved) -> None:
+def check_likely_typos(resolved: ResolvedExperiment) -> None:
     """A text that is nearly a variable's name was probably meant to be it."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for part in resolved.parts.components:
@@ -341,7 +341,7 @@ def _texts(value: Any, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str 
             yield from _texts(item, (*path, i))
 
 
-def check_needs(resolved: Resolved) -> None:
+def check_needs(resolved: ResolvedExperiment) -> None:
     """The microscope has the actions and parameters that components say they need, where it tells before it runs."""
     for part in resolved.with_role(Role.TRANSLATOR):
         has = resolved.abilities(part)
@@ -361,7 +361,7 @@ def check_needs(resolved: Resolved) -> None:
                         )
 
 
-CHECKS: Final[tuple[Callable[[Resolved], None], ...]] = (
+CHECKS: Final[tuple[Callable[[ResolvedExperiment], None], ...]] = (
     check_roles,
     check_names,
     check_commands,

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from afspm.experiment import lines
-from afspm.experiment.findings import Findings, Place
+from afspm.experiment import toml_lines
+from afspm.experiment.findings import Findings, SourceLocation
 
 
 @dataclass
@@ -26,17 +26,17 @@ class Document:
 
     files: tuple[Path, ...]
     data: dict[str, Any] = field(default_factory=dict)
-    places: dict[lines.Path, Place] = field(default_factory=dict)
+    places: dict[toml_lines.Path, SourceLocation] = field(default_factory=dict)
     homes: tuple[Path, ...] = ()
     is_whole: bool = True
 
-    def place(self, *path: str | int) -> Place:
+    def place(self, *path: str | int) -> SourceLocation:
         """Where `path` was set: its own line, or that of the nearest thing around it."""
         for depth in range(len(path), 0, -1):
             found = self.places.get(path[:depth])
             if found is not None:
                 return found
-        return Place(str(self.files[0]))
+        return SourceLocation(str(self.files[0]))
 
     def folder_of(self, *path: str | int) -> Path:
         """The folder of the file that set `path`; relative file names in it are meant from there."""
@@ -57,7 +57,7 @@ def read(files: Sequence[Path], findings: Findings, homes: Sequence[Path] = ()) 
         if text is None or data is None:
             document.is_whole = False
             continue
-        where = {path: Place(str(file), line) for path, line in lines.locate(text).items()}
+        where = {path: SourceLocation(str(file), line) for path, line in toml_lines.locate(text).items()}
         _lay_over(document, data, where)
     return document
 
@@ -66,9 +66,9 @@ def _text(file: Path, findings: Findings) -> str | None:
     try:
         return file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        findings.error(f"the file is not UTF-8 text: {error.reason} at byte {error.start}", Place(str(file)))
+        findings.error(f"the file is not UTF-8 text: {error.reason} at byte {error.start}", SourceLocation(str(file)))
     except OSError as error:
-        findings.error(f"the file can't be read: {error.strerror or error}", Place(str(file)))
+        findings.error(f"the file can't be read: {error.strerror or error}", SourceLocation(str(file)))
     return None
 
 
@@ -87,10 +87,10 @@ def _parse(text: str, file: Path, findings: Findings) -> dict[str, Any] | None:
         twice = re.fullmatch(r"Cannot declare \((.*?),?\) twice", what.split(" at column")[0])
         if twice:
             name = twice[1].replace("'", "").replace(", ", ".")
-            findings.error(f"[{name}] is there twice", Place(str(file), line), "two components need two names")
+            findings.error(f"[{name}] is there twice", SourceLocation(str(file), line), "two components need two names")
         else:
             written = dict(enumerate(text.splitlines(), 1)).get(line, "")
-            findings.error(f"not valid TOML: {what}", Place(str(file), line), _habit(what, written))
+            findings.error(f"not valid TOML: {what}", SourceLocation(str(file), line), _habit(what, written))
         return None
 
 
@@ -114,12 +114,14 @@ def _habit(what: str, written: str) -> str:
     return next((hint for said, line, hint in _HABITS if what.startswith(said) and re.search(line, written)), "")
 
 
-def _lay_over(document: Document, data: dict[str, Any], where: dict[lines.Path, Place]) -> None:
+def _lay_over(document: Document, data: dict[str, Any], where: dict[toml_lines.Path, SourceLocation]) -> None:
     _merge(document.data, data, (), document.places)
     document.places.update(where)
 
 
-def _merge(below: dict[str, Any], above: dict[str, Any], path: lines.Path, places: dict[lines.Path, Place]) -> None:
+def _merge(
+    below: dict[str, Any], above: dict[str, Any], path: toml_lines.Path, places: dict[toml_lines.Path, SourceLocation]
+) -> None:
     for key, value in above.items():
         here = (*path, key)
         if isinstance(value, dict) and isinstance(below.get(key), dict):

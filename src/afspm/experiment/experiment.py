@@ -18,12 +18,12 @@ from afspm.experiment.parts import Role
 from afspm.launch import Launch
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolved import Resolved
+    from afspm.experiment.resolution import ResolvedExperiment
     from afspm.logic.supervision import ChildPolicy
 
 
 @dataclass(frozen=True)
-class Start:
+class ProcessStart:
     """One process to start.
 
     Attributes:
@@ -99,10 +99,10 @@ class Experiment:
         return self._found.ordered()
 
     @cached_property
-    def resolved(self) -> Resolved:
+    def resolved(self) -> ResolvedExperiment:
         """Classes imported, settings in SI, sections parsed, sockets connected."""
         from afspm.experiment import checks
-        from afspm.experiment.resolved import resolve
+        from afspm.experiment.resolution import resolve
 
         resolved = resolve(self.parts, self._document, self._found)
         if self._document.is_whole:  # what is missing may be in a file that can't be read, which has been reported
@@ -127,7 +127,7 @@ class Experiment:
         run_dir: str = "",
         state_dir: str = "",
         log_level: str = "INFO",
-    ) -> list[Start]:
+    ) -> list[ProcessStart]:
         """What is to be started: translator and scheduler first.
 
         Args:
@@ -140,11 +140,11 @@ class Experiment:
         Raises:
             ConfigError: the file has errors, a name is unknown, or an address is missing for a piecemeal start.
         """
-        from afspm.experiment import starting
+        from afspm.experiment import process_starts
 
         self.require_valid()
-        starts = starting.starts(self, take_address, only, without)
-        knowing = starting.knowing_the_run(self.resolved)
+        starts = process_starts.starts(self, take_address, only, without)
+        knowing = process_starts.knowing_the_run(self.resolved)
         return [
             replace(
                 start,
@@ -163,15 +163,15 @@ class Experiment:
 
     def simulated(self, only: Collection[str] = (), without: Collection[str] = ()) -> bool:
         """True if the microscope is simulated for certain, where these parts are started on this computer."""
-        from afspm.experiment import starting
+        from afspm.experiment import process_starts
 
-        return starting.simulated(self, only, without)
+        return process_starts.simulated(self, only, without)
 
     def asking(self, names: Collection[str]) -> Launch | None:
         """A launch line by which those of `names` ask the scheduler where it is started elsewhere; None: nobody can."""
-        from afspm.experiment import starting
+        from afspm.experiment import process_starts
 
-        return starting.asking(self, names)
+        return process_starts.asking(self, names)
 
     def policy(self) -> ChildPolicy:
         """How processes are watched and started again, from [restart]."""
@@ -192,7 +192,7 @@ class Experiment:
 
     def expanded(self, *, secrets: bool = True) -> str:
         """The whole experiment as one TOML text: references replaced, defaults filled in; see `expanded.to_toml`."""
-        from afspm.experiment.expanded import to_toml
+        from afspm.experiment.toml_writer import to_toml
 
         return to_toml(self, secrets=secrets)
 

@@ -16,7 +16,7 @@ class Level(Enum):
 
 
 @dataclass(frozen=True)
-class Place:
+class SourceLocation:
     """A line of a file; line 0 means the file as a whole."""
 
     file: str
@@ -32,7 +32,7 @@ class Finding:
 
     level: Level
     what: str
-    place: Place
+    place: SourceLocation
     hint: str = ""
 
     @property
@@ -50,10 +50,10 @@ class Findings:
 
     found: list[Finding] = field(default_factory=list)
 
-    def error(self, what: str, place: Place, hint: str = "") -> None:
+    def error(self, what: str, place: SourceLocation, hint: str = "") -> None:
         self._add(Finding(Level.ERROR, what, place, hint))
 
-    def warning(self, what: str, place: Place, hint: str = "") -> None:
+    def warning(self, what: str, place: SourceLocation, hint: str = "") -> None:
         self._add(Finding(Level.WARNING, what, place, hint))
 
     def _add(self, finding: Finding) -> None:

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from afspm.experiment.parts import Part, Role
+from afspm.experiment.parts import ExperimentPart, Role
 from afspm.experiment.svg import Svg, text_width
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
-    from afspm.experiment.resolved import Resolved
+    from afspm.experiment.resolution import ResolvedExperiment
 
 ENVELOPES, CONTROL, VENDOR = "#1f6fb2", "#c2570c", "#777777"
 GREY, RED, GREEN = "#666666", "#a3241c", "#1d7a3e"
@@ -32,10 +32,10 @@ BAR_HEIGHT, ARROW_AT, MOST_LABELS = 62.0, 16.0, 7
 
 
 @dataclass
-class Box:
+class ProcessBox:
     """One process and its column. Widths first, then places."""
 
-    part: Part
+    part: ExperimentPart
     lines: list[tuple[str, str]]
     labels: list[str]
     asks: bool
@@ -73,11 +73,11 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Lane:
+class PublisherLane:
     """What one component publishes to others."""
 
-    publisher: Box
-    listeners: tuple[Box, ...]
+    publisher: ProcessBox
+    listeners: tuple[ProcessBox, ...]
     label: str
 
 
@@ -87,7 +87,7 @@ def draw(experiment: Experiment) -> str:
 
 
 class _Drawing:
-    def __init__(self, resolved: Resolved, name: str) -> None:
+    def __init__(self, resolved: ResolvedExperiment, name: str) -> None:
         self.resolved = resolved
         self.name = name
         self.svg = Svg()
@@ -115,7 +115,7 @@ class _Drawing:
 
     # --- what there is ------------------------------------------------------------------------------------------
 
-    def _box(self, part: Part) -> Box:
+    def _box(self, part: ExperimentPart) -> ProcessBox:
         said = self.resolved.declared[part.name]
         what = part.class_path.rpartition(".")[2] if part.class_path else " ".join(part.command)
         lines = [(what if len(what) <= 34 else what[:33] + "…", GREY)]
@@ -125,9 +125,9 @@ class _Drawing:
         if len(labels) > MOST_LABELS:
             labels = [*labels[: MOST_LABELS - 1], f"and {len(labels) - MOST_LABELS + 1} more"]
         written = "subscriber" in part.own and "control_client" not in part.own
-        return Box(part, lines, labels, asks=not written)
+        return ProcessBox(part, lines, labels, asks=not written)
 
-    def _from_scheduler(self, part: Part) -> list[str]:
+    def _from_scheduler(self, part: ExperimentPart) -> list[str]:
         """What it hears from the scheduler: not what only other components publish; at least that it is over."""
         prefixes = self.resolved.envelopes(part)
         if prefixes is None or "" in prefixes:
@@ -135,7 +135,7 @@ class _Drawing:
         others = {e for p in self.components_of_file for e in self.resolved.declared[p.name].publishes}
         return [p for p in prefixes if not any(e.startswith(p) for e in others)] or ["KILL"]
 
-    def _lanes(self) -> list[Lane]:
+    def _lanes(self) -> list[PublisherLane]:
         lanes = []
         for box in self.components:
             key = f"{box.part.name}/publish"
@@ -148,7 +148,7 @@ class _Drawing:
                 if any(s in (key, slot.address) for s in self.resolved.net.links[other.part.name].subscribe)
             )
             label = ", ".join(self.resolved.declared[box.part.name].publishes) or "messages of its own"
-            lanes.append(Lane(box, listeners, f"{label} {_at(slot.address)}"))
+            lanes.append(PublisherLane(box, listeners, f"{label} {_at(slot.address)}"))
         # short ways near the boxes, long ways above them: fewer crossings
         return sorted(lanes, key=lambda lane: len(lane.listeners))
 
@@ -172,7 +172,7 @@ class _Drawing:
 
     # --- drawn ----------------------------------------------------------------------------------------------------
 
-    def _process(self, box: Box) -> None:
+    def _process(self, box: ProcessBox) -> None:
         fill, stroke = FILLS[self.resolved.roles[box.part.name]]
         self.svg.box(box.x - box.width / 2, box.y, box.width, box.height, fill=fill, stroke=stroke)
         y = box.y + 22
@@ -181,7 +181,7 @@ class _Drawing:
             y += LINE
             self.svg.text(box.x, y, text, size=TEXT_SIZE, fill=colour)
 
-    def _component(self, box: Box) -> None:
+    def _component(self, box: ProcessBox) -> None:
         self._process(box)
         top, bottom = box.y + box.height, self.bar_y
         if self._hears_scheduler(box):
@@ -189,7 +189,7 @@ class _Drawing:
         if box.asks:
             self._down(box.x + box.arrows_at + ARROW_AT, top, bottom)
 
-    def _hears_scheduler(self, box: Box) -> bool:
+    def _hears_scheduler(self, box: ProcessBox) -> bool:
         """Some only listen to other components."""
         sources = self.resolved.net.links[box.part.name].subscribe
         own = {f"{p.name}/publish" for p in self.resolved.with_role(Role.SCHEDULER)}
@@ -211,7 +211,7 @@ class _Drawing:
         self.svg.line([(x, top), (x, bottom - 1)], stroke=CONTROL)
         self.svg.text(x + 8, (top + bottom) / 2 + 4, "requests", size=LABEL_SIZE, fill=CONTROL, anchor="start")
 
-    def _lane(self, lane: Lane, y: float) -> None:
+    def _lane(self, lane: PublisherLane, y: float) -> None:
         start = lane.publisher.x + lane.publisher.width / 4
         ends = [self._entry(lane, box) for box in lane.listeners]
         top = self._top()
@@ -224,12 +224,12 @@ class _Drawing:
         middle = min(max((start + far) / 2, MARGIN + half), MARGIN + self.bar_width - half)
         self.svg.text(middle, y - 6, lane.label, size=LABEL_SIZE, fill=ENVELOPES, halo=True)
 
-    def _entry(self, lane: Lane, box: Box) -> float:
+    def _entry(self, lane: PublisherLane, box: ProcessBox) -> float:
         """Where a lane comes down to a listener: each at a place of its own, left of where the box's own goes up."""
         arriving = [other for other in self.lanes if box in other.listeners]
         return box.x - box.width / 4 + arriving.index(lane) * min(14.0, box.width / 2 / (len(arriving) + 1))
 
-    def _scheduler(self, part: Part) -> None:
+    def _scheduler(self, part: ExperimentPart) -> None:
         fill, stroke = FILLS[Role.SCHEDULER]
         self.svg.box(self.bar_x, self.bar_y, self.bar_width, BAR_HEIGHT, fill=fill, stroke=stroke)
         middle = self.bar_x + self.bar_width / 2
@@ -249,7 +249,7 @@ class _Drawing:
                 self.svg.text(x, y, said, size=TEXT_SIZE, fill=colour, anchor=anchor)
                 self.svg.text(x, y + LINE, _at(slot.address), size=TEXT_SIZE, fill=GREY, anchor=anchor)
 
-    def _translator(self, box: Box) -> float:
+    def _translator(self, box: ProcessBox) -> float:
         """The translator below the bar and its microscope below it; returns where that ends."""
         middle = self.bar_x + self.bar_width / 2
         top = self.bar_y + BAR_HEIGHT

@@ -10,14 +10,14 @@ from afspm import wire
 from afspm.client.component import Component
 from afspm.client.dispatch import HANDLERS, snake_case
 from afspm.experiment.findings import closest
-from afspm.experiment.parts import Part, Role
-from afspm.experiment.resolved import Resolved
+from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.resolution import ResolvedExperiment
 
 _NEARLY = 0.8
 _CALLED = ("run", *(name for name in vars(Component) if name.startswith("on_")))
 
 
-def check_handlers(resolved: Resolved) -> None:
+def check_handlers(resolved: ResolvedExperiment) -> None:
     """What looks like a handler is called by that name, with what it takes."""
     for part in resolved.with_role(Role.COMPONENT):
         component = resolved.classes.get(part.name)
@@ -39,7 +39,7 @@ def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., An
                 yield name, method
 
 
-def _check_name(part: Part, component: type[Component], name: str, resolved: Resolved) -> None:
+def _check_name(part: ExperimentPart, component: type[Component], name: str, resolved: ResolvedExperiment) -> None:
     valid = {*_CALLED, *(f"on_{snake_case(message)}" for message in wire.known_messages() if message not in HANDLERS)}
     near = closest(name, valid, _NEARLY)
     if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own
@@ -53,7 +53,11 @@ def _check_name(part: Part, component: type[Component], name: str, resolved: Res
 
 
 def _check_signature(
-    part: Part, component: type[Component], name: str, method: Callable[..., Any], resolved: Resolved
+    part: ExperimentPart,
+    component: type[Component],
+    name: str,
+    method: Callable[..., Any],
+    resolved: ResolvedExperiment,
 ) -> None:
     base = getattr(Component, name, None)
     wanted = list(inspect.signature(base).parameters) if base is not None else ["self", "message"]

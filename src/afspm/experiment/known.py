@@ -6,7 +6,7 @@ from enum import Enum
 from typing import Final
 
 
-class Wire(Enum):
+class WiringClass(Enum):
     """The kinds of intermediary classes: they say where sockets are, and are not imported."""
 
     PUBLISHER = "publisher"
@@ -25,36 +25,36 @@ class Wire(Enum):
 PUBLISHED_WIRES: Final = "afspm.io."
 """Where the published implementation has its intermediary classes. Their modules moved between its versions."""
 
-WIRE_CLASSES: Final[dict[str, Wire]] = {
-    "Publisher": Wire.PUBLISHER,
-    "PubSubCache": Wire.CACHE,
-    "Subscriber": Wire.SUBSCRIBER,
-    "ComboSubscriber": Wire.COMBINED,
-    "ControlServer": Wire.SERVER,
-    "ControlRouter": Wire.ROUTER,
-    "ControlClient": Wire.CLIENT,
-    "AdminControlClient": Wire.CLIENT,
-    "PBCScanLogic": Wire.CACHE_LOGIC,
-    "ProtoBasedCacheLogic": Wire.CACHE_LOGIC,
-    "CacheLogic": Wire.CACHE_LOGIC,
-    "create_roi_scan_envelope": Wire.ENVELOPE,
-    "create_spec_envelope": Wire.SPECTRA,
-    "create_roi_proto_hist_list": Wire.HISTORIES,
+WIRE_CLASSES: Final[dict[str, WiringClass]] = {
+    "Publisher": WiringClass.PUBLISHER,
+    "PubSubCache": WiringClass.CACHE,
+    "Subscriber": WiringClass.SUBSCRIBER,
+    "ComboSubscriber": WiringClass.COMBINED,
+    "ControlServer": WiringClass.SERVER,
+    "ControlRouter": WiringClass.ROUTER,
+    "ControlClient": WiringClass.CLIENT,
+    "AdminControlClient": WiringClass.CLIENT,
+    "PBCScanLogic": WiringClass.CACHE_LOGIC,
+    "ProtoBasedCacheLogic": WiringClass.CACHE_LOGIC,
+    "CacheLogic": WiringClass.CACHE_LOGIC,
+    "create_roi_scan_envelope": WiringClass.ENVELOPE,
+    "create_spec_envelope": WiringClass.SPECTRA,
+    "create_roi_proto_hist_list": WiringClass.HISTORIES,
 }
-SHORT_WIRE_CLASSES: Final[dict[str, Wire]] = {
-    "Publisher": Wire.PUBLISHER,
-    "Subscriber": Wire.SUBSCRIBER,
-    "Cache": Wire.CACHE,
-    "Server": Wire.SERVER,
-    "Router": Wire.ROUTER,
-    "Client": Wire.CLIENT,
+SHORT_WIRE_CLASSES: Final[dict[str, WiringClass]] = {
+    "Publisher": WiringClass.PUBLISHER,
+    "Subscriber": WiringClass.SUBSCRIBER,
+    "Cache": WiringClass.CACHE,
+    "Server": WiringClass.SERVER,
+    "Router": WiringClass.ROUTER,
+    "Client": WiringClass.CLIENT,
 }
 
 # What each kind understands. Settings of the published classes that only say how Python is to decode or to name
 # packets are accepted and have no meaning here: decoding is the wire's, naming is the [cache] section's.
-WIRE_SETTINGS: Final[dict[Wire, frozenset[str]]] = {
-    Wire.PUBLISHER: frozenset({"url", "get_envelope_for_proto"}),
-    Wire.SUBSCRIBER: frozenset(
+WIRE_SETTINGS: Final[dict[WiringClass, frozenset[str]]] = {
+    WiringClass.PUBLISHER: frozenset({"url", "get_envelope_for_proto"}),
+    WiringClass.SUBSCRIBER: frozenset(
         {
             "sub_url",
             "topics_to_sub",
@@ -64,8 +64,8 @@ WIRE_SETTINGS: Final[dict[Wire, frozenset[str]]] = {
             "update_cache_kwargs",
         }
     ),
-    Wire.COMBINED: frozenset({"subs"}),
-    Wire.CACHE: frozenset(
+    WiringClass.COMBINED: frozenset({"subs"}),
+    WiringClass.CACHE: frozenset(
         {
             "url",
             "sub_url",
@@ -77,23 +77,23 @@ WIRE_SETTINGS: Final[dict[Wire, frozenset[str]]] = {
             "topics_to_sub",
         }
     ),
-    Wire.SERVER: frozenset({"url"}),
-    Wire.ROUTER: frozenset({"server_url", "router_url", "request_timeout_ms", "request_retries"}),
-    Wire.CLIENT: frozenset({"url", "request_timeout_ms", "request_retries", "uuid"}),
-    Wire.CACHE_LOGIC: frozenset({"default_scan_history", "proto_with_history_list"}),
-    Wire.ENVELOPE: frozenset({"size", "channel"}),
-    Wire.SPECTRA: frozenset({"type"}),
-    Wire.HISTORIES: frozenset({"sizes_with_hist_list", "channels_list"}),
+    WiringClass.SERVER: frozenset({"url"}),
+    WiringClass.ROUTER: frozenset({"server_url", "router_url", "request_timeout_ms", "request_retries"}),
+    WiringClass.CLIENT: frozenset({"url", "request_timeout_ms", "request_retries", "uuid"}),
+    WiringClass.CACHE_LOGIC: frozenset({"default_scan_history", "proto_with_history_list"}),
+    WiringClass.ENVELOPE: frozenset({"size", "channel"}),
+    WiringClass.SPECTRA: frozenset({"type"}),
+    WiringClass.HISTORIES: frozenset({"sizes_with_hist_list", "channels_list"}),
 }
 
 # The keys by which a component names its intermediaries, and the kinds that fit.
-WIRE_KEYS: Final[dict[str, tuple[Wire, ...]]] = {
-    "subscriber": (Wire.SUBSCRIBER, Wire.COMBINED),
-    "control_client": (Wire.CLIENT,),
-    "publisher": (Wire.PUBLISHER,),
-    "control_server": (Wire.SERVER,),
-    "pubsubcache": (Wire.CACHE,),
-    "router": (Wire.ROUTER,),
+WIRE_KEYS: Final[dict[str, tuple[WiringClass, ...]]] = {
+    "subscriber": (WiringClass.SUBSCRIBER, WiringClass.COMBINED),
+    "control_client": (WiringClass.CLIENT,),
+    "publisher": (WiringClass.PUBLISHER,),
+    "control_server": (WiringClass.SERVER,),
+    "pubsubcache": (WiringClass.CACHE,),
+    "router": (WiringClass.ROUTER,),
 }
 
 DASHBOARD: Final = "dashboard"

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from afspm.components.notifications import END, OCCASIONS, Targets, address
 from afspm.errors import ConfigError
-from afspm.experiment.parts import Part, Role
+from afspm.experiment.parts import ExperimentPart, Role
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolved import Resolved
-    from afspm.experiment.sections import Notify
+    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.sections import NotifySection
 
 NAME = "notifier"
 CLASS = "Notifier"
@@ -25,7 +25,7 @@ def notifies(component: Any) -> bool:
     return getattr(component, "notifies", False) is True
 
 
-def implied(resolved: Resolved, section: Notify) -> Part | None:
+def implied(resolved: ResolvedExperiment, section: NotifySection) -> ExperimentPart | None:
     """The notifier as [notify] wants it; None if nobody is to be told of what happens during the experiment."""
     told = (set(OCCASIONS) - {END}) & set(section.on)
     there_is_one = any(notifies(component) for component in resolved.classes.values())
@@ -35,10 +35,12 @@ def implied(resolved: Resolved, section: Notify) -> Part | None:
     settings: dict[str, Any] = {"program": list(wanted.command)} if wanted.command else {}
     settings |= {"webhook": wanted.webhook} if wanted.webhook else {}
     settings |= {"on": list(section.on), "unsolved_after": section.unsolved_after, "folder": wanted.folder}
-    return Part(resolved.parts.free_name(NAME), CLASS, (), settings, {}, resolved.document.place(SECTION), implied=True)
+    return ExperimentPart(
+        resolved.parts.free_name(NAME), CLASS, (), settings, {}, resolved.document.place(SECTION), implied=True
+    )
 
 
-def targets(section: Notify, folder: Path) -> Targets:
+def targets(section: NotifySection, folder: Path) -> Targets:
     """Who is told. "python" as the program means the one that runs us."""
     command = section.command
     if command[:1] == ("python",):
@@ -46,7 +48,7 @@ def targets(section: Notify, folder: Path) -> Targets:
     return Targets(command, section.webhook, str(folder))
 
 
-def check(resolved: Resolved) -> None:
+def check(resolved: ResolvedExperiment) -> None:
     """Somebody is to be told, and can be."""
     section, findings, document = resolved.notify, resolved.findings, resolved.document
     place = document.place(SECTION)

@@ -11,12 +11,12 @@ from typing import Any, Final
 from afspm.errors import AfspmError
 from afspm.experiment import published
 from afspm.experiment.document import Document
-from afspm.experiment.expanded import value as toml
-from afspm.experiment.findings import Findings, Place, closest, nearest
+from afspm.experiment.findings import Findings, SourceLocation, closest, nearest
 from afspm.experiment.known import WIRE_KEYS
-from afspm.experiment.lines import Path
-from afspm.experiment.published import Setting, wire_of
-from afspm.experiment.references import References
+from afspm.experiment.published import PublishedSetting, wire_of
+from afspm.experiment.toml_lines import Path
+from afspm.experiment.toml_writer import value as toml
+from afspm.experiment.variable_references import VariableReferences
 
 SECTIONS: Final = ("clock", "control", "limits", "problems", "cache", "security", "restart", "record", "notify")
 
@@ -40,7 +40,7 @@ class Role(Enum):
 
 
 @dataclass(frozen=True)
-class Part:
+class ExperimentPart:
     """One process of the experiment as the file has it, references replaced.
 
     Attributes:
@@ -56,18 +56,18 @@ class Part:
     command: tuple[str, ...]
     settings: Mapping[str, Any]
     own: Mapping[str, Any]
-    place: Place
+    place: SourceLocation
     implied: bool = False
 
 
 @dataclass
-class Parts:
+class ExperimentParts:
     """The sorted and expanded file."""
 
     variables: dict[str, Any] = field(default_factory=dict)
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)
     intermediaries: dict[str, dict[str, Any]] = field(default_factory=dict)
-    components: list[Part] = field(default_factory=list)
+    components: list[ExperimentPart] = field(default_factory=list)
     became: dict[Path, str] = field(default_factory=dict)
     """Of each line of the published form, where it is ours under another name or is no more."""
     instead: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -81,9 +81,9 @@ class Parts:
         return next(name for name in names if name not in taken)
 
 
-def sort(document: Document, findings: Findings) -> Parts:
+def sort(document: Document, findings: Findings) -> ExperimentParts:
     """Sort and expand; report what can't be part of an experiment."""
-    parts = Parts()
+    parts = ExperimentParts()
     raw_components: dict[str, dict[str, Any]] = {}
     for key, value in document.data.items():
         if not isinstance(value, dict):
@@ -94,7 +94,7 @@ def sort(document: Document, findings: Findings) -> Parts:
             parts.sections[key] = value
         else:
             parts.intermediaries[key] = value
-    references = References(document, {**parts.variables, **parts.intermediaries}, findings)
+    references = VariableReferences(document, {**parts.variables, **parts.intermediaries}, findings)
     parts.variables = {k: references.expand(v, (k,)) for k, v in parts.variables.items()}
     parts.sections = {k: references.expand(v, (k,)) for k, v in parts.sections.items()}
     parts.intermediaries = {k: references.expand(v, (k,)) for k, v in parts.intermediaries.items()}
@@ -119,7 +119,7 @@ def _is_component(name: str, table: dict[str, Any], document: Document, findings
     return marked is True
 
 
-def _component(name: str, table: dict[str, Any], document: Document, findings: Findings) -> Part | None:
+def _component(name: str, table: dict[str, Any], document: Document, findings: Findings) -> ExperimentPart | None:
     place = document.place(name)
     class_path, command = table.get("class", ""), table.get("command", ())
     if not isinstance(class_path, str):
@@ -138,7 +138,7 @@ def _component(name: str, table: dict[str, Any], document: Document, findings: F
         findings.error(f"component [{name}] has {both}", place, near or "one of them says what to run")
         return None
     own_keys = OWN_KEYS if class_path else OWN_KEYS | {SIMULATED, *DECLARED_KEYS}
-    return Part(
+    return ExperimentPart(
         name=name,
         class_path=class_path,
         command=tuple(command),
@@ -153,11 +153,11 @@ class _FromPublished:
     """Makes components of the published implementation ours, and notes what became of their lines."""
 
     channels: Mapping[str, str]
-    parts: Parts
+    parts: ExperimentParts
     document: Document
     findings: Findings
 
-    def translated(self, part: Part) -> Part | None:
+    def translated(self, part: ExperimentPart) -> ExperimentPart | None:
         """Return the component as ours; None: it has no process of its own here."""
         table = {"class": part.class_path, **part.own, **part.settings}
         here = (part.name, "class")
@@ -181,7 +181,9 @@ class _FromPublished:
             self._put(settings, ours.settings[key], (part.name, key), table)
         return replace(part, class_path=ours.ours, settings=settings)
 
-    def _put(self, settings: dict[str, Any], setting: Setting, here: tuple[str, str], table: Mapping[str, Any]) -> None:
+    def _put(
+        self, settings: dict[str, Any], setting: PublishedSetting, here: tuple[str, str], table: Mapping[str, Any]
+    ) -> None:
         value = table[here[1]]
         try:
             becomes = setting.becomes(self.channels.get(value, value) if here[1] == "channel_id" else value, table)
@@ -202,7 +204,7 @@ def _misspelt(table: Mapping[str, Any], wanted: tuple[str, ...]) -> str:
     return ""
 
 
-def _report_unused(parts: Parts, used: set[str], document: Document, findings: Findings) -> None:
+def _report_unused(parts: ExperimentParts, used: set[str], document: Document, findings: Findings) -> None:
     for name, table in parts.intermediaries.items():
         if name in used:
             continue

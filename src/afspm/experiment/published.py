@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from afspm import units
 from afspm.errors import AfspmError, InvalidValue
-from afspm.experiment.known import PUBLISHED_WIRES, SHORT_WIRE_CLASSES, WIRE_CLASSES, Wire
+from afspm.experiment.known import PUBLISHED_WIRES, SHORT_WIRE_CLASSES, WIRE_CLASSES, WiringClass
 from afspm.logic.envelopes import default_envelope
 from afspm.model import PacketHeader
 
@@ -22,7 +22,7 @@ Becomes = Callable[[Any, Mapping[str, Any]], dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class Setting:
+class PublishedSetting:
     """One setting of a published class.
 
     Attributes:
@@ -35,15 +35,15 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Published:
+class PublishedClass:
     """A published class that is one of ours under another name."""
 
     ours: str
-    settings: Mapping[str, Setting] = field(default_factory=dict)
+    settings: Mapping[str, PublishedSetting] = field(default_factory=dict)
     why: str = ""
 
 
-def wire_of(table: Any) -> Wire | None:
+def wire_of(table: Any) -> WiringClass | None:
     """Return the kind of intermediary that a value is, or None."""
     name = table.get("class") if isinstance(table, Mapping) else None
     if not isinstance(name, str):
@@ -62,7 +62,7 @@ def evaluated(value: Any, channels: Mapping[str, str]) -> Any:
         return [evaluated(item, channels) for item in value]
     if not isinstance(value, dict):
         return value
-    if wire_of(value) in (Wire.ENVELOPE, Wire.SPECTRA):
+    if wire_of(value) in (WiringClass.ENVELOPE, WiringClass.SPECTRA):
         return envelope(with_channels(value, channels))
     return {key: evaluated(item, channels) for key, item in with_channels(value, channels).items()}
 
@@ -71,9 +71,9 @@ def with_channels(table: Mapping[str, Any], channels: Mapping[str, str]) -> dict
     """Return the table of a published function with the names that its channels have here; others as they are."""
     renamed = dict(table)
     match wire_of(renamed):
-        case Wire.ENVELOPE if "channel" in renamed:
+        case WiringClass.ENVELOPE if "channel" in renamed:
             renamed["channel"] = channels.get(renamed["channel"], renamed["channel"])
-        case Wire.HISTORIES if isinstance(given := renamed.get("channels_list"), list):
+        case WiringClass.HISTORIES if isinstance(given := renamed.get("channels_list"), list):
             renamed["channels_list"] = [channels.get(channel, channel) for channel in given]
     return renamed
 
@@ -83,7 +83,7 @@ def envelope(table: Mapping[str, Any]) -> Any:
 
     A size without a unit is in nm, as in the envelopes themselves. What makes no envelope is returned as it is.
     """
-    if wire_of(table) is Wire.SPECTRA:
+    if wire_of(table) is WiringClass.SPECTRA:
         return default_envelope(PacketHeader("Spec1d", kind=str(table.get("type", ""))))
     try:
         width_m, height_m = (length_m(side) for side in table["size"])
@@ -103,15 +103,17 @@ def renamed_channels(components: Mapping[str, Mapping[str, Any]]) -> dict[str, s
     return {str(table["channel_id"]): CHANNEL for table in pictures if "channel_id" in table}
 
 
-def class_of(table: Mapping[str, Any]) -> Published | None:
+def class_of(table: Mapping[str, Any]) -> PublishedClass | None:
     """Return what a component's class is here; None where the class is not a published one of these."""
     name, path = last(table), str(table.get("class", ""))
     if not path.startswith(COMPONENTS) and name != "DriftImageTranslator":  # beside the file, in its samples
         return None
     if name in _PICTURES:
         if "img_path" in table:
-            return Published("ImageMicroscope", _EVERY | _PICTURE)
-        return Published("Simulator", _EVERY | _PICTURE, "a picture of yours is shown by ImageMicroscope with `file`")
+            return PublishedClass("ImageMicroscope", _EVERY | _PICTURE)
+        return PublishedClass(
+            "Simulator", _EVERY | _PICTURE, "a picture of yours is shown by ImageMicroscope with `file`"
+        )
     return CLASSES.get(name)
 
 
@@ -140,15 +142,15 @@ def last(table: Mapping[str, Any]) -> str:
     return str(table.get("class", "")).rpartition(".")[2]
 
 
-def _named(ours: str) -> Setting:
-    return Setting(lambda value, table: {ours: value})
+def _named(ours: str) -> PublishedSetting:
+    return PublishedSetting(lambda value, table: {ours: value})
 
 
-def _gone(why: str, *names: str) -> dict[str, Setting]:
-    return dict.fromkeys(names, Setting(lambda value, table: {}, why))
+def _gone(why: str, *names: str) -> dict[str, PublishedSetting]:
+    return dict.fromkeys(names, PublishedSetting(lambda value, table: {}, why))
 
 
-def _paper(ours: str) -> Setting:
+def _paper(ours: str) -> PublishedSetting:
     """A setting of the paper's tracker, whose queue is what the published scheduler caches."""
 
     def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
@@ -156,7 +158,7 @@ def _paper(ours: str) -> Setting:
         count = _within(table, "pubsubcache", "update_cache_kwargs", "cache_logic", "default_scan_history")
         return settings if count is None else {**settings, "drift.tracker.queue": count}
 
-    return Setting(becomes)
+    return PublishedSetting(becomes)
 
 
 def _within(value: Any, *keys: str) -> Any:
@@ -203,11 +205,11 @@ def _client(address: Callable[[Mapping[str, Any]], str]) -> Becomes:
     return becomes
 
 
-def _refused(hint: str) -> Setting:
+def _refused(hint: str) -> PublishedSetting:
     def becomes(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
         raise InvalidValue("this is not taken over", hint=hint)
 
-    return Setting(becomes)
+    return PublishedSetting(becomes)
 
 
 def _width(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
@@ -221,24 +223,26 @@ def _velocity(value: Any, table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _PICTURES: Final = ("ImageTranslator", "DriftImageTranslator")
-_EVERY: Final[dict[str, Setting]] = {
+_EVERY: Final[dict[str, PublishedSetting]] = {
     **_gone("a process waits for its next message and never sleeps", "loop_sleep_s", "poll_timeout_ms"),
     **_gone("[restart] beat_period and missed_beats", "beat_period_s", "hb_period_s"),
     **_gone("[restart] start is the longest time for it", "spawn_delay_s"),
     **_gone("a component is called as its table", "override_client_uuid", "uuid"),
 }
-_PICTURE: Final[dict[str, Setting]] = {
+_PICTURE: Final[dict[str, PublishedSetting]] = {
     "img_path": _named("file"),
-    "physical_size": Setting(_width, "the simulated surface has no border"),
-    "drift_rate": Setting(_velocity),
+    "physical_size": PublishedSetting(_width, "the simulated surface has no border"),
+    "drift_rate": PublishedSetting(_velocity),
     **_gone("the middle of the sample is the origin", "physical_origin"),
     **_gone("each length has its unit", "physical_units", "data_units", "spatial_units", "temporal_units"),
     **_gone('initial = { scan-speed = "4 um/s" } says how fast the tip moves', "scan_time_s", "move_time_s"),
     **_gone(f"the channel is {CHANNEL}", "channel_id"),
 }
-_ASYLUM: Final[dict[str, Setting]] = {"xop_client": Setting(_client(lambda client: str(client.get("url", ""))))}
-_NANONIS: Final[dict[str, Setting]] = {
-    "client": Setting(
+_ASYLUM: Final[dict[str, PublishedSetting]] = {
+    "xop_client": PublishedSetting(_client(lambda client: str(client.get("url", ""))))
+}
+_NANONIS: Final[dict[str, PublishedSetting]] = {
+    "client": PublishedSetting(
         _client(lambda client: f"{client.get('host', '127.0.0.1')}:{client.get('port', 6501)}"),
     ),
     **_gone("a spectroscopy is started with its kind", "mode"),
@@ -248,21 +252,21 @@ _GXSM: Final = _gone(
     "read_channels_config_path", "read_use_physical_units", "read_allow_convert_from_metadata",
     "read_simplify_metadata",
 )  # fmt: skip
-_HANDLERS: Final[dict[str, Setting]] = {
+_HANDLERS: Final[dict[str, PublishedSetting]] = {
     "param_handler": _refused("write your parameters as the table `parameters`"),
     "action_handler": _refused("write your actions as the table `actions`"),
     **_gone("a parameter's own step says when it is reached", "float_tolerance"),
 }
-_DRIFT: Final[dict[str, Setting]] = {
+_DRIFT: Final[dict[str, PublishedSetting]] = {
     "channel_id": _named("drift.channel"),
     "update_weight": _paper("w_update"),
     "min_intersection_ratio": _paper("f_min"),
     "min_spatial_res_ratio": _paper("sr_norm_min"),
-    "rescan_intersection_ratio": Setting(
+    "rescan_intersection_ratio": PublishedSetting(
         lambda value, table: {"drift.rescan.rule": "paper", "drift.rescan.f_rescan": value}
     ),
-    "drift_model": Setting(_estimator),
-    "grab_oldest_match": Setting(_oldest, "the oldest scan that fits is taken"),
+    "drift_model": PublishedSetting(_estimator),
+    "grab_oldest_match": PublishedSetting(_oldest, "the oldest scan that fits is taken"),
     **_gone("a pair counts where chance would hardly match it as well", "max_fitting_score"),
     **_gone("the component DriftTable writes drift_correction.csv into the folder of the run", "csv_attribs"),
     **_gone("the dashboard shows drift, and the component DriftPictures draws it", "display_fit"),
@@ -278,20 +282,22 @@ _SHOWN: Final = _gone(
     "message_received_method", "per_loop_method", "methods_kwargs",
 )  # fmt: skip
 
-CLASSES: Final[dict[str, Published]] = {
-    "MicroscopeMediator": Published("Scheduler", _EVERY),
-    "MicroscopeScheduler": Published("Scheduler", _EVERY),
-    "DriftCompensatedMediator": Published("DriftCompensatedScheduler", _EVERY | _DRIFT),
-    "DriftCompensatedScheduler": Published("DriftCompensatedScheduler", _EVERY | _DRIFT),
-    "DriftRescanner": Published("Rescanner", _EVERY | _RESCANNER),
-    "ScanMetadataWriter": Published("Metadata", _EVERY | _gone("metadata.csv is in the run's folder", "csv_attribs")),
-    "FeedbackAnalyzer": Published("FeedbackAnalysis", _EVERY),
-    "FeedbackCorrector": Published("FeedbackTuner", _EVERY),
-    "AfspmControlUI": Published("Dashboard", _EVERY),
-    "Visualizer": Published("Dashboard", _EVERY | _SHOWN),
-    "AsylumTranslator": Published("Asylum", _EVERY | _HANDLERS | _ASYLUM),
-    "GxsmTranslator": Published("Gxsm", _EVERY | _HANDLERS | _GXSM),
-    "NanonisTranslator": Published("Nanonis", _EVERY | _HANDLERS | _NANONIS),
+CLASSES: Final[dict[str, PublishedClass]] = {
+    "MicroscopeMediator": PublishedClass("Scheduler", _EVERY),
+    "MicroscopeScheduler": PublishedClass("Scheduler", _EVERY),
+    "DriftCompensatedMediator": PublishedClass("DriftCompensatedScheduler", _EVERY | _DRIFT),
+    "DriftCompensatedScheduler": PublishedClass("DriftCompensatedScheduler", _EVERY | _DRIFT),
+    "DriftRescanner": PublishedClass("Rescanner", _EVERY | _RESCANNER),
+    "ScanMetadataWriter": PublishedClass(
+        "Metadata", _EVERY | _gone("metadata.csv is in the run's folder", "csv_attribs")
+    ),
+    "FeedbackAnalyzer": PublishedClass("FeedbackAnalysis", _EVERY),
+    "FeedbackCorrector": PublishedClass("FeedbackTuner", _EVERY),
+    "AfspmControlUI": PublishedClass("Dashboard", _EVERY),
+    "Visualizer": PublishedClass("Dashboard", _EVERY | _SHOWN),
+    "AsylumTranslator": PublishedClass("Asylum", _EVERY | _HANDLERS | _ASYLUM),
+    "GxsmTranslator": PublishedClass("Gxsm", _EVERY | _HANDLERS | _GXSM),
+    "NanonisTranslator": PublishedClass("Nanonis", _EVERY | _HANDLERS | _NANONIS),
 }
 """By the name of the class, in whichever module of the published implementation it was."""
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from afspm.experiment.parts import Part, Role
+from afspm.experiment.parts import ExperimentPart, Role
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolved import Resolved
-    from afspm.experiment.sections import Record
+    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.sections import RecordSection
 
 NAME = "recorder"
 CLASS = "Recorder"
@@ -20,7 +20,7 @@ def records(component: Any) -> bool:
     return getattr(component, "records", False) is True
 
 
-def implied(resolved: Resolved, section: Record) -> Part | None:
+def implied(resolved: ResolvedExperiment, section: RecordSection) -> ExperimentPart | None:
     """The recorder as [record] wants it; None if it wants none, or the file has one, or there is no scheduler."""
     there_is_one = any(records(component) for component in resolved.classes.values())
     if not section.on or there_is_one or not resolved.with_role(Role.SCHEDULER):
@@ -35,4 +35,4 @@ def implied(resolved: Resolved, section: Record) -> Part | None:
             'pip install "afspm[record]"; or say [record] scans = false',
         )
     settings = {} if scans else {"scans": False}
-    return Part(resolved.parts.free_name(NAME), CLASS, (), settings, {}, place, implied=True)
+    return ExperimentPart(resolved.parts.free_name(NAME), CLASS, (), settings, {}, place, implied=True)

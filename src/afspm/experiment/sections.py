@@ -25,7 +25,7 @@ DangerousState = Literal["MOVING", "SCANNING", "COARSE_MOTOR", "BUSY_PARAM", "SP
 PositiveDuration = Annotated[Duration, Field(gt=0)]
 
 
-class Clock(Section):
+class ClockSection(Section):
     """[clock]: when the experiment's time begins and how fast it goes (simulated microscopes only)."""
 
     start: datetime | None = None
@@ -33,7 +33,7 @@ class Clock(Section):
     waits: bool = True
 
 
-class Roles(Section):
+class RolesSection(Section):
     """[control.roles]: who may do what concerns everyone; None: everyone may."""
 
     end_experiment: tuple[str, ...] | None = None
@@ -44,7 +44,7 @@ class Roles(Section):
     restart: tuple[str, ...] | None = None
 
 
-class Control(Section):
+class ControlSection(Section):
     """[control]: how control is given and taken away."""
 
     lease: PositiveDuration | None = None
@@ -63,10 +63,10 @@ class Control(Section):
     """Those states; None: what the watchdog takes for dangerous by itself."""
     spectra_by_variable: bool = False
     """Whether the translator sends the values of a spectrum variable after variable, as some of version 1 do."""
-    roles: Roles = Roles()
+    roles: RolesSection = RolesSection()
 
 
-class Security(Section):
+class SecuritySection(Section):
     """[security]: the folder of CURVE keys, or the spoken word that there are none."""
 
     keys: str | None = None
@@ -75,7 +75,7 @@ class Security(Section):
     insecure: bool = False
 
 
-class Restart(Section):
+class RestartSection(Section):
     """[restart]: how patiently processes are watched, and how often they are started again. Real time."""
 
     beat_period: PositiveDuration = 1.0
@@ -90,7 +90,7 @@ class Restart(Section):
     healthy: PositiveDuration = 30.0
 
 
-class Record(Section):
+class RecordSection(Section):
     """[record]: what is kept of a run, beside what components write."""
 
     on: bool = True
@@ -98,7 +98,7 @@ class Record(Section):
     """Scans and spectra, too, each as a file."""
 
 
-class Notify(Section):
+class NotifySection(Section):
     """[notify]: who is told, outside of the experiment, of what."""
 
     command: tuple[str, ...] = ()

@@ -18,7 +18,7 @@ import pydantic
 from afspm import units
 from afspm.addresses import Listens
 from afspm.errors import UnitError
-from afspm.experiment import classes
+from afspm.experiment import class_loader
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, closest, nearest
 from afspm.experiment.sections import report
@@ -140,8 +140,8 @@ def _object(value: dict[str, Any], path: tuple[str, ...], document: Document, fi
     settings = {key: item for key, item in value.items() if key != "class"}
     place = document.place(*path)
     try:
-        wanted = classes.load(value["class"])
-    except classes.Unloadable as error:
+        wanted = class_loader.load(value["class"])
+    except class_loader.Unloadable as error:
         findings.error(f"[{path[0]}] {'.'.join(path[1:])} class: {error.what}", place, error.hint)
         return {"class": value["class"]}
     if not isinstance(wanted, type):

@@ -8,30 +8,30 @@ from typing import TYPE_CHECKING, Any, Final
 from afspm import units
 from afspm.addresses import is_address
 from afspm.errors import UnitError
-from afspm.experiment.expanded import dumps
-from afspm.experiment.expanded import value as toml
-from afspm.experiment.findings import Place
-from afspm.experiment.known import WIRE_KEYS, Wire
-from afspm.experiment.parts import Part, Role
+from afspm.experiment.findings import SourceLocation
+from afspm.experiment.known import WIRE_KEYS, WiringClass
+from afspm.experiment.parts import ExperimentPart, Role
 from afspm.experiment.published import INSTEAD, envelope, last, wire_of
+from afspm.experiment.toml_writer import dumps
+from afspm.experiment.toml_writer import value as toml
 from afspm.transport.network import is_local
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
-    from afspm.experiment.resolved import Resolved
-    from afspm.experiment.wiring import Wires
+    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.wiring import WiringKeys
 
 _VARIABLES: Final[tuple[str, ...]] = ("name", "messages")
 _FILLED_IN: Final = "filled in: processes on one computer find each other"
-_WIRES: Final[dict[Wire, str]] = {
-    **dict.fromkeys((Wire.PUBLISHER, Wire.CACHE, Wire.COMBINED, Wire.SERVER), _FILLED_IN),
-    **dict.fromkeys((Wire.ROUTER, Wire.CLIENT), f"{_FILLED_IN}; timeouts are [control] request_timeout"),
-    Wire.SUBSCRIBER: f"{_FILLED_IN}; topics are `envelopes` of the component",
-    **dict.fromkeys((Wire.CACHE_LOGIC, Wire.HISTORIES), "[cache]"),
+_WIRES: Final[dict[WiringClass, str]] = {
+    **dict.fromkeys((WiringClass.PUBLISHER, WiringClass.CACHE, WiringClass.COMBINED, WiringClass.SERVER), _FILLED_IN),
+    **dict.fromkeys((WiringClass.ROUTER, WiringClass.CLIENT), f"{_FILLED_IN}; timeouts are [control] request_timeout"),
+    WiringClass.SUBSCRIBER: f"{_FILLED_IN}; topics are `envelopes` of the component",
+    **dict.fromkeys((WiringClass.CACHE_LOGIC, WiringClass.HISTORIES), "[cache]"),
 }
 
 
-def explained(experiment: Experiment) -> list[tuple[Place, str, str]]:
+def explained(experiment: Experiment) -> list[tuple[SourceLocation, str, str]]:
     """Return for each line of the file where it is, what it sets, and what has become of it."""
     resolved = experiment.resolved
     return [(resolved.document.place(*path), _shown(path), became) for path, became in _lines(resolved)]
@@ -55,7 +55,7 @@ def short(experiment: Experiment) -> str:
     return "\n".join(blocks)
 
 
-def _lines(resolved: Resolved) -> Iterator[tuple[tuple[str, ...], str]]:
+def _lines(resolved: ResolvedExperiment) -> Iterator[tuple[tuple[str, ...], str]]:
     parts = resolved.parts
     components = {part.name for part in parts.components} | parts.instead.keys()
     addresses = _addresses(resolved)
@@ -71,7 +71,7 @@ def _lines(resolved: Resolved) -> Iterator[tuple[tuple[str, ...], str]]:
             yield (name,), _intermediary(parts.intermediaries[name])
 
 
-def _addresses(resolved: Resolved) -> set[str]:
+def _addresses(resolved: ResolvedExperiment) -> set[str]:
     """Every address between processes of the experiment, as the tables of the wiring say it."""
     found = {slot.address for slot in resolved.net.slots.values()}
     for table in resolved.parts.intermediaries.values():
@@ -90,7 +90,7 @@ def _variable(name: str, value: Any, addresses: Collection[str]) -> str:
 
 def _intermediary(table: Mapping[str, Any]) -> str:
     kind = wire_of(table)
-    if kind in (Wire.ENVELOPE, Wire.SPECTRA):
+    if kind in (WiringClass.ENVELOPE, WiringClass.SPECTRA):
         return f"the envelope {toml(envelope(table))}"
     if kind is not None:
         return _WIRES[kind]
@@ -103,7 +103,7 @@ def _shown(path: tuple[str, ...]) -> str:
     return path[0] if len(path) == 1 else f"[{path[0]}] {path[1]}"
 
 
-def _table(part: Part, resolved: Resolved) -> dict[str, Any]:
+def _table(part: ExperimentPart, resolved: ResolvedExperiment) -> dict[str, Any]:
     what: dict[str, Any] = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
     own = {key: value for key, value in part.own.items() if key not in {"class", "command", *WIRE_KEYS}}
     wires = resolved.wires[part.name]
@@ -112,7 +112,7 @@ def _table(part: Part, resolved: Resolved) -> dict[str, Any]:
     return {"component": True, **what, **own, **_remote(wires, resolved.roles[part.name]), **part.settings}
 
 
-def _remote(wires: Wires, role: Role) -> dict[str, Any]:
+def _remote(wires: WiringKeys, role: Role) -> dict[str, Any]:
     """The addresses that other computers reach or are on: they can't be left out."""
     places = {
         "publisher": wires.publish,
@@ -131,7 +131,7 @@ def _is_remote(address: str) -> bool:
     return is_address(address) and not is_local(address)
 
 
-def _sections(resolved: Resolved) -> dict[str, dict[str, Any]]:
+def _sections(resolved: ResolvedExperiment) -> dict[str, dict[str, Any]]:
     sections = {name: dict(table) for name, table in resolved.parts.sections.items()}
     timeouts = [wires.request_timeout_s for wires in resolved.wires.values() if wires.request_timeout_s]
     retries = [wires.request_retries for wires in resolved.wires.values() if wires.request_retries is not None]
@@ -144,7 +144,7 @@ def _sections(resolved: Resolved) -> dict[str, dict[str, Any]]:
     return sections
 
 
-def _cache(resolved: Resolved) -> dict[str, Any]:
+def _cache(resolved: ResolvedExperiment) -> dict[str, Any]:
     rules = [
         {
             "message": rule.message,

@@ -12,28 +12,28 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from afspm.addresses import hint_on, is_address
-from afspm.experiment.classes import Declared
-from afspm.experiment.findings import Findings, Place
-from afspm.experiment.known import WIRE_KEYS, Wire
-from afspm.experiment.parts import Part, Role
+from afspm.experiment.class_loader import ComponentDeclaration
+from afspm.experiment.findings import Findings, SourceLocation
+from afspm.experiment.known import WIRE_KEYS, WiringClass
+from afspm.experiment.parts import ExperimentPart, Role
 from afspm.experiment.published import wire_of
 
 
 @dataclass(frozen=True)
-class Slot:
+class BoundSocket:
     """One end that a process binds: the address the file gives under `key`, or None where it is left open."""
 
     owner: str
     use: str
     address: str | None
     key: str
-    place: Place
+    place: SourceLocation
     keyed: bool = True
     """Whether it is open to nobody without a key, where the experiment has keys."""
 
 
 @dataclass
-class Wires:
+class WiringKeys:
     """What the wiring keys of one component say, as plain addresses."""
 
     publish: str | None = None
@@ -49,8 +49,8 @@ class Wires:
 
 
 @dataclass(frozen=True)
-class Links:
-    """Every socket of one process; an open address is a `Slot`'s key "owner/use" until it is given one."""
+class ProcessSockets:
+    """Every socket of one process; an open address is a `BoundSocket`'s key "owner/use" until it is given one."""
 
     publish: str | None = None
     subscribe: tuple[str, ...] = ()
@@ -59,20 +59,20 @@ class Links:
 
 
 @dataclass
-class Net:
+class Wiring:
     """All slots and links of an experiment."""
 
-    slots: dict[str, Slot] = field(default_factory=dict)
-    links: dict[str, Links] = field(default_factory=dict)
+    slots: dict[str, BoundSocket] = field(default_factory=dict)
+    links: dict[str, ProcessSockets] = field(default_factory=dict)
 
     def addresses(self, take: Callable[[], str]) -> dict[str, str]:
         """Every slot's key with the address bound there, open ones filled by `take()`."""
         return {key: slot.address or take() for key, slot in self.slots.items()}
 
 
-def read_wires(part: Part, placed: Callable[..., Place], findings: Findings) -> Wires:
+def read_wires(part: ExperimentPart, placed: Callable[..., SourceLocation], findings: Findings) -> WiringKeys:
     """What the wiring keys of a component mean; reports what doesn't fit them."""
-    wires = Wires()
+    wires = WiringKeys()
     for key, kinds in WIRE_KEYS.items():
         if key not in part.own:
             continue
@@ -96,7 +96,7 @@ def _kind(table: Any) -> str:
     return wire.value if wire else "table"
 
 
-def _apply_address(wires: Wires, key: str, address: str) -> None:
+def _apply_address(wires: WiringKeys, key: str, address: str) -> None:
     match key:
         case "subscriber":
             wires.subscribe = [address]
@@ -110,31 +110,31 @@ def _apply_address(wires: Wires, key: str, address: str) -> None:
             wires.cache_out = address
 
 
-def _apply_table(wires: Wires, table: Mapping[str, Any]) -> None:
+def _apply_table(wires: WiringKeys, table: Mapping[str, Any]) -> None:
     match wire_of(table):
-        case Wire.PUBLISHER:
+        case WiringClass.PUBLISHER:
             wires.publish = table.get("url")
-        case Wire.SUBSCRIBER:
+        case WiringClass.SUBSCRIBER:
             _add_subscriber(wires, table)
-        case Wire.COMBINED:
+        case WiringClass.COMBINED:
             for one in table.get("subs", ()):
                 if isinstance(one, dict):
                     _add_subscriber(wires, one)
-        case Wire.CLIENT:
+        case WiringClass.CLIENT:
             wires.control = table.get("url")
             _apply_timeouts(wires, table)
-        case Wire.SERVER:
+        case WiringClass.SERVER:
             wires.serve = table.get("url")
-        case Wire.ROUTER:
+        case WiringClass.ROUTER:
             wires.serve, wires.control = table.get("router_url"), table.get("server_url")
             _apply_timeouts(wires, table)
-        case Wire.CACHE:
+        case WiringClass.CACHE:
             wires.cache_out, wires.cache_in = table.get("url"), table.get("sub_url")
             logic = table.get("update_cache_kwargs")
             wires.cache_logic = logic.get("cache_logic") if isinstance(logic, dict) else None
 
 
-def _add_subscriber(wires: Wires, table: Mapping[str, Any]) -> None:
+def _add_subscriber(wires: WiringKeys, table: Mapping[str, Any]) -> None:
     urls = table.get("sub_url", ())
     wires.subscribe = [*(wires.subscribe or ()), *([urls] if isinstance(urls, str) else urls)]
     topics = table.get("topics_to_sub")
@@ -142,7 +142,7 @@ def _add_subscriber(wires: Wires, table: Mapping[str, Any]) -> None:
         wires.envelopes = [*(wires.envelopes or ()), *([topics] if isinstance(topics, str) else topics)]
 
 
-def _apply_timeouts(wires: Wires, table: Mapping[str, Any]) -> None:
+def _apply_timeouts(wires: WiringKeys, table: Mapping[str, Any]) -> None:
     timeout_ms, retries = table.get("request_timeout_ms"), table.get("request_retries")
     if isinstance(timeout_ms, int | float):
         wires.request_timeout_s = timeout_ms / 1000
@@ -151,27 +151,27 @@ def _apply_timeouts(wires: Wires, table: Mapping[str, Any]) -> None:
 
 
 def connect(
-    parts: Sequence[Part],
+    parts: Sequence[ExperimentPart],
     roles: Mapping[str, Role],
-    declared: Mapping[str, Declared],
-    wires: Mapping[str, Wires],
-    placed: Callable[..., Place],
-) -> Net:
+    declared: Mapping[str, ComponentDeclaration],
+    wires: Mapping[str, WiringKeys],
+    placed: Callable[..., SourceLocation],
+) -> Wiring:
     """Fill in what the wiring keys leave out."""
-    net = Net()
+    net = Wiring()
     scheduler = next((p.name for p in parts if roles.get(p.name) is Role.SCHEDULER), None)
     translator = next((p.name for p in parts if roles.get(p.name) is Role.TRANSLATOR), None)
-    above = wires[scheduler] if scheduler else Wires()
+    above = wires[scheduler] if scheduler else WiringKeys()
 
     def slot(owner: str, use: str, address: str | None, key: str) -> str:
-        net.slots[f"{owner}/{use}"] = Slot(owner, use, address, key, placed(owner, key))
+        net.slots[f"{owner}/{use}"] = BoundSocket(owner, use, address, key, placed(owner, key))
         return f"{owner}/{use}"
 
     if translator:
         own = wires[translator]
         data = slot(translator, "publish", own.publish or above.cache_in, "publisher")
         asked = slot(translator, "serve", own.serve or above.control, "control_server")
-        net.links[translator] = Links(publish=data, serve=asked)
+        net.links[translator] = ProcessSockets(publish=data, serve=asked)
     if scheduler:
         out = slot(scheduler, "publish", above.cache_out, "pubsubcache")
         router = slot(scheduler, "serve", above.serve, "router")
@@ -179,7 +179,7 @@ def connect(
         if translator:
             source = source or f"{translator}/publish"
             target = target or f"{translator}/serve"
-        net.links[scheduler] = Links(out, (source,) if source else (), router, target)
+        net.links[scheduler] = ProcessSockets(out, (source,) if source else (), router, target)
     others = [p for p in parts if roles.get(p.name) is Role.COMPONENT]
     for part in others:
         if wires[part.name].publish or declared[part.name].publishes:
@@ -187,7 +187,7 @@ def connect(
     for part in others:
         own = wires[part.name]
         publish = f"{part.name}/publish"
-        net.links[part.name] = Links(
+        net.links[part.name] = ProcessSockets(
             publish=publish if publish in net.slots else None,
             subscribe=_sources(part, own, scheduler, above, declared, net),
             control=own.control or (f"{scheduler}/serve" if scheduler else None),
@@ -196,7 +196,12 @@ def connect(
 
 
 def _sources(
-    part: Part, own: Wires, scheduler: str | None, above: Wires, declared: Mapping[str, Declared], net: Net
+    part: ExperimentPart,
+    own: WiringKeys,
+    scheduler: str | None,
+    above: WiringKeys,
+    declared: Mapping[str, ComponentDeclaration],
+    net: Wiring,
 ) -> tuple[str, ...]:
     """Where a component subscribes: as said, else at the scheduler and at those who publish what it listens to."""
     if own.subscribe is not None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from afspm.formatting import area, lengths, place
+from afspm.formatting import area_text, lengths_text, position_text
 from afspm.logic.arbitration import ArbitrationState, ControlEvent, ControlInput, Rules, Transition
 from afspm.model import (
     RESTART_REQUEST,
@@ -76,12 +76,12 @@ def _scan_parameters(subject: Any, problems: ProblemNames) -> str:
     region, shape = subject.region, subject.shape
     parts = []
     if isinstance(region, Region):
-        parts.append(f"{area(region.size_m)} at {place(region.center_m)}")
+        parts.append(f"{area_text(region.size_m)} at {position_text(region.center_m)}")
         if region.angle_rad:
             parts.append(f"turned by {math.degrees(region.angle_rad):.5g} deg")
     elif isinstance(region, RegionChange):
         given = {"left": region.left_m, "low": region.low_m, "width": region.width_m, "height": region.height_m}
-        parts += [f"{name} {lengths([value_m])}" for name, value_m in given.items() if value_m is not None]
+        parts += [f"{name} {lengths_text([value_m])}" for name, value_m in given.items() if value_m is not None]
         if region.angle_rad is not None:
             parts.append(f"angle {math.degrees(region.angle_rad):.5g} deg")
     if isinstance(shape, ShapeChange):
@@ -102,10 +102,10 @@ def _feedback(subject: Any, problems: ProblemNames) -> str:
 
 def _position(subject: Any, problems: ProblemNames) -> str:
     if isinstance(subject, ProbePosition):
-        return f"probe position: {place(subject.xy_m)}"
+        return f"probe position: {position_text(subject.xy_m)}"
     if isinstance(subject, PositionChange):
         given = {"x": subject.x_m, "y": subject.y_m}
-        parts = [f"{name} = {lengths([value_m])}" for name, value_m in given.items() if value_m is not None]
+        parts = [f"{name} = {lengths_text([value_m])}" for name, value_m in given.items() if value_m is not None]
         return f"probe position: {', '.join(parts)}"
     return "probe position"
 

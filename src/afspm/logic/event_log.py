@@ -10,8 +10,8 @@ from afspm.logic.arbitration import ArbitrationState, ControlInput, Transition
 from afspm.logic.descriptions import asked
 from afspm.model import (
     CLOCK_REQUEST,
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
     JournalEntries,
     JournalEntry,
     ProblemNames,
@@ -30,7 +30,7 @@ LONGEST = 1000
 REQUEST, CONTROL, ORDER = "request", "control", "order"
 SCHEDULER = "scheduler"
 """Who asks for what nobody else did."""
-_UNWRITTEN = frozenset({CLOCK_REQUEST, TELL_REQUEST})
+_UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
 
 _Answered = tuple[int, str, Request, Response, float, str]
 

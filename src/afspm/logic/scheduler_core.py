@@ -51,8 +51,8 @@ from afspm.logic.watchdog import Watchdog
 from afspm.model import (
     CLOCK_REQUEST,
     HAS_ENDED,
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
     ControlMode,
     ControlResponse,
     ControlState,
@@ -307,7 +307,7 @@ class SchedulerCore:
             return
         if not self._pipeline.take(event, now_s):
             return
-        if kind == TELL_REQUEST:  # a supervisor's last words come after the end
+        if kind == RELAY_REQUEST:  # a supervisor's last words come after the end
             self._follow(event, self._bulletin.told(event, now_s, now_ns))
             self._farewell.told(self._bulletin.telling.states_of(event.name), now_s)
         elif self.control.ended:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from afspm.formatting import lasting
+from afspm.formatting import duration_text
 from afspm.logic.events import Codec, RequestIn
 from afspm.model import (
     LogLines,
@@ -15,11 +15,11 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Progress,
-    Told,
+    RelayedMessage,
     component_of,
     is_process_name,
 )
-from afspm.model.journal import LONGEST_PROCESS_NAME, PERSON
+from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 
 SUPERVISOR = "supervisor"
 """Whose key it takes, where there are keys, to speak of processes; each supervisor adds ":" and what tells it apart."""
@@ -78,7 +78,7 @@ class SupervisorRegistry:
     def envelope(self, event: RequestIn, now_s: float) -> tuple[str, str]:
         """The envelope under which to publish what is told, or "" and why it is not."""
         told = event.request.subject
-        if not isinstance(told, Told):
+        if not isinstance(told, RelayedMessage):
             return "", "nothing is told"
         if len(told.payload) > LONGEST:
             return "", f"{len(told.payload)} bytes are told at once, at most {LONGEST} may be"
@@ -134,7 +134,7 @@ class SupervisorRegistry:
             return f"no supervisor has a process {process!r}; known: {', '.join(known) or 'none'}"
         newest = max(having.values(), key=lambda one: now_s if one.told_s is None else one.told_s)
         if newest.told_s is not None and now_s - newest.told_s > SILENT_S:
-            return f"the supervisor of {process} has not been heard of for {lasting(now_s - newest.told_s)}"
+            return f"the supervisor of {process} has not been heard of for {duration_text(now_s - newest.told_s)}"
         if process not in newest.orders:
             newest.orders.append(process)
         return ""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from afspm.model.control import HAS_ENDED, Parameter, Request, Response
 from afspm.model.enums import (
     CLOCK_REQUEST,
     OTHER_RUN_RESPONSE,
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -16,8 +15,7 @@ from afspm.model.enums import (
     ScopeState,
     request_name,
 )
-from afspm.model.geometry import Frame, Region, RegionChange
-from afspm.model.journal import (
+from afspm.model.events import (
     JournalEntries,
     JournalEntry,
     LogLine,
@@ -26,14 +24,16 @@ from afspm.model.journal import (
     ProcessState,
     ProcessStates,
     Progress,
-    Told,
+    RelayedMessage,
     component_of,
     is_process_name,
 )
-from afspm.model.lines import ScanLines
+from afspm.model.geometry import Frame, Region, RegionChange
 from afspm.model.packet import Packet, PacketHeader
 from afspm.model.problems import ProblemNames
+from afspm.model.requests import HAS_ENDED, Parameter, Request, Response
 from afspm.model.scan import Scan, ScanParameters, ScanSet, ShapeChange
+from afspm.model.scan_lines import ScanLines
 from afspm.model.spectrum import Spectrum
 from afspm.model.state import ControlState, Feedback, PositionChange, ProbePosition, ScopeStatus
 
@@ -42,7 +42,7 @@ __all__ = [
     "HAS_ENDED",
     "OTHER_RUN_RESPONSE",
     "RESTART_REQUEST",
-    "TELL_REQUEST",
+    "RELAY_REQUEST",
     "ControlMode",
     "ControlRequest",
     "ControlResponse",
@@ -77,7 +77,7 @@ __all__ = [
     "ScopeStatus",
     "ShapeChange",
     "Spectrum",
-    "Told",
+    "RelayedMessage",
     "component_of",
     "is_process_name",
     "request_name",

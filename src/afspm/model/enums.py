@@ -56,7 +56,7 @@ class ControlRequest(IntEnum):
 
 CLOCK_REQUEST = 101
 """A request of ours, not in version 1: what time it is in the experiment."""
-TELL_REQUEST = 102
+RELAY_REQUEST = 102
 """A request of ours, not in version 1: a supervisor has something to publish; its answer are orders to it."""
 RESTART_REQUEST = 103
 """A request of ours, not in version 1: a process is to be started anew; its subject is the process's name."""
@@ -64,7 +64,7 @@ RESTART_REQUEST = 103
 OTHER_RUN_RESPONSE = 100
 """A response of ours, not in version 1, and only to those who named their run: it is not that of the scheduler."""
 
-_OURS = {CLOCK_REQUEST: "CLOCK", TELL_REQUEST: "TELL", RESTART_REQUEST: "RESTART"}
+_OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "TELL", RESTART_REQUEST: "RESTART"}
 
 
 def request_name(kind: int) -> str:

@@ -159,7 +159,7 @@ class Scan:
         Raises:
             InvalidValue: what is not finite, or a sample as fast as the scan.
         """
-        from afspm.model.undistort import undistorted
+        from afspm.model.drift_removal import undistorted
 
         values = undistorted(self.values, self.region, velocity_m_s, duration_s, upwards=upwards)
         return replace(self, values=values)
@@ -193,7 +193,7 @@ class Scan:
         Raises:
             InvalidValue: there is no such kind, or nothing was measured.
         """
-        from afspm.model.views import draw
+        from afspm.model.plotting import draw
 
         return draw(self, kind, axes)
 
@@ -247,7 +247,7 @@ class Scan:
         )
 
     def _repr_html_(self) -> str:
-        from afspm.model.picture import scan_html
+        from afspm.model.notebook import scan_html
 
         return scan_html(self)
 

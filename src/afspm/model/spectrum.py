@@ -78,6 +78,6 @@ class Spectrum:
         return xarray.Dataset(columns, {swept: (swept, self[swept], {"units": self.units[0]})}, attributes)
 
     def _repr_html_(self) -> str:
-        from afspm.model.picture import spectrum_html
+        from afspm.model.notebook import spectrum_html
 
         return spectrum_html(self)

@@ -10,7 +10,7 @@ from typing import Any
 from afspm import wire
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import TransportError, WireError
-from afspm.model import CLOCK_REQUEST, TELL_REQUEST, ControlResponse, Packet, Response
+from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
 from afspm.transport.complaints import Complaints
 from afspm.transport.history import Published
 from afspm.transport.network import Network
@@ -141,6 +141,6 @@ class Replayer:
         if request.kind == CLOCK_REQUEST:
             told = {**self._clock.as_dict(), "now_ns": self._clock.now_ns()}
             return Response(int(ControlResponse.SUCCESS), json.dumps(told).encode(), "", request.id)
-        if request.kind == TELL_REQUEST:  # a supervisor of those who listen: it has nobody to tell
+        if request.kind == RELAY_REQUEST:  # a supervisor of those who listen: it has nobody to tell
             return Response(int(ControlResponse.SUCCESS), wire.encode_orders(()), "", request.id)
         return Response(int(ControlResponse.FAILURE), reason=REASON, id=request.id)

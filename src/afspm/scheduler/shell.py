@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
-from afspm.model import HAS_ENDED, TELL_REQUEST, ControlRequest, ControlResponse, Packet, Request, Response
+from afspm.model import HAS_ENDED, RELAY_REQUEST, ControlRequest, ControlResponse, Packet, Request, Response
 from afspm.storage.atomic import OutageLog
 from afspm.storage.disk import DEADLINE_S, SYNCER, DiskThread
 from afspm.transport.fair_queue import FairQueue
@@ -38,7 +38,7 @@ _CLOSED_WITHIN_S = 5.0
 _MOST_A_TURN = 20
 """Requests that are handled before everything else is looked at again: the component in control waits no longer."""
 _TOO_MANY = "too many requests of this client wait to be answered: ask again once others are"
-_TELL = bytes([TELL_REQUEST])
+_TELL = bytes([RELAY_REQUEST])
 
 
 class Core(Protocol):

@@ -13,7 +13,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-from afspm.errors import ConfigError, Gathered, each
+from afspm.errors import ConfigError, ErrorCollector, individual_errors
 
 T = TypeVar("T")
 
@@ -30,7 +30,7 @@ def build(cls: type[T], settings: object, where: str) -> T:
     hints = typing.get_type_hints(cls)
     names = _names(cls)
     values: dict[str, object] = {}
-    errors = Gathered()
+    errors = ErrorCollector()
     for key, value in settings.items():
         at = f"{where}.{key}"
         if key not in names:
@@ -42,7 +42,7 @@ def build(cls: type[T], settings: object, where: str) -> T:
     try:
         made = cls(**values)
     except ConfigError as error:
-        for one in each(error):
+        for one in individual_errors(error):
             if known or one.where in values:  # else it may be about what was left out above
                 errors.add(ConfigError(one.what, where=f"{where}.{one.where}" if one.where else where, hint=one.hint))
     except TypeError:
@@ -73,7 +73,7 @@ def check(settings: object, *, above_zero: str = "", from_zero: str = "", fracti
 
     A fraction lies in [0, 1]. Raises ConfigError with the attribute as `where`, for all of them at once.
     """
-    errors = Gathered()
+    errors = ErrorCollector()
     rules: tuple[tuple[str, str, Callable[[float], bool]], ...] = (
         (above_zero, "above zero", lambda value: value > 0),
         (from_zero, "zero or more", lambda value: value >= 0),
@@ -129,7 +129,7 @@ def _sequence(arguments: tuple[Any, ...], value: object, where: str) -> tuple[ob
 
 
 def _gathered(pairs: Iterable[tuple[Any, object]], where: str) -> list[object]:
-    errors, found = Gathered(), []
+    errors, found = ErrorCollector(), []
     for i, (hint, item) in enumerate(pairs):
         with errors:
             found.append(_convert(hint, item, f"{where}[{i}]"))

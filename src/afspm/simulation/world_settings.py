@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from afspm.errors import ConfigError, Gathered
+from afspm.errors import ConfigError, ErrorCollector
 from afspm.simulation import spectra
 from afspm.simulation.drift import DriftSettings
 from afspm.simulation.feedback import FeedbackSettings
@@ -58,7 +58,7 @@ def read_settings(settings: Mapping[str, Any]) -> tuple[object, WorldSettings]:
     """
     tables = dict(settings)
     names = ["surface", *WorldSettings.__dataclass_fields__]
-    errors = Gathered()
+    errors = ErrorCollector()
     for name in [name for name in tables if name not in names]:
         errors.add(ConfigError(f"no setting named {name!r}", where=f"simulation.{name}", hint=nearest(name, names)))
         del tables[name]

@@ -16,8 +16,8 @@ from typing import IO, Literal
 from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
 from afspm.exit_codes import ExitCode
-from afspm.supervisor.jobs import Job
-from afspm.supervisor.thinning import PAUSE_S, Thinning
+from afspm.supervisor.output_limit import PAUSE_S, OutputLimit
+from afspm.supervisor.windows_job import WindowsJob
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
 FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
@@ -96,7 +96,7 @@ class ChildProcess:
                 f"{command[0]} can't be started: {error}", where=name, hint="is it installed and executable?"
             ) from error
         self.pid = self._popen.pid
-        self._job = Job(self._popen, has_tip=has_tip)
+        self._job = WindowsJob(self._popen, has_tip=has_tip)
         self._fed = threading.Event()
         readers = [self._reader("stdout", self._popen.stdout), self._reader("stderr", self._popen.stderr)]
         threading.Thread(
@@ -161,7 +161,7 @@ class _Output:
     def __init__(self, name: str, pid: int, stream: Stream, tell: Callable[[ChildEvent], None]) -> None:
         self._name, self._pid, self._stream, self._tell = name, pid, stream, tell
         self._clock = ExperimentClock.real()
-        self._thinning = Thinning(self._clock.monotonic_s())
+        self._thinning = OutputLimit(self._clock.monotonic_s())
         self._lock = threading.Lock()
         self._pause: threading.Timer | None = None
 

@@ -19,15 +19,15 @@ from afspm.launch import Launch
 from afspm.logic.supervisor_registry import LONGEST
 from afspm.model import (
     OTHER_RUN_RESPONSE,
-    TELL_REQUEST,
+    RELAY_REQUEST,
     ControlResponse,
     LogLine,
     LogLines,
     ProcessState,
     ProcessStates,
+    RelayedMessage,
     Request,
     Response,
-    Told,
 )
 from afspm.process.context import new_session
 from afspm.transport.launching import open_port
@@ -49,25 +49,25 @@ _CLOSED_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Ordered:
+class RestartOrdered:
     """A process is to be started anew."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
-class SchedulerThere:
+class SchedulerAnswered:
     """The scheduler of this run has answered: components may ask it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Complaint:
+class ReportFailed:
     """The scheduler can't be told."""
 
     text: str
 
 
-News = Ordered | Complaint | SchedulerThere
+ReporterEvent = RestartOrdered | ReportFailed | SchedulerAnswered
 
 
 class Reporter:
@@ -83,7 +83,7 @@ class Reporter:
     """
 
     def __init__(self, launch: Launch, clock: Clock, supervisor: str) -> None:
-        self.post: Callable[[News], None] = lambda news: None
+        self.post: Callable[[ReporterEvent], None] = lambda news: None
         self._launch = launch
         self._clock = clock
         self._supervisor = supervisor
@@ -143,7 +143,7 @@ class Reporter:
             port = open_port(self._launch, ExperimentClock.real())
         except AfspmError as error:
             self._complain(str(error))
-            self.post(SchedulerThere())  # or not: there is no asking
+            self.post(SchedulerAnswered())  # or not: there is no asking
             return
         try:
             self._port = port
@@ -212,7 +212,7 @@ class Reporter:
             talk.asked = None
             if not talk.answered and incoming.response.code != OTHER_RUN_RESPONSE:
                 talk.answered = True
-                self.post(SchedulerThere())
+                self.post(SchedulerAnswered())
             self._answered(incoming.response)
 
     def _answered(self, response: Response) -> None:
@@ -226,12 +226,12 @@ class Reporter:
             self._complain(str(error))
             return
         for name in orders:
-            self.post(Ordered(name))
+            self.post(RestartOrdered(name))
 
     def _complain(self, why: str) -> None:
         if why not in self._complaints and len(self._complaints) < 100:
             self._complaints.add(why)
-            self.post(Complaint(f"the scheduler is not told how it is with the processes here: {why}"))
+            self.post(ReportFailed(f"the scheduler is not told how it is with the processes here: {why}"))
 
 
 class _Talk:
@@ -245,8 +245,8 @@ class _Talk:
 
     def ask(self, thing: ProcessStates | LogLines) -> None:
         self._count += 1
-        told = Told(*wire.encode(thing))
-        self.asked = Request(TELL_REQUEST, told, id=f"{self._name}/{self._session}/{self._count}")
+        told = RelayedMessage(*wire.encode(thing))
+        self.asked = Request(RELAY_REQUEST, told, id=f"{self._name}/{self._session}/{self._count}")
 
     def is_answer(self, response: Response) -> bool:
         return self.asked is not None and response.id == self.asked.id

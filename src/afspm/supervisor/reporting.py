@@ -11,7 +11,7 @@ from typing import Any
 
 from afspm.addresses import connectable
 from afspm.clock import Clock
-from afspm.experiment import Experiment, Role, Start
+from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.supervisor.reporter import Reporter
@@ -21,7 +21,7 @@ _LONGEST = 60
 
 def reporter(
     experiment: Experiment,
-    starts: Sequence[Start],
+    starts: Sequence[ProcessStart],
     clock: Clock,
     run: str = "",
     keys: Mapping[str, Any] | None = None,
@@ -44,7 +44,7 @@ def reporter(
     return Reporter(replace(launch, name=f"{SUPERVISOR}:{here}", keys=keys or launch.keys), clock, here)
 
 
-def _local(scheduler: Start) -> Launch | None:
+def _local(scheduler: ProcessStart) -> Launch | None:
     """How a scheduler is asked that is started here."""
     launch = scheduler.launch
     if scheduler.command or launch.sockets.serve is None:

@@ -13,19 +13,19 @@ from afspm.addresses import connectable
 from afspm.client.connect import GUEST, guest_facts
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
-from afspm.experiment import Experiment, Role, Start
+from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record import ahead
 from afspm.record.run_json import ENDED, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
-from afspm.supervisor import aftermath, common_clock, key_ring, reporting, run_folder
-from afspm.supervisor.aftermath import Ended
-from afspm.supervisor.common_clock import Common
+from afspm.supervisor import key_handout, post_run, reporting, run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
-from afspm.supervisor.supervisor import Outcome, Supervisor
+from afspm.supervisor.post_run import EndedRun
+from afspm.supervisor.run_identity import RunIdentity
+from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.supervisor.task import from_start
 
 TAKES_WHO_COMES = ""
@@ -39,7 +39,7 @@ CLOCK_FILE = "clock"
 
 
 @dataclass(frozen=True)
-class Options:
+class RunOptions:
     """How to run an experiment here and now, as far as the experiment file is not about it.
 
     Attributes:
@@ -59,15 +59,15 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Run:
+class FinishedRun:
     """What came of a run."""
 
     folder: Path
-    outcome: Outcome
+    outcome: RunOutcome
 
 
-def run(experiment: Experiment, options: Options = Options(), terminal: TextIO | None = None) -> Run:
-    """Run an experiment until it ends.
+def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: TextIO | None = None) -> FinishedRun:
+    """FinishedRun an experiment until it ends.
 
     Raises:
         ConfigError: the experiment file has errors, or the options don't fit it; nothing was started.
@@ -77,7 +77,7 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
     own = _own(experiment, options)
     # whatever is wrong is told before a folder is made
     first = _starts(experiment, options, own, FreePorts())
-    key_ring.hand_over(experiment, first)
+    key_handout.hand_over(experiment, first)
     names = [start.launch.name for start in first]
     require_free(addresses_of(first))
     common = _common(experiment, first, own, options, terminal)
@@ -89,14 +89,14 @@ def run(experiment: Experiment, options: Options = Options(), terminal: TextIO |
 
 def go(
     experiment: Experiment,
-    options: Options,
-    common: Common,
+    options: RunOptions,
+    common: RunIdentity,
     folder: Path,
     name: str,
     terminal: TextIO | None,
     names: Sequence[str],
-) -> Run:
-    """Run an experiment in a folder that is there, and locked, until it ends.
+) -> FinishedRun:
+    """FinishedRun an experiment in a folder that is there, and locked, until it ends.
 
     Args:
         name: of the experiment; names: of its processes.
@@ -113,7 +113,7 @@ def go(
         if {start.launch.name for start in starts} & set(experiment.recorders):
             ahead.expect_record(folder / STATE_DIR)
         log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
-        handed = key_ring.hand_over(experiment, starts)
+        handed = key_handout.hand_over(experiment, starts)
         reporter = reporting.reporter(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
         supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter)
@@ -124,14 +124,14 @@ def go(
             run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
         except OSError as error:  # a full disk must not keep people from being told of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
-        ended = Ended(name, folder, outcome, common.simulated)
-        aftermath.follow(experiment, ended, starts, clock, log, with_report=options.report)
+        ended = EndedRun(name, folder, outcome, common.simulated)
+        post_run.follow(experiment, ended, starts, clock, log, with_report=options.report)
     finally:
         log.close()
-    return Run(folder, outcome)
+    return FinishedRun(folder, outcome)
 
 
-def addresses_of(starts: Sequence[Start]) -> dict[str, str]:
+def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
     """The addresses that are bound here, with the names of who will."""
     return {
         address: start.launch.name
@@ -141,7 +141,7 @@ def addresses_of(starts: Sequence[Start]) -> dict[str, str]:
     }
 
 
-def facts_to_resume(experiment: Experiment, starts: Sequence[Start], options: Options) -> dict[str, object]:
+def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], options: RunOptions) -> dict[str, object]:
     """What else run.json says, so that the run can be resumed with that file alone.
 
     There the recorder and others that go where the scheduler is are named like all the rest, and so are chosen by name.
@@ -155,13 +155,13 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[Start], options: Op
     }
 
 
-def dry_run(experiment: Experiment, options: Options = Options()) -> list[Start]:
+def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
     """What `run` would start, and nothing else. Raises as `run` does."""
     experiment.require_valid()
     return _starts(experiment, options, _own(experiment, options), FreePorts())
 
 
-def run_facts(name: str, starts: Sequence[Start], common: Common) -> dict[str, object]:
+def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) -> dict[str, object]:
     """What run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
     facts: dict[str, object] = {
         "name": name,
@@ -181,7 +181,7 @@ def run_facts(name: str, starts: Sequence[Start], common: Common) -> dict[str, o
     return facts if host is None else {**facts, GUEST: guest_facts(host)}
 
 
-def _example_of_a_guest(starts: Sequence[Start]) -> Launch | None:
+def _example_of_a_guest(starts: Sequence[ProcessStart]) -> Launch | None:
     """The launch line of somebody who is connected as a guest would be; None where that can't be known."""
     by_role = {start.role: start.launch for start in reversed(starts)}
     scheduler = by_role.get(Role.SCHEDULER)
@@ -196,8 +196,8 @@ def _example_of_a_guest(starts: Sequence[Start]) -> Launch | None:
 
 
 def _starts(
-    experiment: Experiment, options: Options, common: Common, ports: FreePorts, folder: Path | None = None
-) -> list[Start]:
+    experiment: Experiment, options: RunOptions, common: RunIdentity, ports: FreePorts, folder: Path | None = None
+) -> list[ProcessStart]:
     starts = experiment.launches(
         take_address=ports.address,
         only=options.only,
@@ -214,7 +214,7 @@ def _starts(
     return starts
 
 
-def _own(experiment: Experiment, options: Options) -> Common:
+def _own(experiment: Experiment, options: RunOptions) -> RunIdentity:
     """What this part of the experiment would have by itself."""
     simulated = experiment.simulated(options.only, options.without)
     clock, speed = experiment.clock(), options.speed
@@ -222,12 +222,16 @@ def _own(experiment: Experiment, options: Options) -> Common:
         raise ConfigError("a real microscope has real time", where="--speed", hint="leave --speed away")
     if speed is not None:
         clock = replace(clock, speed=speed)
-    return Common(clock, common_clock.new_identity(), simulated)
+    return RunIdentity(clock, run_identity.new_identity(), simulated)
 
 
 def _common(
-    experiment: Experiment, starts: Sequence[Start], own: Common, options: Options, terminal: TextIO | None
-) -> Common:
+    experiment: Experiment,
+    starts: Sequence[ProcessStart],
+    own: RunIdentity,
+    options: RunOptions,
+    terminal: TextIO | None,
+) -> RunIdentity:
     """What the whole experiment has, of which perhaps only a part is started here: it is the scheduler's.
 
     Raises:
@@ -242,7 +246,7 @@ def _common(
         return own if Role.SCHEDULER in roles.values() else replace(own, run=TAKES_WHO_COMES)
     if Role.COMPONENT not in roles.values() and not experiment.resolved.simulated:
         return replace(own, run=TAKES_WHO_COMES)
-    common = common_clock.of_scheduler(launch, lambda text: print(text, file=terminal, flush=True))
+    common = run_identity.ask_scheduler(launch, lambda text: print(text, file=terminal, flush=True))
     if options.speed is not None and common.clock.speed != options.speed:
         raise ConfigError(
             f"the experiment goes at {common.clock.speed:g}",

@@ -11,7 +11,7 @@ from types import FrameType
 
 
 @dataclass(frozen=True, slots=True)
-class Signalled:
+class EndSignal:
     """Somebody wants the run to end."""
 
     number: int
@@ -26,7 +26,7 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
 
 
 @contextmanager
-def told(tell: Callable[[Signalled], None], wakeup_fd: int) -> Iterator[None]:
+def told(tell: Callable[[EndSignal], None], wakeup_fd: int) -> Iterator[None]:
     """While in this block, signals that end a program are told instead; `wakeup_fd` is written to with each.
 
     A signal that is ignored already (SIGHUP under nohup) stays ignored. Away from the main thread Python gives no
@@ -37,7 +37,7 @@ def told(tell: Callable[[Signalled], None], wakeup_fd: int) -> Iterator[None]:
         return
 
     def handle(number: int, _frame: FrameType | None) -> None:
-        tell(Signalled(number))
+        tell(EndSignal(number))
 
     before = {}
     for number in (getattr(signal, name) for name in _NAMES if hasattr(signal, name)):

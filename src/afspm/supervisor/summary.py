@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
-from afspm.formatting import lasting
+from afspm.formatting import duration_text
 from afspm.record.run import open_run
 from afspm.record.run_lock import resume_command
 from afspm.storage.disk import DiskTimeout, run_bounded
 from afspm.supervisor.ending import Why
 
 if TYPE_CHECKING:
-    from afspm.supervisor.supervisor import Outcome
+    from afspm.supervisor.supervisor import RunOutcome
 
 COUNTED_WITHIN_S = 20.0
 TABLE = "metadata.csv"  # of the component Metadata
 
 
-def lines(outcome: Outcome, folder: Path) -> list[str]:
+def lines(outcome: RunOutcome, folder: Path) -> list[str]:
     """The summary: why it ended, what ran, what had to be restarted or was given up, where everything is."""
-    told = [f"{outcome.text}, after {lasting(outcome.duration_s)}"]
+    told = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
     told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
         if (restarts := report.starts - 1 - report.ordered) > 0:

@@ -21,15 +21,15 @@ from afspm.logic import supervision
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.supervisor import signals
+from afspm.supervisor.activity_monitor import ActivityMonitor
+from afspm.supervisor.clock_check import ClockCheck
 from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed, describe_exit
+from afspm.supervisor.process_status import ProcessStatus
 from afspm.supervisor.reaper import Reaper
-from afspm.supervisor.reporter import Complaint, News, Ordered, Reporter, SchedulerThere
-from afspm.supervisor.standing import Standing
+from afspm.supervisor.reporter import Reporter, ReporterEvent, ReportFailed, RestartOrdered, SchedulerAnswered
 from afspm.supervisor.task import Task
-from afspm.supervisor.vital_signs import VitalSigns
-from afspm.supervisor.wall import Wall
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 from afspm.transport.wakeup import WakeUp
 
@@ -43,7 +43,7 @@ START_AT_THE_END_S = 15.0  # what is started again at the end has so long to com
 
 
 @dataclass(frozen=True)
-class Report:
+class ProcessReport:
     """What became of one process: how often it was started, of that how often since it was ordered, whether it was
     given up, how it ended last."""
 
@@ -55,12 +55,12 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """How a run ended."""
 
     why: Why
     text: str
-    reports: tuple[Report, ...]
+    reports: tuple[ProcessReport, ...]
     duration_s: float
 
     @property
@@ -82,7 +82,7 @@ class _Child:
     up: bool = False
     beat: Heartbeat | None = None
     beat_s: float = 0.0
-    signs: VitalSigns | None = None
+    signs: ActivityMonitor | None = None
     works: bool | None = None  # though it does not beat; None: that is not known
     given_up: bool = False
     last_exit: str = ""
@@ -108,7 +108,7 @@ class _Child:
         if self.process is None or not self.up or now_s < self.beat_s + lately_s:
             self.signs = self.works = None
             return
-        self.signs = self.signs or VitalSigns(self.process.pid, lately_s)
+        self.signs = self.signs or ActivityMonitor(self.process.pid, lately_s)
         self.works = self.signs.work(now_s)
 
     def look_at_s(self, liveness: LivenessPolicy) -> float | None:
@@ -160,12 +160,12 @@ class Supervisor:
     ) -> None:
         self._log = log
         self._reporter = reporter
-        self._standing = Standing(clock, policy.liveness)
+        self._standing = ProcessStatus(clock, policy.liveness)
         self._looked_s = -math.inf
         self._clock = clock
-        self._wall = Wall(clock, lambda text: log.write(LOGGED_AS, logging.WARNING, text))
+        self._wall = ClockCheck(clock, lambda text: log.write(LOGGED_AS, logging.WARNING, text))
         self._policy = policy
-        self._wakeup: WakeUp[ChildEvent | signals.Signalled | News] = WakeUp()
+        self._wakeup: WakeUp[ChildEvent | signals.EndSignal | ReporterEvent] = WakeUp()
         self._beats = HeartbeatListener(self._wakeup)
         self._reaper = Reaper()
         self._children = {task.name: self._child(task) for task in tasks}
@@ -182,7 +182,7 @@ class Supervisor:
         launch = replace(task.launch, beat_token=token, sockets=replace(task.launch.sockets, heartbeat=address))
         return _Child(replace(task, launch=launch), watch)
 
-    def run(self) -> Outcome:
+    def run(self) -> RunOutcome:
         """Start everything; returns when nothing of it runs any more."""
         began_s = self._clock.monotonic_s()
         self._reaper.begin()
@@ -208,14 +208,14 @@ class Supervisor:
             self._wakeup.close()
             self._reaper.close()
         reports = tuple(
-            Report(child.name, child.starts, child.given_up, child.last_exit, child.ordered)
+            ProcessReport(child.name, child.starts, child.given_up, child.last_exit, child.ordered)
             for child in self._children.values()
         )
-        return Outcome(self._ending.why, self._ending.text, reports, self._clock.monotonic_s() - began_s)
+        return RunOutcome(self._ending.why, self._ending.text, reports, self._clock.monotonic_s() - began_s)
 
     def stop(self) -> None:
         """End the run as Ctrl-C does. From any thread; a second call kills at once."""
-        self._wakeup.post(signals.Signalled(signal.SIGINT))
+        self._wakeup.post(signals.EndSignal(signal.SIGINT))
 
     # --- what comes in ---
 
@@ -231,7 +231,7 @@ class Supervisor:
                 self._log.write(child.name, logging.DEBUG, "is up")
             self._carry_out(child, child.watch.beat(beat, now_s))
         # whoever wants it to end does not wait behind what the processes say
-        for event in sorted(self._wakeup.take(), key=lambda event: not isinstance(event, signals.Signalled)):
+        for event in sorted(self._wakeup.take(), key=lambda event: not isinstance(event, signals.EndSignal)):
             match event:
                 case Printed():
                     self._on_printed(self._children[event.name], event)
@@ -240,13 +240,13 @@ class Supervisor:
                     self._log.write(event.name, logging.WARNING, told)
                 case Exited():
                     self._on_exited(self._children[event.name], event)
-                case signals.Signalled():
+                case signals.EndSignal():
                     self._on_signal(event)
-                case Ordered():
+                case RestartOrdered():
                     self._on_ordered(event.name)
-                case SchedulerThere():
+                case SchedulerAnswered():
                     self._scheduler_is_there.set()
-                case Complaint():
+                case ReportFailed():
                     self._log.write(LOGGED_AS, logging.WARNING, event.text)
 
     def _timeout_s(self) -> float | None:
@@ -293,7 +293,7 @@ class Supervisor:
         elif exited.code == ExitCode.DONE and child.task.essential:
             self._end(Why.EXPERIMENT_ENDED, f"{child.name} is done")
 
-    def _on_signal(self, signalled: signals.Signalled) -> None:
+    def _on_signal(self, signalled: signals.EndSignal) -> None:
         if self._ending is None:
             self._end(Why.STOPPED, f"stopped by {signalled.name}")
         else:

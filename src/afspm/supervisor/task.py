@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from afspm.experiment import Role, Start
+from afspm.experiment import ProcessStart, Role
 from afspm.launch import Launch
 
 HOST = "afspm.process.host"
@@ -47,7 +47,7 @@ class Task:
         return self.role is not Role.COMPONENT
 
 
-def from_start(start: Start) -> Task:
+def from_start(start: ProcessStart) -> Task:
     """A task of what the experiment file says: Python classes by our host, other languages by our guard."""
     # -P: modules are those beside the experiment file, and never what happens to lie where the run was started
     python = (sys.executable, "-P", "-m")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from afspm import units
-from afspm.errors import AfspmError, ConfigError, Gathered, Refused, UnitError
+from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused, UnitError
 from afspm.model import ControlResponse, names
 
 Value = bool | int | float | str
@@ -232,7 +232,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             ConfigError: an attribute is unknown or has a value that it can't have; those of all rows at once.
         """
         table = dict(self._rows)
-        errors = Gathered()
+        errors = ErrorCollector()
         for name, given in rows.items():
             known = table.get(name, ParameterSpec(name, vendor=name, unit=names.BASE_PARAMETERS.get(name) or ""))
             with errors:
@@ -264,7 +264,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             ConfigError: a name or a value can't be; all of them at once.
         """
         values: dict[str, Value] = {}
-        errors = Gathered()
+        errors = ErrorCollector()
         for name, value in given.items():
             try:
                 values[name] = self._written(name, value)
@@ -300,7 +300,7 @@ def _row(known: ParameterSpec, given: Mapping[str, Any], where: str, *, translat
     at = f"{where}, parameters.{known.name}"
     if not isinstance(given, Mapping):
         raise ConfigError(f"a table is wanted, not {given!r}", where=at)
-    errors = Gathered()
+    errors = ErrorCollector()
     for key in given:
         if key not in _ATTRIBUTES:
             near = difflib.get_close_matches(key, _ATTRIBUTES, n=1)

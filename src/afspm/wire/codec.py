@@ -244,7 +244,7 @@ _ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
     model.ProcessStates: _plain_encoder("ProcessStates", journal.processes_to_wire),
     model.LogLines: _plain_encoder("LogLines", journal.log_to_wire),
     model.Progress: _plain_encoder("Progress", journal.progress_to_wire),
-    model.Told: _plain_encoder("Told", journal.told_to_wire),
+    model.RelayedMessage: _plain_encoder("Told", journal.told_to_wire),
 }
 
 _DECODERS: dict[str, Callable[[Buffer], Any]] = {

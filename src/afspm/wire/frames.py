@@ -12,8 +12,8 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm.errors import AfspmError, InvalidValue, WireError
 from afspm.model import (
     CLOCK_REQUEST,
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
     ControlRequest,
     ControlResponse,
     Packet,
@@ -219,7 +219,7 @@ _SUBJECTS: dict[int, Callable[[bytes], Any]] = {
     ControlRequest.SET_CONTROL_MODE: _number,
     ControlRequest.END_EXPERIMENT: _nothing,
     CLOCK_REQUEST: lambda p: None,
-    TELL_REQUEST: journal.told_from_wire,
+    RELAY_REQUEST: journal.told_from_wire,
     RESTART_REQUEST: _action,
     ControlRequest.ACTION_SUPPORT: _action,
 }

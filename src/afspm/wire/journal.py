@@ -114,16 +114,16 @@ def progress_from_wire(payload: Buffer) -> model.Progress:
     return model.Progress(time_ns(message.timestamp), message.name, message.done, message.of, left_s)
 
 
-def told_to_wire(told: model.Told) -> journal_pb2.Told:
+def told_to_wire(told: model.RelayedMessage) -> journal_pb2.Told:
     return journal_pb2.Told(message=told.message, payload=told.payload)
 
 
-def told_from_wire(payload: Buffer) -> model.Told:
+def told_from_wire(payload: Buffer) -> model.RelayedMessage:
     """Raises WireError: it names no message."""
     message = parse(journal_pb2.Told, payload)
     if not message.message:
         raise WireError("nothing is told: the name of the message is missing")
-    return model.Told(message.message, message.payload)
+    return model.RelayedMessage(message.message, message.payload)
 
 
 def encode_orders(restart: Iterable[str]) -> bytes:

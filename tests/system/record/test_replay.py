@@ -19,7 +19,7 @@ from afspm.client.follower import Follower
 from afspm.errors import ConfigError, RequestError, TransportError
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.store import RecordSettings, RecordStore
-from afspm.supervisor import replaying, resuming
+from afspm.supervisor import replay, resume
 
 START_NS = 1_773_518_400_000_000_000
 STEP_NS = 60_000_000_000  # experiment time between two packets
@@ -91,15 +91,15 @@ def test_a_notebook_joins_gets_what_was_published_and_is_refused_clearly(
 
 def test_it_ends_as_an_experiment_does_with_its_folder_saying_so(recorded: Path, tmp_path: Path) -> None:
     told: list[str] = []
-    options = replaying.Options(speed=1e6, only=["Scan2d"], runs=tmp_path / "runs")
-    assert replaying.replay(recorded, options, told.append) == SCANS
+    options = replay.ReplayOptions(speed=1e6, only=["Scan2d"], runs=tmp_path / "runs")
+    assert replay.replay(recorded, options, told.append) == SCANS
     assert "1e+06 experiment seconds a second" in told[0]
     (folder,) = (tmp_path / "runs").glob("replay-*")
     facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     assert (facts["replay_of"], facts["ended"]) == (str(recorded), "the replay is over")
     assert afspm.open_run(tmp_path / "runs").folder == recorded, "the newest is a replay: what it replays is meant"
     with pytest.raises(ConfigError, match="this is a replay"):
-        resuming.find(folder)
+        resume.find(folder)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there a program can't send these")
@@ -121,16 +121,16 @@ def test_one_that_is_stopped_says_so_in_its_folder_and_to_who_listens(
 
 def test_an_address_that_is_taken_leaves_no_folder(recorded: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        options = replaying.Options(publish=f"tcp://127.0.0.1:{taken.getsockname()[1]}", runs=tmp_path / "runs")
+        options = replay.ReplayOptions(publish=f"tcp://127.0.0.1:{taken.getsockname()[1]}", runs=tmp_path / "runs")
         with pytest.raises(TransportError):
-            replaying.replay(recorded, options, lambda _: None)
+            replay.replay(recorded, options, lambda _: None)
     assert not (tmp_path / "runs").exists()
 
 
 def test_what_cannot_be_replayed_is_told(recorded: Path, tmp_path: Path) -> None:
     for only, said in ((["Scan3d"], "no message 'Scan3d'"), (["Spec1d"], "nothing to replay")):
         with pytest.raises(ConfigError, match=said):
-            replaying.replay(recorded, replaying.Options(only=only, runs=tmp_path), lambda _: None)
+            replay.replay(recorded, replay.ReplayOptions(only=only, runs=tmp_path), lambda _: None)
 
 
 def test_the_addresses_of_the_experiment_file_are_taken(recorded: Path, tmp_path: Path) -> None:
@@ -141,8 +141,8 @@ def test_the_addresses_of_the_experiment_file_are_taken(recorded: Path, tmp_path
         encoding="utf-8",
     )
     with afspm.open_run(recorded) as run:
-        assert replaying._addresses(run, replaying.Options()) == ("tcp://127.0.0.1:19471", "tcp://127.0.0.1:19472")
-        assert replaying._addresses(run, replaying.Options(publish="tcp://127.0.0.1:1", serve="tcp://127.0.0.1:2")) == (
+        assert replay._addresses(run, replay.ReplayOptions()) == ("tcp://127.0.0.1:19471", "tcp://127.0.0.1:19472")
+        assert replay._addresses(run, replay.ReplayOptions(publish="tcp://127.0.0.1:1", serve="tcp://127.0.0.1:2")) == (
             "tcp://127.0.0.1:1",
             "tcp://127.0.0.1:2",
         )

@@ -15,8 +15,8 @@ from afspm.clock import NS_PER_S
 from afspm.errors import ConfigError, FileError
 from afspm.record.run_json import STATE_DIR
 from afspm.record.run_lock import lock_run
-from afspm.supervisor import resuming
-from afspm.supervisor.run import Options
+from afspm.supervisor import resume
+from afspm.supervisor.run import RunOptions
 
 EXPERIMENT = """
 [clock]
@@ -88,13 +88,13 @@ def test_a_stopped_run_goes_on_where_it_was_and_an_ended_one_does_not(tmp_path: 
     run = Path(output_until(first, "processes, into").strip().rpartition(", into ")[2])
     output_until(first, "is in control")
     with pytest.raises(FileError, match="still going on"):
-        resuming.resume(resuming.find(run), Options())
+        resume.resume(resume.find(run), RunOptions())
     first.kill()  # the supervisor alone: the others find out by themselves
     first.wait()
     assert first.stdout is not None
     first.stdout.close()
     before = memory(run)
-    seen_ns = resuming.last_seen_ns(run)
+    seen_ns = resume.last_seen_ns(run)
     again = afspm_run(away, "--resume", "runs")
     told = again.communicate(timeout=60.0)[0]
     assert again.returncode == 0, told
@@ -105,7 +105,7 @@ def test_a_stopped_run_goes_on_where_it_was_and_an_ended_one_does_not(tmp_path: 
     assert after["now_s"] - before["now_s"] < 6 * 3600, "time stands still while nobody is there"
     assert (run / "log.txt").read_text(encoding="utf-8").count("processes, into") == 2
     with pytest.raises(ConfigError, match="has ended"):
-        resuming.find(run)
+        resume.find(run)
 
 
 def test_a_killed_run_goes_on_with_a_dashboard_that_it_had_not(tmp_path: Path) -> None:
@@ -133,20 +133,20 @@ def test_a_run_that_has_a_dashboard_is_resumed_with_that_one(tmp_path: Path) -> 
     (tmp_path / "short.py").write_text(COMPONENT, encoding="utf-8")
     (tmp_path / "run.json").write_text("{}", encoding="utf-8")
     (tmp_path / "state").mkdir()
-    found = resuming.find(tmp_path)
+    found = resume.find(tmp_path)
     assert resumed_with_dashboard(found) == found
     assert found.added == ()
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileError):
-        resuming.find(tmp_path)
+        resume.find(tmp_path)
     (tmp_path / "run.json").write_text("{}", encoding="utf-8")
     with pytest.raises(FileError, match="not the folder of a run"):
-        resuming.find(tmp_path)
+        resume.find(tmp_path)
     (tmp_path / "run.json").write_text("half a", encoding="utf-8")
     with pytest.raises(FileError, match=r"run\.json"):
-        resuming.find(tmp_path)
+        resume.find(tmp_path)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no journal at all", b"SQLite format 3\0 and then nothing"])
@@ -155,7 +155,7 @@ def test_a_damaged_journal_does_not_keep_a_run_from_going_on(tmp_path: Path, con
     (tmp_path / "state" / "microscope.json").write_text('{"seen_ns": 17}', encoding="utf-8")
     if content is not None:
         (tmp_path / "journal.sqlite").write_bytes(content)
-    assert resuming.last_seen_ns(tmp_path) == 17
+    assert resume.last_seen_ns(tmp_path) == 17
 
 
 def test_a_lock_is_given_back_by_who_leaves(tmp_path: Path) -> None:

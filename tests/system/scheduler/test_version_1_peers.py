@@ -17,7 +17,7 @@ from afspm.client.link import ExperimentLink
 from afspm.clock import ExperimentClock
 from afspm.launch import Launch, Sockets
 from afspm.model import (
-    TELL_REQUEST,
+    RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
     LogLine,
@@ -26,14 +26,14 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Region,
+    RelayedMessage,
     Response,
     ScanLines,
     ScopeState,
     ScopeStatus,
-    Told,
 )
-from afspm.supervisor import common_clock
-from afspm.supervisor.reporter import Complaint, Reporter
+from afspm.supervisor import run_identity
+from afspm.supervisor.reporter import Reporter, ReportFailed
 from afspm.transport.network import Network
 from afspm.transport.port import Killed
 from afspm.transport.zmq_port import ZmqPort
@@ -88,7 +88,7 @@ def say_everything_of_ours(rig: Any, ours: Any) -> None:
         LogLines((LogLine(CLOCK.now_ns(), "one", "INFO", "a line"),)),
         ProcessStates(CLOCK.now_ns(), "here", (one,)),
     ):
-        assert ours.ask(TELL_REQUEST, Told(*wire.encode(thing))).ok
+        assert ours.ask(RELAY_REQUEST, RelayedMessage(*wire.encode(thing))).ok
     rig.publish_packet(*wire.encode(ScopeStatus(ScopeState.SCANNING)))
     rig.until(lambda: all(ours.packets(name) for name in ("JournalEntries", "LogLines", "ProcessStates", "ScanLines")))
 
@@ -256,7 +256,7 @@ def launch(router: Router) -> Launch:
 def test_our_supervisor_tells_their_scheduler_nothing_and_says_so_once(router: Router) -> None:
     reporter = Reporter(launch(router), CLOCK, "here")
     complaints: list[str] = []
-    reporter.post = lambda news: complaints.append(news.text) if isinstance(news, Complaint) else None
+    reporter.post = lambda news: complaints.append(news.text) if isinstance(news, ReportFailed) else None
     reporter.start()
     reporter.states((ProcessState("one", "component", ProcessCondition.ALIVE, CLOCK.now_ns()),), changed=True)
     reporter.line("one", 20, "a line")
@@ -269,7 +269,7 @@ def test_our_supervisor_tells_their_scheduler_nothing_and_says_so_once(router: R
 def test_with_their_scheduler_the_experiment_goes_by_real_time(router: Router) -> None:
     found: list[Any] = []
     told: list[str] = []
-    asking = threading.Thread(target=lambda: found.append(common_clock.of_scheduler(launch(router), told.append)))
+    asking = threading.Thread(target=lambda: found.append(run_identity.ask_scheduler(launch(router), told.append)))
     asking.start()
     until(lambda: found, router.pump)
     asking.join()
@@ -310,5 +310,5 @@ def test_our_component_asks_their_scheduler_what_version_1_has(port: ZmqPort, ro
     for kind, thing in requests:
         assert link.request(kind, thing).ok
         link.tell(LogLines(()))
-    assert not link.request(TELL_REQUEST, Told("Progress", b"")).ok
+    assert not link.request(RELAY_REQUEST, RelayedMessage("Progress", b"")).ok
     assert [frames[0][0] for _, frames in router.asked] == [12, *(int(kind) for kind, _ in requests)]

@@ -12,7 +12,7 @@ from afspm.clock import ExperimentClock
 from afspm.logic.supervision import ChildPolicy
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.reporter import Reporter
-from afspm.supervisor.supervisor import Outcome, Supervisor
+from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.supervisor.task import Task
 
 
@@ -28,7 +28,7 @@ def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
         log = RunLog(tmp_path / "log.txt", clock, terminal=terminal, level=0)  # type: ignore[arg-type]
         logs.append(log)
         supervisor = Supervisor(tasks, log, clock, policy, reporter)
-        outcomes: list[Outcome] = []
+        outcomes: list[RunOutcome] = []
 
         def run() -> None:
             try:

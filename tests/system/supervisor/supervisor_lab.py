@@ -15,7 +15,7 @@ from afspm.launch import Launch
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.restart import RestartPolicy
 from afspm.logic.supervision import ChildPolicy
-from afspm.supervisor.supervisor import Outcome, Supervisor
+from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.supervisor.task import Task
 
 DEADLINE_S = 20.0
@@ -69,17 +69,17 @@ class Running:
     supervisor: Supervisor
     terminal: Terminal
     thread: threading.Thread
-    outcomes: list[Outcome] = field(default_factory=list)
+    outcomes: list[RunOutcome] = field(default_factory=list)
 
     def pid(self, name: str, life: int = 1) -> int:
         """The process id of a task's n-th process."""
         return int(self.terminal.wait_for(f" {name} ", "started, process", count=life).rsplit(" ", 1)[1])
 
-    def stop(self) -> Outcome:
+    def stop(self) -> RunOutcome:
         self.supervisor.stop()
         return self.outcome()
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> RunOutcome:
         self.thread.join(DEADLINE_S)
         assert self.outcomes, "the run did not end:\n" + "\n".join(self.terminal.lines)
         return self.outcomes[0]

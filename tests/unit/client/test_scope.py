@@ -718,8 +718,8 @@ def test_of_progress_told_in_a_tight_loop_a_few_wait_and_the_newest_arrives(lab:
     scope.scan(REGION)
     for done in range(10_000):
         scope.progress(done, 10_000)
-    assert lab.count(model.TELL_REQUEST) == 4
+    assert lab.count(model.RELAY_REQUEST) == 4
     scope.sleep(1.0)
-    told = [request.subject for request in lab.requests if request.kind == model.TELL_REQUEST]
+    told = [request.subject for request in lab.requests if request.kind == model.RELAY_REQUEST]
     assert len(told) == 5
     assert wire.decode(told[-1].message, told[-1].payload).done == 9_999

@@ -12,7 +12,7 @@ from afspm.client.component import Component
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.exit_codes import ExitCode
-from afspm.model import TELL_REQUEST, ControlRequest, Problem, Progress
+from afspm.model import RELAY_REQUEST, ControlRequest, Problem, Progress
 
 
 def series(scans: int = 3, *, keep_control: bool = False, end_when_done: bool = True) -> ScanSeries:
@@ -181,7 +181,7 @@ def test_a_spectrum_is_taken_at_each_point_of_a_grid() -> None:
 
 
 def progress_of(lab: Lab) -> list[Progress]:
-    told = [request.subject for request in lab.requests if request.kind == TELL_REQUEST]
+    told = [request.subject for request in lab.requests if request.kind == RELAY_REQUEST]
     return [wire.decode(one.message, one.payload) for one in told]
 
 

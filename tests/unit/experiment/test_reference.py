@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from afspm.experiment import caching, limits, sections
-from afspm.experiment.known import WIRE_KEYS, WIRE_SETTINGS, Wire
+from afspm.experiment import cache_section, limits_section, sections
+from afspm.experiment.known import WIRE_KEYS, WIRE_SETTINGS, WiringClass
 from afspm.experiment.parts import DECLARED_KEYS, OWN_KEYS, SECTIONS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "experiment-file.md").read_text(encoding="utf-8")
-MODELS = [sections.Clock, sections.Control, sections.Roles, sections.Security, sections.Restart, sections.Record,
-          caching.Cache, caching.Rule, limits.ParameterLimit, limits.ActionLimit, limits.Whole, limits.Box]  # fmt: skip
+MODELS = [sections.ClockSection, sections.ControlSection, sections.RolesSection, sections.SecuritySection, sections.RestartSection, sections.RecordSection,
+          cache_section.CacheSection, cache_section.CacheRuleSection, limits_section.ParameterLimit, limits_section.ActionLimit, limits_section.LimitsSection, limits_section.RegionSection]  # fmt: skip
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
@@ -29,6 +29,6 @@ def test_every_section_and_key_of_a_component_is_on_the_page() -> None:
 
 
 def test_every_setting_of_the_wiring_that_means_something_is_on_the_page() -> None:
-    kinds = (Wire.PUBLISHER, Wire.SERVER, Wire.ROUTER, Wire.CLIENT)
+    kinds = (WiringClass.PUBLISHER, WiringClass.SERVER, WiringClass.ROUTER, WiringClass.CLIENT)
     keys = {key for kind in kinds for key in WIRE_SETTINGS[kind]} - {"get_envelope_for_proto"}
     assert [key for key in keys if f"`{key}`" not in PAGE] == []

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from afspm.experiment import classes, load
+from afspm.experiment import class_loader, load
 from afspm.launch import Launch
 from afspm.process import loading
 
@@ -191,7 +191,7 @@ def test_an_intermediary_class_of_one_s_own_is_made_by_the_process(write: Write,
     assert experiment.check() == []
     settings = experiment.resolved.settings["planner"]
     assert settings == {"plan": {"class": "parts.Plan", "size": 2e-6}, "more": [settings["plan"]]}
-    with classes.importing_from([tmp_path]):
+    with class_loader.importing_from([tmp_path]):
         made: Any = loading.load(Launch("planner", "parts.Planner", json.loads(json.dumps(settings))))
     assert (made.plan.size, made.plan.rounds, made.more[0].size) == (2e-6, 1, 2e-6)
 

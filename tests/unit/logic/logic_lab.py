@@ -25,7 +25,7 @@ from afspm.logic.events import (
 from afspm.logic.scheduler_core import SchedulerCore
 from afspm.logic.settings import SchedulerSettings
 from afspm.model import (
-    TELL_REQUEST,
+    RELAY_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -35,11 +35,11 @@ from afspm.model import (
     ProcessCondition,
     ProcessState,
     ProcessStates,
+    RelayedMessage,
     Request,
     Response,
     ScopeState,
     ScopeStatus,
-    Told,
 )
 from afspm.testing.deterministic.codec import TableCodec
 
@@ -141,7 +141,7 @@ class Lab:
     def tell(self, *states: ProcessState, supervisor: str = "supervisor:lab") -> list[Effect]:
         """A supervisor says how it is with its processes, and whatever is due because of that is done."""
         thing = ProcessStates(self.now_ns, supervisor.partition(":")[2], states)
-        self.ask(supervisor, TELL_REQUEST, Told("ProcessStates", self.codec.encode(thing)))
+        self.ask(supervisor, RELAY_REQUEST, RelayedMessage("ProcessStates", self.codec.encode(thing)))
         return self.step(Tick())
 
     def give_up(self, name: str) -> list[Effect]:

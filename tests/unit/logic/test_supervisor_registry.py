@@ -12,8 +12,8 @@ from afspm.logic.events import SaveState
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.supervisor_registry import LONGEST, SILENT_S
 from afspm.model import (
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -23,9 +23,9 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Progress,
+    RelayedMessage,
     Response,
     ScopeStatus,
-    Told,
 )
 
 HOST = "supervisor:host"
@@ -46,8 +46,8 @@ def states(*names: str, supervisor: str = "host") -> ProcessStates:
 
 
 def tell(lab: Lab, thing: Any, name: str = HOST, id_: str = "", user: str | None = None) -> Response:
-    told = Told(type(thing).__name__, lab.codec.encode(thing))
-    return replies(lab.ask(name, TELL_REQUEST, told, id_, user))[-1].response
+    told = RelayedMessage(type(thing).__name__, lab.codec.encode(thing))
+    return replies(lab.ask(name, RELAY_REQUEST, told, id_, user))[-1].response
 
 
 def orders(lab: Lab, response: Response) -> tuple[str, ...]:
@@ -94,14 +94,14 @@ def test_it_is_not_in_the_journal_and_changes_no_lease(lab: Lab) -> None:
 def test_nothing_else_is_published_for_others(lab: Lab, thing: Any) -> None:
     before = len(published(lab.effects))
     assert tell(lab, thing).code == ControlResponse.FAILURE
-    told = Told("ProcessStates", lab.codec.encode(thing))
-    assert replies(lab.ask(HOST, TELL_REQUEST, told))[-1].response.code == ControlResponse.FAILURE
+    told = RelayedMessage("ProcessStates", lab.codec.encode(thing))
+    assert replies(lab.ask(HOST, RELAY_REQUEST, told))[-1].response.code == ControlResponse.FAILURE
     assert len(published(lab.effects)) == before
 
 
 def test_what_is_too_long_or_nobodys_is_refused(lab: Lab) -> None:
-    told = Told("LogLines", b"0" * (LONGEST + 1))
-    assert "at most" in replies(lab.ask(HOST, TELL_REQUEST, told))[-1].response.reason
+    told = RelayedMessage("LogLines", b"0" * (LONGEST + 1))
+    assert "at most" in replies(lab.ask(HOST, RELAY_REQUEST, told))[-1].response.reason
     assert "whose" in tell(lab, states("a", supervisor="")).reason
 
 

@@ -17,7 +17,7 @@ from afspm.client.component import Component
 from afspm.launch import Launch, Sockets
 from afspm.logic import arbitration as a
 from afspm.model import (
-    TELL_REQUEST,
+    RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
     ControlState,
@@ -268,7 +268,7 @@ class Lab:
         }
         if request.kind in asks:
             return self.does(asks[request.kind], self.name, request.subject or 0)
-        if request.kind == TELL_REQUEST:
+        if request.kind == RELAY_REQUEST:
             return Response(ControlResponse.SUCCESS)
         reads = request.kind == ControlRequest.PARAM and request.subject.value is None
         if self.control.holder != self.name and not reads and request.kind != ControlRequest.ACTION_SUPPORT:

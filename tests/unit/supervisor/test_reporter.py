@@ -45,11 +45,11 @@ def test_what_is_for_developers_is_left_out(reporter: Reporter) -> None:
 
 
 def test_orders_that_can_not_be_read_are_told_and_do_not_end_it(reporter: Reporter) -> None:
-    told: list[reporting.News] = []
+    told: list[reporting.ReporterEvent] = []
     reporter.post = told.append
     reporter._answered(Response(ControlResponse.SUCCESS, b"\xff"))
     (complaint,) = told
-    assert isinstance(complaint, reporting.Complaint)
+    assert isinstance(complaint, reporting.ReportFailed)
     assert "Orders" in complaint.text
 
 

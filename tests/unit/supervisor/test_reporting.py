@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.experiment import Experiment, Start, load
+from afspm.experiment import Experiment, ProcessStart, load
 from afspm.supervisor import reporting
 from afspm.supervisor.reporter import Reporter
 from afspm.transport.keys import generate
@@ -40,7 +40,7 @@ def experiment(folder: Path, scheduler: str = OURS, more: str = "") -> Experimen
     return load(file)
 
 
-def starts(made: Experiment, *only: str) -> list[Start]:
+def starts(made: Experiment, *only: str) -> list[ProcessStart]:
     return made.launches(take_address=lambda: "tcp://127.0.0.1:29110", only=only)
 
 

@@ -14,8 +14,8 @@ from afspm.errors import ConfigError
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
 from afspm.supervisor import run as running
-from afspm.supervisor.resuming import Resumable, _wait_until_gone
-from afspm.supervisor.run import ONLY, WITHOUT, Options, dry_run, facts_to_resume
+from afspm.supervisor.resume import ResumableRun, _wait_until_gone
+from afspm.supervisor.run import ONLY, WITHOUT, RunOptions, dry_run, facts_to_resume
 
 PARTS = """
 [clock]
@@ -48,14 +48,14 @@ command = ["python", "call.py"]
 @pytest.mark.parametrize(
     "options",
     [
-        Options(),
-        Options(only=("microscope", "scheduler")),
-        Options(only=("series", "metadata")),
-        Options(without=("series",)),
-        Options(without=("microscope", "scheduler")),
+        RunOptions(),
+        RunOptions(only=("microscope", "scheduler")),
+        RunOptions(only=("series", "metadata")),
+        RunOptions(without=("series",)),
+        RunOptions(without=("microscope", "scheduler")),
     ],
 )
-def test_a_part_is_resumed_with_what_it_had(options: Options, tmp_path: Path) -> None:
+def test_a_part_is_resumed_with_what_it_had(options: RunOptions, tmp_path: Path) -> None:
     (tmp_path / "night.toml").write_text(PARTS, encoding="utf-8")
     experiment = load(tmp_path / "night.toml")
     starts = dry_run(experiment, options)
@@ -66,7 +66,7 @@ def test_a_part_is_resumed_with_what_it_had(options: Options, tmp_path: Path) ->
     (tmp_path / "experiment.toml").write_text(experiment.expanded(), encoding="utf-8")
     expanded = load_expanded(tmp_path / "experiment.toml", [tmp_path])
     for _ in range(2):  # and once more
-        again = Options(only=facts[ONLY], without=facts[WITHOUT])  # type: ignore[arg-type]
+        again = RunOptions(only=facts[ONLY], without=facts[WITHOUT])  # type: ignore[arg-type]
         starts = dry_run(expanded, again)
         assert sorted(start.launch.name for start in starts) == sorted(names)
         facts = facts_to_resume(expanded, starts, again)
@@ -75,20 +75,20 @@ def test_a_part_is_resumed_with_what_it_had(options: Options, tmp_path: Path) ->
 def test_what_was_added_when_it_was_resumed_is_there_in_that_life(tmp_path: Path) -> None:
     overlay = tmp_path / "overlay.toml"
     overlay.write_text('[dashboard]\ncomponent = true\nclass = "Dashboard"\n', encoding="utf-8")
-    file, part = tmp_path / "experiment.toml", Options(only=("microscope", "scheduler"))
+    file, part = tmp_path / "experiment.toml", RunOptions(only=("microscope", "scheduler"))
     file.write_text(PARTS, encoding="utf-8")
     experiment = load(file)
     starts = dry_run(experiment, part)
     before = {start.launch.name for start in starts}
     facts: dict[str, Any] = facts_to_resume(experiment, starts, part)
-    plain = Resumable(tmp_path, "night", load_expanded(file, [tmp_path]), facts, (tmp_path,))
+    plain = ResumableRun(tmp_path, "night", load_expanded(file, [tmp_path]), facts, (tmp_path,))
     added = plain.with_overlay(overlay)
-    starts = dry_run(added.experiment, added.options(Options()))
+    starts = dry_run(added.experiment, added.options(RunOptions()))
     assert {start.launch.name for start in starts} == {*before, "dashboard"}
     # and in the next life not, without being missed
-    facts = facts_to_resume(added.experiment, starts, added.options(Options()))
+    facts = facts_to_resume(added.experiment, starts, added.options(RunOptions()))
     again = replace(plain, facts=facts)
-    assert {start.launch.name for start in dry_run(again.experiment, again.options(Options()))} == before
+    assert {start.launch.name for start in dry_run(again.experiment, again.options(RunOptions()))} == before
 
 
 def test_all_processes_are_asked_at_once_whether_they_are_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ class = "Scheduler"
 def test_without_its_emulator_an_experiment_does_not_have_the_time_of_a_simulation(tmp_path: Path) -> None:
     """The translator would talk to whatever is at its address: nothing is started."""
     (tmp_path / "night.toml").write_text(EMULATED, encoding="utf-8")
-    options = Options(runs=tmp_path / "runs", without=("controller",))
+    options = RunOptions(runs=tmp_path / "runs", without=("controller",))
     with pytest.raises(ConfigError, match="nothing here proves that its microscope is simulated"):
         running.run(load(tmp_path / "night.toml"), options)
     assert not (tmp_path / "runs").exists()

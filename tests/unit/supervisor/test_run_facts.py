@@ -10,9 +10,9 @@ import pytest
 from afspm.client.connect import guest_of
 from afspm.clock import ExperimentClock
 from afspm.experiment import load
-from afspm.supervisor.common_clock import Common
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import run_facts
+from afspm.supervisor.run_identity import RunIdentity
 from afspm.transport.keys import generate
 
 EXPERIMENT = """
@@ -44,7 +44,7 @@ def test_with_keys_a_guest_knows_whose_to_expect_whatever_runs_on_this_computer(
     generate(tmp_path / "keys", ["microscope", "scheduler", "metadata"])
     starts = load(file).launches(take_address=FreePorts().address, only=only)
     (tmp_path / "run.json").write_text(
-        json.dumps(run_facts("night", starts, Common(ExperimentClock.real(), "ab12", simulated=False)))
+        json.dumps(run_facts("night", starts, RunIdentity(ExperimentClock.real(), "ab12", simulated=False)))
     )
     guest = guest_of(tmp_path, "alice")
     assert guest.keys is not None

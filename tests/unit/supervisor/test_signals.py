@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from afspm.supervisor import signals
-from afspm.supervisor.signals import Signalled
+from afspm.supervisor.signals import EndSignal
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def test_each_is_told_and_ends_nothing_by_itself(name: str, writer: int) -> None
     number = getattr(signal, name, None)
     if number is None or (sys.platform == "win32" and name == "SIGTERM"):
         pytest.skip("no such signal here")
-    told: list[Signalled] = []
+    told: list[EndSignal] = []
     before = signal.signal(number, signal.default_int_handler)  # whatever the tests themselves were begun with: nohup
     try:
         with signals.told(told.append, writer):
@@ -35,12 +35,12 @@ def test_each_is_told_and_ends_nothing_by_itself(name: str, writer: int) -> None
         assert signal.getsignal(number) is signal.default_int_handler
     finally:
         signal.signal(number, before)
-    assert told == [Signalled(number)]
+    assert told == [EndSignal(number)]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")
 def test_under_nohup_the_closing_of_the_terminal_stays_ignored(writer: int) -> None:
-    told: list[Signalled] = []
+    told: list[EndSignal] = []
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with signals.told(told.append, writer):

@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
-from afspm.errors import AfspmError, ConfigError, Gathered, Refused
+from afspm.errors import AfspmError, ConfigError, ErrorCollector, Refused
 from afspm.microscopes.simulator import files
 from afspm.microscopes.simulator.faults import Fault, Faults
 from afspm.microscopes.simulator.instrument import Instrument, PanelEvent
@@ -125,7 +125,7 @@ class Simulator(Driver):
         }
         self._world_settings = {name: settings for name, settings in world.items() if settings is not None}
         self._seed = seed
-        errors = Gathered()
+        errors = ErrorCollector()
         with errors:
             World.from_settings(self._world_settings, seed, 0.0)
         self._faults_settings = _made(Fault, faults or [], "faults", errors)
@@ -146,7 +146,7 @@ class Simulator(Driver):
                 self._check_values(loop, initial or {}, errors)
         errors.raise_all()
 
-    def _check_values(self, loop: FeedbackSettings, initial: Mapping[str, Any], errors: Gathered) -> None:
+    def _check_values(self, loop: FeedbackSettings, initial: Mapping[str, Any], errors: ErrorCollector) -> None:
         """Values of parameters that are set by themselves: at the start, and by a person at the panel."""
         in_force = {
             FEEDBACK_ON: loop.on,
@@ -328,7 +328,7 @@ def _loop_of(settings: Mapping[str, Any]) -> FeedbackSettings | None:
         return None
 
 
-def _made(kind: type[T], tables: Sequence[Mapping[str, Any]], where: str, errors: Gathered) -> list[T]:
+def _made(kind: type[T], tables: Sequence[Mapping[str, Any]], where: str, errors: ErrorCollector) -> list[T]:
     made = []
     for i, table in enumerate(tables):
         with errors:

@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 
 from afspm.clock import NS_PER_S
-from afspm.formatting import area, day, from_to, lasting, time_of_day, typeset
+from afspm.formatting import area_text, day, duration_text, period_text, time_of_day, typeset
 from afspm.record.report import time_line
 from afspm.record.report.pictures import Small
 from afspm.record.report.story import MOST_ROWS, RunStory, sentence, states_in_words
@@ -50,9 +50,9 @@ def html(story: RunStory, shown: Sequence[Small], figures: Sequence[Path]) -> st
 
 
 def _when(story: RunStory) -> str:
-    told = f"{from_to(story.start_ns, story.end_ns, UTC)}, {lasting(story.lasted_ns / NS_PER_S)}"
+    told = f"{period_text(story.start_ns, story.end_ns, UTC)}, {duration_text(story.lasted_ns / NS_PER_S)}"
     if story.speed != 1.0:
-        told += f" ({lasting(story.lasted_ns / NS_PER_S / story.speed)} real)"
+        told += f" ({duration_text(story.lasted_ns / NS_PER_S / story.speed)} real)"
     return f"{told}; {story.ended}"
 
 
@@ -93,7 +93,7 @@ def _share_table(story: RunStory, heading: str, lane: Timeline, styles: dict[str
         words = label if styles else states_in_words(label)
         bar = '<svg class="share" viewBox="0 0 100 10" preserveAspectRatio="none">'
         bar += f'<rect class="{style}" width="{part:.2f}" height="10"/></svg>'
-        rows.append([escape(words), bar, lasting(ns / NS_PER_S), f"{part:.0f} %"])
+        rows.append([escape(words), bar, duration_text(ns / NS_PER_S), f"{part:.0f} %"])
     return _table([heading, "", "", ""], rows) if rows else ""
 
 
@@ -108,7 +108,7 @@ def _problems(story: RunStory) -> str:
                 escape(span.by or "not known"),
                 escape(", ".join(story.repairs(span)) or "nobody"),
                 escape(", ".join(story.done_meanwhile(span))),
-                lasting((end_ns - span.start_ns) / NS_PER_S),
+                duration_text((end_ns - span.start_ns) / NS_PER_S),
                 "<b>not solved</b>" if span.end_ns is None else _clock(story, end_ns),
             ]
         )
@@ -136,7 +136,7 @@ def _thumb(small: Small, story: RunStory, styles: dict[str, str]) -> str:
         if small.picture is not None
         else '<div class="none">no values</div>'
     )
-    size = typeset(area(row.region.size_m)) if row.region else ""
+    size = typeset(area_text(row.region.size_m)) if row.region else ""
     is_bad = row.interrupted or bool(row.problems)
     mark = " <b>interrupted</b>" if row.interrupted else ""
     style = styles.get(row.holder or "", "state")

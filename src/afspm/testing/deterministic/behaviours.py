@@ -6,8 +6,8 @@ from collections.abc import Callable, Generator
 from typing import Any
 
 from afspm.model import (
+    RELAY_REQUEST,
     RESTART_REQUEST,
-    TELL_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -15,8 +15,8 @@ from afspm.model import (
     Problem,
     ProcessState,
     ProcessStates,
+    RelayedMessage,
     ScopeState,
-    Told,
     names,
 )
 from afspm.testing.deterministic.client import Client, Doing
@@ -298,8 +298,10 @@ class Teller(Client):
     def behave(self) -> Doing:
         while True:
             now_ns = self.timeline.now_ns()
-            told = Told("ProcessStates", self.codec.encode(ProcessStates(now_ns, self.name, self.processes())))
-            response = yield from self.ask(TELL_REQUEST, told)
+            told = RelayedMessage(
+                "ProcessStates", self.codec.encode(ProcessStates(now_ns, self.name, self.processes()))
+            )
+            response = yield from self.ask(RELAY_REQUEST, told)
             for name in self.codec.decode(response.payload) if response.code == _OK else ():
                 self.ordered += 1
                 self.restart(name)

@@ -32,7 +32,7 @@ from afspm.logic.events import (
     TranslatorUp,
 )
 from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
-from afspm.model import HAS_ENDED, TELL_REQUEST, ControlResponse, Packet, PacketHeader, Request, Response
+from afspm.model import HAS_ENDED, RELAY_REQUEST, ControlResponse, Packet, PacketHeader, Request, Response
 from afspm.testing.deterministic.network import ControlLine, ControlServer, Feed, Publisher, Weather
 from afspm.testing.deterministic.process import Alarm, Process
 from afspm.testing.deterministic.timeline import Timeline
@@ -187,7 +187,7 @@ class SchedulerHost(Process):
 
     def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
         connection = self._lines.get(line)
-        if self._has_ended and request.kind != TELL_REQUEST:
+        if self._has_ended and request.kind != RELAY_REQUEST:
             line.answer(Response(int(ControlResponse.FAILURE), b"", HAS_ENDED, request.id))
         elif connection is not None:
             self._step(RequestIn(connection, line.name, request), late=True)

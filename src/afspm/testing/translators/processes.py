@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
 
 from afspm.clock import Clock
-from afspm.experiment import Start
+from afspm.experiment import ProcessStart
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, Printed, describe_exit
 from afspm.supervisor.task import from_start
@@ -34,8 +34,8 @@ class Processes:
         self._ended: dict[str, str] = {}
         self._running: dict[str, ChildProcess] = {}
 
-    def start(self, starts: Sequence[Start]) -> None:
-        """Start these.
+    def start(self, starts: Sequence[ProcessStart]) -> None:
+        """ProcessStart these.
 
         Raises:
             AfspmError: one can't be started.

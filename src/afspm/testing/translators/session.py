@@ -17,17 +17,17 @@ from afspm.client.component import Component
 from afspm.client.link import ExperimentLink
 from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
-from afspm.experiment import Experiment, Role, Start, load
+from afspm.experiment import Experiment, ProcessStart, Role, load
 from afspm.launch import Launch, Sockets
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.model import Frame
 from afspm.process.context import new_session
 from afspm.record.run_json import STATE_DIR
-from afspm.supervisor import common_clock, run_folder
-from afspm.supervisor.common_clock import Common
+from afspm.supervisor import run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
 from afspm.supervisor.run import addresses_of
+from afspm.supervisor.run_identity import RunIdentity
 from afspm.testing.translators.bench import Bench
 from afspm.testing.translators.processes import Processes
 from afspm.testing.translators.support import Support, find_out
@@ -124,7 +124,7 @@ def prepare(options: Options) -> Experiment:
 
 @contextmanager
 def opened(options: Options) -> Iterator[Session]:
-    """Start, or join, what is to be checked; in control of the microscope while in the block.
+    """ProcessStart, or join, what is to be checked; in control of the microscope while in the block.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
@@ -165,7 +165,7 @@ def _interrupting(bench: Bench) -> Iterator[None]:
 def _bench(
     experiment: Experiment, options: Options, stack: ExitStack, complaints: list[str]
 ) -> tuple[Bench, Path, bool]:
-    """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
+    """ProcessStart what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
     common = _common(experiment, options)
     clock = common.clock
     folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
@@ -201,7 +201,9 @@ def _bench(
 _NOTHING = logging.CRITICAL + 1
 
 
-def _starts(experiment: Experiment, options: Options, common: Common, folder: Path) -> tuple[Launch, list[Start]]:
+def _starts(
+    experiment: Experiment, options: Options, common: RunIdentity, folder: Path
+) -> tuple[Launch, list[ProcessStart]]:
     """The tester's own launch line, and what is to be started."""
     starts = experiment.launches(
         take_address=FreePorts().address,
@@ -225,7 +227,7 @@ def _left_out(experiment: Experiment, options: Options) -> list[str]:
     return [name for name in experiment.component_names if name not in wanted or name in options.without]
 
 
-def _translator_address(experiment: Experiment, starts: Sequence[Start]) -> str | None:
+def _translator_address(experiment: Experiment, starts: Sequence[ProcessStart]) -> str | None:
     """Where the scheduler asks the translator; None: nobody says."""
     for start in starts:
         if start.role is Role.SCHEDULER:
@@ -258,16 +260,16 @@ def is_simulated(experiment: Experiment, options: Options) -> bool:
     return experiment.simulated(without=_left_out(experiment, options))
 
 
-def _common(experiment: Experiment, options: Options) -> Common:
+def _common(experiment: Experiment, options: Options) -> RunIdentity:
     """The scheduler's, where that runs already; else our own."""
     simulated = is_simulated(experiment, options)
     schedulers = {part.name for part in experiment.resolved.with_role(Role.SCHEDULER)}
     launch = experiment.asking([NAME]) if schedulers <= set(options.without) else None
     if launch is not None:
-        common = common_clock.of_scheduler(launch, logging.getLogger(__name__).warning)
+        common = run_identity.ask_scheduler(launch, logging.getLogger(__name__).warning)
         return replace(common, simulated=simulated or common.simulated)
     clock = replace(experiment.clock(), speed=options.speed) if simulated else ExperimentClock.real()
-    return Common(clock, common_clock.new_identity(), simulated)
+    return RunIdentity(clock, run_identity.new_identity(), simulated)
 
 
 def _now() -> datetime:

@@ -8,15 +8,15 @@ from collections.abc import Callable
 
 import pytest
 
-from afspm.supervisor.vital_signs import LEAST_SHARE, Signs, VitalSigns, of_process
+from afspm.supervisor.activity_monitor import LEAST_SHARE, ActivityMonitor, ActivitySample, of_process
 
 LATELY_S = 1.5
 
 
-def judged(signs: Callable[[float], Signs | None], until_s: float = 10.0) -> bool | None:
+def judged(signs: Callable[[float], ActivitySample | None], until_s: float = 10.0) -> bool | None:
     """What it is found to do at the end of a time in which one looks again and again."""
     now = [0.0]
-    vital = VitalSigns(1, LATELY_S, lambda pid: signs(now[0]))
+    vital = ActivityMonitor(1, LATELY_S, lambda pid: signs(now[0]))
     works = vital.work(now[0])
     while now[0] < until_s:
         now[0] += 0.1
@@ -25,46 +25,46 @@ def judged(signs: Callable[[float], Signs | None], until_s: float = 10.0) -> boo
 
 
 def test_who_uses_processor_time_works() -> None:
-    assert judged(lambda now_s: Signs(100.0 + now_s)) is True
-    assert judged(lambda now_s: Signs(2.0 * LEAST_SHARE * now_s)) is True
+    assert judged(lambda now_s: ActivitySample(100.0 + now_s)) is True
+    assert judged(lambda now_s: ActivitySample(2.0 * LEAST_SHARE * now_s)) is True
 
 
 def test_who_only_waits_stands_still_whatever_it_did_before() -> None:
-    assert judged(lambda now_s: Signs(100.0)) is False
-    assert judged(lambda now_s: Signs(min(now_s, 8.0))) is False
-    assert judged(lambda now_s: Signs(0.2 * LEAST_SHARE * now_s)) is False
+    assert judged(lambda now_s: ActivitySample(100.0)) is False
+    assert judged(lambda now_s: ActivitySample(min(now_s, 8.0))) is False
+    assert judged(lambda now_s: ActivitySample(0.2 * LEAST_SHARE * now_s)) is False
 
 
 def test_who_waits_for_a_disk_works_though_that_is_not_seen_at_every_look() -> None:
-    assert judged(lambda now_s: Signs(0.0, waits_for_disk=round(now_s) % 2 == 0)) is True
-    assert judged(lambda now_s: Signs(0.0, waits_for_disk=now_s < 8.0)) is False
+    assert judged(lambda now_s: ActivitySample(0.0, waits_for_disk=round(now_s) % 2 == 0)) is True
+    assert judged(lambda now_s: ActivitySample(0.0, waits_for_disk=now_s < 8.0)) is False
 
 
 def test_who_would_work_if_the_processor_were_free_works() -> None:
-    assert judged(lambda now_s: Signs(0.001 * now_s, runs=True)) is True
-    assert judged(lambda now_s: Signs(0.001 * now_s, runs=now_s < 9.5)) is True
-    assert judged(lambda now_s: Signs(0.001 * now_s, runs=now_s < 8.0)) is False
+    assert judged(lambda now_s: ActivitySample(0.001 * now_s, runs=True)) is True
+    assert judged(lambda now_s: ActivitySample(0.001 * now_s, runs=now_s < 9.5)) is True
+    assert judged(lambda now_s: ActivitySample(0.001 * now_s, runs=now_s < 8.0)) is False
 
 
 def test_who_was_stopped_stands_still_at_once() -> None:
-    assert judged(lambda now_s: Signs(now_s, stopped=now_s > 9.9)) is False
+    assert judged(lambda now_s: ActivitySample(now_s, stopped=now_s > 9.9)) is False
 
 
 def test_a_single_look_tells_nothing_and_what_can_not_be_seen_neither() -> None:
-    assert VitalSigns(1, LATELY_S, lambda pid: Signs(100.0)).work(0.0) is None
+    assert ActivityMonitor(1, LATELY_S, lambda pid: ActivitySample(100.0)).work(0.0) is None
     assert judged(lambda now_s: None) is None
-    assert judged(lambda now_s: Signs(now_s) if now_s < 9.9 else None) is None
+    assert judged(lambda now_s: ActivitySample(now_s) if now_s < 9.9 else None) is None
 
 
 def test_nobody_looks_all_the_time() -> None:
     looks = 0
 
-    def look(pid: int) -> Signs:
+    def look(pid: int) -> ActivitySample:
         nonlocal looks
         looks += 1
-        return Signs(0.0)
+        return ActivitySample(0.0)
 
-    vital = VitalSigns(1, LATELY_S, look)
+    vital = ActivityMonitor(1, LATELY_S, look)
     for milliseconds in range(1500):
         vital.work(milliseconds / 1000.0)
     assert looks == 10

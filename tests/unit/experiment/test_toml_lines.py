@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.experiment.expanded import dumps
-from afspm.experiment.lines import Path, locate
+from afspm.experiment.toml_lines import Path, locate
+from afspm.experiment.toml_writer import dumps
 
 TEXT = '''\
 # a comment with [brackets] and = signs

@@ -10,7 +10,7 @@ import pytest
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, WireError
 from afspm.model import ControlResponse, Response
-from afspm.supervisor.common_clock import Common, _read
+from afspm.supervisor.run_identity import RunIdentity, _read
 
 THEIRS = ExperimentClock(1_000.0, 5_000.0, 600.0)
 
@@ -32,7 +32,7 @@ def test_where_the_clock_on_the_wall_is_wrong_the_time_in_the_experiment_is_stil
 
 def test_a_part_has_the_run_and_the_simulation_of_its_scheduler() -> None:
     facts = {**THEIRS.as_dict(), "run": "ab12", "simulated": True}
-    assert _read(told(5_000.0, **facts), 1_000.0, 1_000.0, "") == Common(THEIRS, "ab12", simulated=True)
+    assert _read(told(5_000.0, **facts), 1_000.0, 1_000.0, "") == RunIdentity(THEIRS, "ab12", simulated=True)
     assert not _read(told(5_000.0), 1_000.0, 1_000.0, "").simulated
 
 

@@ -20,10 +20,10 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from afspm.errors import AfspmError
-from afspm.experiment import classes
+from afspm.experiment import class_loader
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings
-from afspm.experiment.known import Wire
+from afspm.experiment.known import WiringClass
 from afspm.experiment.published import length_m, wire_of
 from afspm.experiment.sections import Section, parse
 from afspm.logic.envelopes import CacheRule, Envelopes
@@ -39,7 +39,7 @@ _EXAMPLES = (
 )
 
 
-class Rule(Section):
+class CacheRuleSection(Section):
     """[[cache.rules]]: the first that fits a packet says under which envelope it is kept, and how many are."""
 
     message: str | None = None
@@ -51,16 +51,16 @@ class Rule(Section):
     history: Count | None = None
 
 
-class Cache(Section):
+class CacheSection(Section):
     """[cache]. `mapping` names a function of the user's, from a packet's header to its envelope."""
 
     history: dict[str, Count] = Field(default_factory=dict)
     mapping: str | None = None
-    rules: tuple[Rule, ...] = ()
+    rules: tuple[CacheRuleSection, ...] = ()
 
 
 @dataclass(frozen=True)
-class Caching:
+class CacheSettings:
     """What the scheduler is told of the cache."""
 
     rules: tuple[CacheRule, ...] = ()
@@ -78,13 +78,15 @@ class Caching:
         return {"rules": rules, "mapping": self.mapping, "history": dict(self.history)}
 
 
-def read(table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Document, findings: Findings) -> Caching:
+def read(
+    table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Document, findings: Findings
+) -> CacheSettings:
     """The section, with what the paper's form says of the cache where the section says nothing.
 
     Args:
         logic: the table that the scheduler's cache refers to in the paper's form.
     """
-    section = parse(Cache, "cache", dict(table), document, findings)
+    section = parse(CacheSection, "cache", dict(table), document, findings)
     rules = []
     for i, rule in enumerate(section.rules):
         try:
@@ -96,17 +98,17 @@ def read(table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Do
     if section.mapping is not None:
         _check_mapping(section.mapping, document, findings)
     history = dict(section.history)
-    if logic is not None and wire_of(logic) is Wire.CACHE_LOGIC:
+    if logic is not None and wire_of(logic) is WiringClass.CACHE_LOGIC:
         history = _published_history(logic) | history
         rules += _published_rules(logic)
-    return Caching(tuple(rules), section.mapping, history)
+    return CacheSettings(tuple(rules), section.mapping, history)
 
 
 def _check_mapping(name: str, document: Document, findings: Findings) -> None:
     place = document.place("cache", "mapping")
     try:
-        function = classes.load(name)
-    except classes.Unloadable as error:
+        function = class_loader.load(name)
+    except class_loader.Unloadable as error:
         findings.error(f"[cache] mapping: {error.what}", place, error.hint)
         return
     if not callable(function):
@@ -128,7 +130,7 @@ def _published_history(logic: Mapping[str, Any]) -> dict[str, int]:
 def _published_rules(logic: Mapping[str, Any]) -> list[CacheRule]:
     """Histories by size, [[width, height], count]; a number is in nm, as in the envelopes' names."""
     histories = logic.get("proto_with_history_list")
-    if wire_of(histories) is not Wire.HISTORIES or not isinstance(histories, Mapping):
+    if wire_of(histories) is not WiringClass.HISTORIES or not isinstance(histories, Mapping):
         return []
     rules = []
     channels = histories.get("channels_list") or []

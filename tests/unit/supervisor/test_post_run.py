@@ -15,11 +15,11 @@ from afspm.components.notifications import OCCASIONS, Targets
 from afspm.experiment import load
 from afspm.record.report import REPORT_FILE
 from afspm.record.store import RecordStore
-from afspm.supervisor import aftermath
-from afspm.supervisor.aftermath import Ended
+from afspm.supervisor import post_run
 from afspm.supervisor.ending import Why
 from afspm.supervisor.ports import FreePorts
-from afspm.supervisor.supervisor import Outcome, Report
+from afspm.supervisor.post_run import EndedRun
+from afspm.supervisor.supervisor import ProcessReport, RunOutcome
 
 
 class Log:
@@ -36,10 +36,10 @@ def told(folder: Path, why: Why, on: tuple[str, ...] = OCCASIONS) -> list[dict[s
     """What a command is told of a run that ended so."""
     file = folder / "told.txt"
     code = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
-    reports = (Report("judge", 3, True, "exit code 1"), Report("series", 1, False, "done"))
-    outcome = Outcome(why, "the microscope is given up", reports, 60.0)
+    reports = (ProcessReport("judge", 3, True, "exit code 1"), ProcessReport("series", 1, False, "done"))
+    outcome = RunOutcome(why, "the microscope is given up", reports, 60.0)
     targets = Targets([sys.executable, "-c", code, str(file)])
-    aftermath.tell(Ended("night", folder, outcome, True), targets, on, ExperimentClock.real(), Log())  # type: ignore[arg-type]
+    post_run.tell(EndedRun("night", folder, outcome, True), targets, on, ExperimentClock.real(), Log())  # type: ignore[arg-type]
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
@@ -80,9 +80,9 @@ def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.M
     monkeypatch.setattr(notifications, "FIRST_DELAY_S", 0.01)
     log, count = Log(), tmp_path / "count"
     code = "import sys; open(sys.argv[1], 'a').write('x'); sys.exit('no network')"
-    ended = Ended("night", tmp_path, Outcome(Why.ALL_DONE, "all is done", (), 1.0), False)
+    ended = EndedRun("night", tmp_path, RunOutcome(Why.ALL_DONE, "all is done", (), 1.0), False)
     targets = Targets([sys.executable, "-c", code, str(count)])
-    aftermath.tell(ended, targets, ("end",), TenSeconds(), log)  # type: ignore[arg-type]
+    post_run.tell(ended, targets, ("end",), TenSeconds(), log)  # type: ignore[arg-type]
     assert count.read_text() == "xxx"
     assert [level for level, _ in log.lines] == [logging.ERROR]
     assert "nobody could be told by the command" in log.lines[0][1]
@@ -91,14 +91,14 @@ def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.M
 def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
     RecordStore(tmp_path).close()
     log = Log()
-    aftermath.report(tmp_path, log)  # type: ignore[arg-type]
+    post_run.report(tmp_path, log)  # type: ignore[arg-type]
     assert (tmp_path / REPORT_FILE).is_file()
     assert log.lines == [(logging.INFO, f"the report is {tmp_path / REPORT_FILE}")]
 
 
 def test_without_a_record_there_is_none_and_no_word_of_it(tmp_path: Path) -> None:
     log = Log()
-    aftermath.report(tmp_path, log)  # type: ignore[arg-type]
+    post_run.report(tmp_path, log)  # type: ignore[arg-type]
     assert log.lines == []
     assert list(tmp_path.iterdir()) == []
 
@@ -106,7 +106,7 @@ def test_without_a_record_there_is_none_and_no_word_of_it(tmp_path: Path) -> Non
 def test_a_report_that_fails_is_a_warning(tmp_path: Path) -> None:
     (tmp_path / "journal.sqlite").write_bytes(b"not a database at all, but long enough to be looked at" * 20)
     log = Log()
-    aftermath.report(tmp_path, log)  # type: ignore[arg-type]
+    post_run.report(tmp_path, log)  # type: ignore[arg-type]
     ((level, text),) = log.lines
     assert level == logging.WARNING
     assert text.startswith("no report: ")
@@ -115,13 +115,13 @@ def test_a_report_that_fails_is_a_warning(tmp_path: Path) -> None:
 def test_people_are_told_before_the_report_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """That may take two minutes, and who is in a hurry presses Ctrl-C."""
     done: list[str] = []
-    monkeypatch.setattr(aftermath, "tell", lambda *_: done.append("told"))
-    monkeypatch.setattr(aftermath, "report", lambda *_: done.append("reported"))
+    monkeypatch.setattr(post_run, "tell", lambda *_: done.append("told"))
+    monkeypatch.setattr(post_run, "report", lambda *_: done.append("reported"))
     file = tmp_path / "experiment.toml"
     parts = [f'[{name}]\ncomponent = true\nclass = "{name.capitalize()}"\n' for name in ("simulator", "scheduler")]
     file.write_text("\n".join(parts))
     experiment = load(file)
     starts = experiment.launches(take_address=FreePorts().address)
-    ended = Ended("night", tmp_path, Outcome(Why.ALL_DONE, "all is done", (), 1.0), True)
-    aftermath.follow(experiment, ended, starts, ExperimentClock.real(), Log(), with_report=True)  # type: ignore[arg-type]
+    ended = EndedRun("night", tmp_path, RunOutcome(Why.ALL_DONE, "all is done", (), 1.0), True)
+    post_run.follow(experiment, ended, starts, ExperimentClock.real(), Log(), with_report=True)  # type: ignore[arg-type]
     assert done == ["told", "reported"]

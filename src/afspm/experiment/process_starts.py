@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from afspm.addresses import connectable, reaches
 from afspm.errors import ConfigError
-from afspm.experiment import limits, wiring
-from afspm.experiment.expanded import SECRET
-from afspm.experiment.experiment import Start
+from afspm.experiment import limits_section, wiring
+from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import nearest
 from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
-from afspm.experiment.parts import Part, Role
+from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.toml_writer import SECRET
 from afspm.launch import Launch, Sockets
 from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.watchdog import WatchdogSettings
@@ -22,14 +22,14 @@ from afspm.model import Frame
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
-    from afspm.experiment.resolved import Resolved
+    from afspm.experiment.resolution import ResolvedExperiment
 
 _ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
 
 
 def starts(
     experiment: Experiment, take_address: Callable[[], str], only: Collection[str], without: Collection[str]
-) -> list[Start]:
+) -> list[ProcessStart]:
     """The processes chosen, translator and scheduler first; clock and folders are still to be added."""
     resolved = experiment.resolved
     chosen = _with_implied(_chosen(experiment.component_names, only, without), resolved, set(only), set(without))
@@ -46,7 +46,7 @@ def starts(
     return [_start(part, experiment, links[part.name], addresses, chosen) for part in parts]
 
 
-def knowing_the_run(resolved: Resolved) -> set[str]:
+def knowing_the_run(resolved: ResolvedExperiment) -> set[str]:
     """The processes that are told the identity of the run: all, unless the scheduler is of another language."""
     if all(not part.command for part in resolved.with_role(Role.SCHEDULER)):
         return {part.name for part in resolved.parts.components}
@@ -66,14 +66,16 @@ def _chosen(names: list[str], only: Collection[str], without: Collection[str]) -
     return {name for name in names if (not only or name in only) and name not in without}
 
 
-def _with_implied(chosen: set[str], resolved: Resolved, only: set[str], without: set[str]) -> set[str]:
+def _with_implied(chosen: set[str], resolved: ResolvedExperiment, only: set[str], without: set[str]) -> set[str]:
     """What is not in the file is started where the scheduler is."""
     here = any(part.name in chosen for part in resolved.with_role(Role.SCHEDULER))
     implied = {part.name for part in resolved.parts.components if part.implied} - only
     return chosen | (implied - without) if here else chosen - implied
 
 
-def _without_gone(links: wiring.Links, resolved: Resolved, without: set[str]) -> wiring.Links:
+def _without_gone(
+    links: wiring.ProcessSockets, resolved: ResolvedExperiment, without: set[str]
+) -> wiring.ProcessSockets:
     """A component left out, of no address that anybody could know, is not there: nobody listens to it."""
     gone = {
         key
@@ -83,7 +85,7 @@ def _without_gone(links: wiring.Links, resolved: Resolved, without: set[str]) ->
     return replace(links, subscribe=tuple(source for source in links.subscribe if source not in gone))
 
 
-def _reachable(links: wiring.Links, resolved: Resolved, chosen: set[str]) -> wiring.Links:
+def _reachable(links: wiring.ProcessSockets, resolved: ResolvedExperiment, chosen: set[str]) -> wiring.ProcessSockets:
     """Nobody has to write down an address for the sake of what is not in the file."""
     slots = resolved.net.slots
     unknown = {key for key, slot in slots.items() if slot.address is None and slot.owner not in chosen}
@@ -91,7 +93,7 @@ def _reachable(links: wiring.Links, resolved: Resolved, chosen: set[str]) -> wir
 
 
 def _require_addresses(
-    resolved: Resolved, links: Mapping[str, wiring.Links], chosen: set[str], *, piecemeal: bool
+    resolved: ResolvedExperiment, links: Mapping[str, wiring.ProcessSockets], chosen: set[str], *, piecemeal: bool
 ) -> None:
     """Between a process started here and one started elsewhere the address must be written down.
 
@@ -117,8 +119,12 @@ def _require_addresses(
 
 
 def _start(
-    part: Part, experiment: Experiment, links: wiring.Links, addresses: Mapping[str, str], chosen: Collection[str]
-) -> Start:
+    part: ExperimentPart,
+    experiment: Experiment,
+    links: wiring.ProcessSockets,
+    addresses: Mapping[str, str],
+    chosen: Collection[str],
+) -> ProcessStart:
     resolved = experiment.resolved
     wires, role = resolved.wires[part.name], resolved.roles[part.name]
 
@@ -153,10 +159,10 @@ def _start(
     )
     folders = tuple(str(folder) for folder in resolved.document.folders)
     beats = part.own.get("heartbeats") is not False
-    return Start(launch, role, _command(part), experiment.folder, folders, beats, _hidden(resolved, part.name))
+    return ProcessStart(launch, role, _command(part), experiment.folder, folders, beats, _hidden(resolved, part.name))
 
 
-def _hidden(resolved: Resolved, name: str) -> tuple[str, ...]:
+def _hidden(resolved: ResolvedExperiment, name: str) -> tuple[str, ...]:
     """Environment variables that hold secrets, but for those of the component `name`."""
     webhook = str(resolved.notify.webhook)
     every = {DASHBOARD_PASSWORD, *([webhook[1:]] if webhook.startswith("$") else [])}
@@ -164,14 +170,14 @@ def _hidden(resolved: Resolved, name: str) -> tuple[str, ...]:
     return tuple(sorted(every - _secrets(resolved, name)))
 
 
-def _secrets(resolved: Resolved, name: str) -> set[str]:
+def _secrets(resolved: ResolvedExperiment, name: str) -> set[str]:
     """Environment variables of which a component has to know the value."""
     webhook = str(resolved.settings[name].get(SECRET, ""))
     operates = getattr(resolved.classes.get(name), "operates", False) is True
     return {*([webhook[1:]] if webhook.startswith("$") else []), *([DASHBOARD_PASSWORD] if operates else [])}
 
 
-def _command(part: Part) -> tuple[str, ...]:
+def _command(part: ExperimentPart) -> tuple[str, ...]:
     """The command; "python" is the one that runs us, wherever that is."""
     return (sys.executable, *part.command[1:]) if part.command[:1] == ("python",) else part.command
 
@@ -192,13 +198,17 @@ def asking(experiment: Experiment, names: Collection[str]) -> Launch | None:
     if address is None:
         return None
     target = connectable(address)
-    keys = _keys(resolved, wiring.Links(), {key: found for key, found in addresses.items() if found is not None})
+    keys = _keys(
+        resolved, wiring.ProcessSockets(), {key: found for key, found in addresses.items() if found is not None}
+    )
     if keys is not None and "folder" in keys:
         keys = {**keys, target: part.name}
     return Launch(next(iter(names)), sockets=Sockets(control=target), keys=keys)
 
 
-def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str]) -> dict[str, str] | None:
+def _keys(
+    resolved: ResolvedExperiment, links: wiring.ProcessSockets, addresses: Mapping[str, str]
+) -> dict[str, str] | None:
     """The folder of the keys, and whose key to expect at each address; see `transport.network.Network.from_launch`."""
     if resolved.keys_folder is None:
         return {"insecure": "true"} if resolved.security.insecure else None
@@ -221,7 +231,7 @@ def _keys(resolved: Resolved, links: wiring.Links, addresses: Mapping[str, str])
     return keys
 
 
-def _log(resolved: Resolved) -> tuple[str | None, str]:
+def _log(resolved: ResolvedExperiment) -> tuple[str | None, str]:
     """Where a component collects the log lines of all others, and its name."""
     for name, component in resolved.classes.items():
         if getattr(component, "collects_logs", False) is True:
@@ -229,13 +239,13 @@ def _log(resolved: Resolved) -> tuple[str | None, str]:
     return None, ""
 
 
-def _in_sample_coordinates(resolved: Resolved) -> bool:
+def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:
     """Whether the scheduler maps places, as its class says."""
     schedulers = resolved.with_role(Role.SCHEDULER)
     return any(getattr(resolved.classes.get(part.name), "frame", None) is Frame.SAMPLE for part in schedulers)
 
 
-def _retracts(resolved: Resolved) -> bool:
+def _retracts(resolved: ResolvedExperiment) -> bool:
     """Whether a tip without feedback is to be retracted when nobody is in control any more."""
     control = resolved.control
     dangerous = WatchdogSettings().dangerous if control.dangerous is None else control.dangerous
@@ -246,7 +256,7 @@ def _first(a: int | None, b: int) -> int:
     return b if a is None else a
 
 
-def _operators(resolved: Resolved) -> list[str]:
+def _operators(resolved: ResolvedExperiment) -> list[str]:
     """Components by which a person may command the microscope in MANUAL mode, as their classes say.
 
     And a dashboard that joins the run later, which is under no other's name.
@@ -255,7 +265,7 @@ def _operators(resolved: Resolved) -> list[str]:
     return operators if DASHBOARD in resolved.classes else [*operators, DASHBOARD]
 
 
-def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
+def _for_scheduler(resolved: ResolvedExperiment) -> dict[str, Any]:
     """The sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m.
 
     control: lease_s, grace_s, malfunction_after_s, stop_scan_on_problem, stop_scan_on_manual, retract, dangerous,
@@ -278,6 +288,6 @@ def _for_scheduler(resolved: Resolved) -> dict[str, Any]:
                 "operate": _operators(resolved) if control.roles.operate is None else list(control.roles.operate),
             },
         },
-        "limits": limits.to_settings(resolved.limits),
+        "limits": limits_section.to_settings(resolved.limits),
         "cache": resolved.caching.to_settings(),
     }

@@ -21,12 +21,12 @@ from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
 from afspm.record.run_lock import lock_run
 from afspm.storage.atomic import load_checkpoint
-from afspm.supervisor import edited
+from afspm.supervisor import config_diff
 from afspm.supervisor import run as running
-from afspm.supervisor.common_clock import Common, new_identity
 from afspm.supervisor.ending import Why
 from afspm.supervisor.ports import require_free
-from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, Options, Run
+from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
+from afspm.supervisor.run_identity import RunIdentity, new_identity
 
 _OVER = {Why.EXPERIMENT_ENDED.name.lower(), Why.ALL_DONE.name.lower()}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
@@ -38,7 +38,7 @@ STEP_NS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Resumable:
+class ResumableRun:
     """A run that can go on.
 
     Attributes:
@@ -53,21 +53,21 @@ class Resumable:
     homes: tuple[Path, ...]
     added: tuple[str, ...] = ()
 
-    def with_overlay(self, file: Path) -> Resumable:
+    def with_overlay(self, file: Path) -> ResumableRun:
         """The same run, which goes on with what the file adds."""
         experiment = load_expanded(self.folder / EXPERIMENT_FILE, self.homes, file)
         before = self.experiment.component_names
         added = [name for name in experiment.component_names if name not in before]
         return replace(self, experiment=experiment, added=(*self.added, *added))
 
-    def options(self, options: Options) -> Options:
+    def options(self, options: RunOptions) -> RunOptions:
         """With the processes that it had on this computer, and those that were added now."""
         names = self.experiment.component_names  # without what was added in an earlier life
         only, without = ([name for name in self.facts.get(which, ()) if name in names] for which in (ONLY, WITHOUT))
         return replace(options, only=(*only, *self.added) if only else (), without=tuple(without))
 
 
-def find(where: Path) -> Resumable:
+def find(where: Path) -> ResumableRun:
     """The run that is meant: by its folder, or that of all runs (the newest is meant), or the experiment file.
 
     Raises:
@@ -87,11 +87,11 @@ def find(where: Path) -> Resumable:
     experiment = load_expanded(file, homes)
     if where.suffix == ".toml":
         begun_with = [Path(name) for name in facts.get(FILES, ())]
-        edited.refuse_edited(begun_with if where.resolve() in begun_with else [where], experiment, folder)
-    return Resumable(folder, str(facts.get("name", folder.name)), experiment, facts, homes)
+        config_diff.refuse_edited(begun_with if where.resolve() in begun_with else [where], experiment, folder)
+    return ResumableRun(folder, str(facts.get("name", folder.name)), experiment, facts, homes)
 
 
-def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -> Run:
+def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = None) -> FinishedRun:
     """Go on with a run until it ends, where every process finds what it remembers. Raises as `run.run`, and
 
     FileError: it is still going on.
@@ -107,11 +107,11 @@ def resume(found: Resumable, options: Options, terminal: TextIO | None = None) -
         return running.go(experiment, options, common, folder, found.name, terminal, names)
 
 
-def _common(experiment: Experiment, options: Options, facts: dict[str, Any], folder: Path) -> Common:
+def _common(experiment: Experiment, options: RunOptions, facts: dict[str, Any], folder: Path) -> RunIdentity:
     """As before, with real time, or the simulated time after the last that anybody has seen."""
     simulated = bool(facts.get("simulated")) or experiment.simulated(options.only, options.without)
     clock = _clock_after(facts, folder) if simulated else experiment.clock()
-    return Common(clock, str(facts.get(RUN) or new_identity()), simulated)
+    return RunIdentity(clock, str(facts.get(RUN) or new_identity()), simulated)
 
 
 def _clock_after(facts: dict[str, Any], folder: Path) -> ExperimentClock:

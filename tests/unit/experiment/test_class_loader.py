@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.experiment import classes
+from afspm.experiment import class_loader
 
 
 def test_modules_beside_the_file_are_forgotten_and_those_of_an_environment_in_its_folder_are_not(
@@ -20,7 +20,7 @@ def test_modules_beside_the_file_are_forgotten_and_those_of_an_environment_in_it
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("import library\n" if file.name == "beside.py" else "", encoding="utf-8")
     monkeypatch.syspath_prepend(environment)
-    with classes.importing_from([tmp_path]):
+    with class_loader.importing_from([tmp_path]):
         for name in ("beside", "package"):
             importlib.import_module(name)
         assert {"beside", "package", "library"} <= set(sys.modules)

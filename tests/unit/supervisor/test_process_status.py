@@ -11,7 +11,7 @@ from afspm.launch import Launch
 from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.supervision import ChildPolicy, ChildWatch
 from afspm.model import ProcessCondition
-from afspm.supervisor.standing import Standing
+from afspm.supervisor.process_status import ProcessStatus
 from afspm.supervisor.task import Task
 from afspm.transport.heartbeat import Heartbeat
 
@@ -61,11 +61,11 @@ class Child:
 
 
 @pytest.fixture
-def standing() -> Standing:
-    return Standing(Clock(), POLICY.liveness)  # type: ignore[arg-type]
+def standing() -> ProcessStatus:
+    return ProcessStatus(Clock(), POLICY.liveness)  # type: ignore[arg-type]
 
 
-def test_through_its_life(standing: Standing) -> None:
+def test_through_its_life(standing: ProcessStatus) -> None:
     child = Child()
     assert standing.condition(child, 0.0) is Condition.STARTING
     child.start(7)
@@ -87,7 +87,7 @@ def test_through_its_life(standing: Standing) -> None:
     assert standing.condition(child, 6.5) is Condition.GIVEN_UP
 
 
-def test_one_that_is_done_has_ended_and_one_that_closes_is_not_silent(standing: Standing) -> None:
+def test_one_that_is_done_has_ended_and_one_that_closes_is_not_silent(standing: ProcessStatus) -> None:
     child = Child()
     child.start(7)
     child.beats(1.0, closing=True)
@@ -96,7 +96,7 @@ def test_one_that_is_done_has_ended_and_one_that_closes_is_not_silent(standing: 
     assert standing.condition(child, 5.0) is Condition.ENDED
 
 
-def test_one_that_is_killed_to_be_started_again_is_being_restarted(standing: Standing) -> None:
+def test_one_that_is_killed_to_be_started_again_is_being_restarted(standing: ProcessStatus) -> None:
     child = Child()
     child.start(7)
     child.beats(1.0)
@@ -104,7 +104,7 @@ def test_one_that_is_killed_to_be_started_again_is_being_restarted(standing: Sta
     assert standing.condition(child, 1.5) is Condition.RESTARTING
 
 
-def test_one_that_sends_no_beats_is_taken_to_be_alive(standing: Standing) -> None:
+def test_one_that_sends_no_beats_is_taken_to_be_alive(standing: ProcessStatus) -> None:
     child = Child(Task(Launch("one"), (), beats=False))
     child.start(7)
     assert standing.condition(child, 1e6) is Condition.ALIVE
@@ -112,7 +112,7 @@ def test_one_that_sends_no_beats_is_taken_to_be_alive(standing: Standing) -> Non
 
 def test_a_change_is_told_once_and_since_when_it_is_so() -> None:
     clock = Clock(10)
-    standing, child = Standing(clock, POLICY.liveness), Child()  # type: ignore[arg-type]
+    standing, child = ProcessStatus(clock, POLICY.liveness), Child()  # type: ignore[arg-type]
     child.start(7)
     (state,), changed = standing.of([child], 0.0)
     assert (state.role, state.pid, state.starts, state.since_ns, changed) == ("translator", 7, 1, 10, True)

@@ -143,7 +143,7 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class RelayedMessage:
     """What the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress of a component.
 
     Its envelope is the message's name, for ProcessStates and Progress followed by "_" and whose it is.

@@ -47,7 +47,7 @@ class Child(Protocol):
     def last_exit(self) -> str: ...
 
 
-class Standing:
+class ProcessStatus:
     """Knows since when each process is in the condition that it is in."""
 
     def __init__(self, clock: Clock, liveness: LivenessPolicy) -> None:

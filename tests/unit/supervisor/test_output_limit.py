@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-from afspm.supervisor.thinning import AT_ONCE, BYTES_PER_S, LAST_BYTES, PAUSE_S, STAMP_BYTES, Thinning
+from afspm.supervisor.output_limit import AT_ONCE, BYTES_PER_S, LAST_BYTES, PAUSE_S, STAMP_BYTES, OutputLimit
 
 LINE = b"still waiting for the stage\n"
 COST = len(LINE) + STAMP_BYTES
 NIGHT_S = 36_000.0
 
 
-def flooded(now_s: float = 0.0) -> Thinning:
-    thinning = Thinning(now_s)
+def flooded(now_s: float = 0.0) -> OutputLimit:
+    thinning = OutputLimit(now_s)
     while thinning.passes(LINE, now_s):
         pass
     return thinning
 
 
 def test_a_component_that_says_a_little_all_night_is_heard_in_full() -> None:
-    thinning, period_s = Thinning(0.0), COST / BYTES_PER_S
+    thinning, period_s = OutputLimit(0.0), COST / BYTES_PER_S
     assert all(thinning.passes(LINE, i * period_s) for i in range(100_000))
 
 
 def test_much_may_be_said_at_once() -> None:
-    thinning = Thinning(0.0)
+    thinning = OutputLimit(0.0)
     assert all(thinning.passes(LINE, 0.0) for _ in range(AT_ONCE // COST))
     assert not thinning.passes(LINE, 0.0)
 
 
 def test_a_night_of_printing_is_no_more_than_the_disk_can_take() -> None:
-    thinning, kept, now_s, hours_s = Thinning(0.0), 0, 0.0, NIGHT_S / 10
+    thinning, kept, now_s, hours_s = OutputLimit(0.0), 0, 0.0, NIGHT_S / 10
     while now_s < hours_s:
         if thinning.passes(LINE, now_s):
             kept += COST

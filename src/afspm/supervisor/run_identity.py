@@ -21,7 +21,7 @@ _SAME_S = 1e-3  # two processes of one computer agree on real time to that
 
 
 @dataclass(frozen=True)
-class Common:
+class RunIdentity:
     """What is the same in all processes of a run, on all of its computers.
 
     Attributes:
@@ -39,7 +39,7 @@ def new_identity() -> str:
     return os.urandom(8).hex()
 
 
-def of_scheduler(launch: Launch, tell: Callable[[str], None]) -> Common:
+def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
     """Ask the scheduler that `launch` leads to, which is waited for. One of version 1 knows real time alone.
 
     Raises:
@@ -61,7 +61,7 @@ def of_scheduler(launch: Launch, tell: Callable[[str], None]) -> Common:
                 if isinstance(incoming, ReplyReceived) and incoming.response.id == asked:
                     if incoming.response.code == ControlResponse.CMD_NOT_SUPPORTED:
                         tell(f"{incoming.response.reason}: the experiment goes by real time")
-                        return Common(wall, "", simulated=False)
+                        return RunIdentity(wall, "", simulated=False)
                     return _read(incoming.response, asked_s, wall.now_s(), str(launch.sockets.control))
             if not found and not waiting:
                 waiting = True
@@ -70,7 +70,7 @@ def of_scheduler(launch: Launch, tell: Callable[[str], None]) -> Common:
         port.close()
 
 
-def _read(response: Response, asked_s: float, answered_s: float, where: str) -> Common:
+def _read(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
     """What was told between two moments of real time, with the clock as it is to be read on this computer."""
     if not response.ok:
         raise ConfigError(f"the scheduler does not tell the time: {response.reason}", where=where)
@@ -82,9 +82,9 @@ def _read(response: Response, asked_s: float, answered_s: float, where: str) -> 
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise WireError(f"the scheduler's time can't be read: {error!r}", where=where) from error
     if told.get("waits"):
-        return Common(clock, run, simulated)
+        return RunIdentity(clock, run, simulated)
     real_s = (asked_s + answered_s) / 2
     shown_s = clock.start_s + (real_s - clock.origin_s) * clock.speed
     if abs(now_s - shown_s) <= ((answered_s - asked_s) / 2 + _SAME_S) * clock.speed:
-        return Common(clock, run, simulated)  # the same clock on the wall: exactly the same time
-    return Common(ExperimentClock(real_s, now_s, clock.speed), run, simulated)
+        return RunIdentity(clock, run, simulated)  # the same clock on the wall: exactly the same time
+    return RunIdentity(ExperimentClock(real_s, now_s, clock.speed), run, simulated)

@@ -24,26 +24,32 @@ from afspm.supervisor.ending import Why
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from afspm.experiment import Experiment, Start
+    from afspm.experiment import Experiment, ProcessStart
     from afspm.supervisor.log import RunLog
-    from afspm.supervisor.supervisor import Outcome
+    from afspm.supervisor.supervisor import RunOutcome
 
 REPORT_WITHIN_S = 120.0
 TOLD_WITHIN_S = 30.0
 
 
 @dataclass(frozen=True)
-class Ended:
+class EndedRun:
     """A run that is over."""
 
     name: str
     folder: Path
-    outcome: Outcome
+    outcome: RunOutcome
     simulated: bool
 
 
 def follow(
-    experiment: Experiment, ended: Ended, starts: Sequence[Start], clock: Clock, log: RunLog, *, with_report: bool
+    experiment: Experiment,
+    ended: EndedRun,
+    starts: Sequence[ProcessStart],
+    clock: Clock,
+    log: RunLog,
+    *,
+    with_report: bool,
 ) -> None:
     """Tell whoever [notify] names, then say what was measured and write the report, which need the disk and may take
     long.
@@ -90,7 +96,7 @@ def report(folder: Path, log: RunLog) -> None:
         log.write(LOGGED_AS, logging.INFO, f"the report is {folder / REPORT_FILE}")
 
 
-def tell(ended: Ended, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
+def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
     """Tell people that a run is over, and how. What fails is tried again, for half a minute."""
     is_lost = ended.outcome.why is Why.LOST
     what = GIVEN_UP if is_lost and GIVEN_UP in on else END
@@ -122,6 +128,6 @@ def _tell(notice: Notification, targets: Targets, way: Way, clock: Clock, until_
         threading.Event().wait(delay_s)
 
 
-def _text(outcome: Outcome) -> str:
+def _text(outcome: RunOutcome) -> str:
     given_up = [report.name for report in outcome.reports if report.given_up]
     return outcome.text + (f"; given up: {', '.join(given_up)}" if given_up else "")

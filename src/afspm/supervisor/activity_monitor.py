@@ -22,7 +22,7 @@ LOOKS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Signs:
+class ActivitySample:
     """What is seen of a process at one time.
 
     Attributes:
@@ -38,10 +38,10 @@ class Signs:
     runs: bool = False
 
 
-Look = Callable[[int], Signs | None]
+Look = Callable[[int], ActivitySample | None]
 
 
-class VitalSigns:
+class ActivityMonitor:
     """Looks at one process again and again, and judges by what it has done lately.
 
     Args:
@@ -57,7 +57,7 @@ class VitalSigns:
         self._pid = pid
         self._lately_s = lately_s
         self._look = look or of_process
-        self._seen: deque[tuple[float, Signs]] = deque()
+        self._seen: deque[tuple[float, ActivitySample]] = deque()
         self._works: bool | None = None
         self.again_s = -math.inf
 
@@ -68,7 +68,7 @@ class VitalSigns:
             self._works = self._judge(self._look(self._pid), now_s)
         return self._works
 
-    def _judge(self, signs: Signs | None, now_s: float) -> bool | None:
+    def _judge(self, signs: ActivitySample | None, now_s: float) -> bool | None:
         if signs is None:
             return None
         self._seen.append((now_s, signs))
@@ -86,7 +86,7 @@ class VitalSigns:
         return signs.processor_s - first.processor_s >= LEAST_SHARE * (now_s - since_s)
 
 
-def of_process(pid: int) -> Signs | None:
+def of_process(pid: int) -> ActivitySample | None:
     """What can be seen of a process here; None: nothing, or there is none."""
     if sys.platform == "linux":
         return _on_linux(pid)
@@ -100,14 +100,14 @@ if sys.platform == "linux":
     _STOPPED = "Tt"
     _RUNS = "R"
 
-    def _on_linux(pid: int) -> Signs | None:
+    def _on_linux(pid: int) -> ActivitySample | None:
         folder = Path("/proc") / str(pid)
         try:
             state, processor_s = _stat(folder)
             threads = list((folder / "task").iterdir())
         except (OSError, ValueError, IndexError):  # it ends at this moment
             return None
-        return Signs(processor_s, any(map(_waits_for_disk, threads)), state in _STOPPED, state == _RUNS)
+        return ActivitySample(processor_s, any(map(_waits_for_disk, threads)), state in _STOPPED, state == _RUNS)
 
     def _waits_for_disk(thread: Path) -> bool:
         try:
@@ -128,7 +128,7 @@ elif sys.platform == "win32":
     _MAY_ASK = 0x1000  # PROCESS_QUERY_LIMITED_INFORMATION
     _TICK_S = 1e-7
 
-    def _on_windows(pid: int) -> Signs | None:
+    def _on_windows(pid: int) -> ActivitySample | None:
         """Windows says of no thread of another process what it waits for; whoever has stopped it, it uses no time."""
         system = ctypes.WinDLL("kernel32", use_last_error=True)
         system.OpenProcess.restype = wintypes.HANDLE
@@ -145,4 +145,6 @@ elif sys.platform == "win32":
                 return None
         finally:
             system.CloseHandle(process)
-        return Signs(sum((time.dwHighDateTime << 32) + time.dwLowDateTime for time in (kernel, user)) * _TICK_S)
+        return ActivitySample(
+            sum((time.dwHighDateTime << 32) + time.dwLowDateTime for time in (kernel, user)) * _TICK_S
+        )

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Abilities:
+class MicroscopeCapabilities:
     """The generic names of actions, and of parameters with their SI unit (None: it depends).
 
     Attributes:
@@ -26,7 +26,7 @@ class Abilities:
     sets: Mapping[str, tuple[Parameter, ...]]
 
 
-def of_class(microscope: type, settings: Mapping[str, Any]) -> Abilities | None:
+def of_class(microscope: type, settings: Mapping[str, Any]) -> MicroscopeCapabilities | None:
     """The abilities of a `Driver` class with these settings; None where the class does not tell."""
     from afspm.translator.driver import Driver
 
@@ -40,7 +40,7 @@ def of_class(microscope: type, settings: Mapping[str, Any]) -> Abilities | None:
         sets = {name: _set_by(what, table) for name, what in added.items()}
     except (AfspmError, AttributeError):
         return None  # the microscope itself will say what is wrong with its table
-    return Abilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets)
+    return MicroscopeCapabilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets)
 
 
 def _set_by(action: Any, table: ParameterTable) -> tuple[Parameter, ...]:

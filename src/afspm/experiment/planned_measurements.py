@@ -20,7 +20,7 @@ PURE = (
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedMeasurements:
     """The measurements of a plan, and what the microscope must have for them."""
 
     regions: tuple[Region, ...] = ()
@@ -30,7 +30,7 @@ class Planned:
     needs_parameters: tuple[str, ...] = ()
 
 
-def plan_of(component: type, settings: Mapping[str, Any]) -> Planned | None:
+def plan_of(component: type, settings: Mapping[str, Any]) -> PlannedMeasurements | None:
     """The plan of a component with these settings; None where it has none, or none that can be known.
 
     Raises:
@@ -45,10 +45,10 @@ def plan_of(component: type, settings: Mapping[str, Any]) -> Planned | None:
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
     needs = (tuple(getattr(made, name, ())) for name in ("needs_actions", "needs_parameters"))
-    return Planned(regions, positions, getattr(plan, "shape", None), *needs)
+    return PlannedMeasurements(regions, positions, getattr(plan, "shape", None), *needs)
 
 
-def refusals(name: str, planned: Planned, limits: ExperimentLimits) -> list[str]:
+def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[str]:
     """Why the limits would refuse what is planned; each reason once."""
     # steps and rates depend on what is in force by then
     guard = LimitChecker(_without_changes(limits))

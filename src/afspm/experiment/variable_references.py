@@ -11,10 +11,10 @@ from typing import Any
 
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings
-from afspm.experiment.lines import Path
+from afspm.experiment.toml_lines import Path
 
 
-class References:
+class VariableReferences:
     """Replaces references in values; reports cycles; remembers which keys were used."""
 
     def __init__(self, document: Document, variables: Mapping[str, Any], findings: Findings) -> None:

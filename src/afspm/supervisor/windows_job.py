@@ -1,4 +1,4 @@
-"""Job objects of Windows: a child, all that it starts, and our own end. Elsewhere `reaper` and groups do that."""
+"""WindowsJob objects of Windows: a child, all that it starts, and our own end. Elsewhere `reaper` and groups do that."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Limits(ctypes.Structure):
     )
 
 
-class Job:
+class WindowsJob:
     """A child and all that it starts, ended together.
 
     Args:

@@ -15,7 +15,7 @@ STAMP_BYTES = 100
 """What a line costs besides its text: stamp and name in the file, and its place in memory."""
 
 
-class Thinning:
+class OutputLimit:
     """Which lines of a stream go on, and which are left out.
 
     A stream has AT_ONCE to its credit, and gets BYTES_PER_S. Once that is used up it pauses: from then on its lines are

@@ -15,7 +15,7 @@ import pytest
 from afspm.client.connect import GUEST_KEYS, _keys_in
 from afspm.errors import ConfigError
 from afspm.experiment import Experiment, load
-from afspm.supervisor.key_ring import Handed, hand_over
+from afspm.supervisor.key_handout import KeyHandout, hand_over
 from afspm.transport.keys import Keys, from_launch, generate
 
 FILE = """
@@ -49,12 +49,12 @@ def experiment(folder: Path, more: str = "", router: str = "") -> Experiment:
     return load(file)
 
 
-def handed(made: Experiment, **which: Any) -> Handed:
+def handed(made: Experiment, **which: Any) -> KeyHandout:
     ports = itertools.count(21_000)
     return hand_over(made, made.launches(take_address=lambda: f"tcp://127.0.0.1:{next(ports)}", **which))
 
 
-def lines(found: Handed) -> dict[str, Mapping[str, Any]]:
+def lines(found: KeyHandout) -> dict[str, Mapping[str, Any]]:
     return {start.launch.name: start.launch.keys or {} for start in found.starts}
 
 

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from afspm.clock import ExperimentClock
-from afspm.supervisor.wall import PARTED_S, Wall
+from afspm.supervisor.clock_check import PARTED_S, ClockCheck
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ def test_when_the_clock_on_the_wall_is_set_that_is_said_once(
 ) -> None:
     wall_s = time.time
     told: list[str] = []
-    wall = Wall(ExperimentClock.starting_now(), told.append)
+    wall = ClockCheck(ExperimentClock.starting_now(), told.append)
     wall.look()
     assert told == []
     monkeypatch.setattr(time, "time", lambda: wall_s() + step_s)
@@ -32,7 +32,7 @@ def test_when_the_clock_on_the_wall_is_set_that_is_said_once(
 def test_of_a_time_that_passes_faster_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     wall_s = time.time
     told: list[str] = []
-    wall = Wall(ExperimentClock.starting_now(speed=60.0), told.append)
+    wall = ClockCheck(ExperimentClock.starting_now(speed=60.0), told.append)
     monkeypatch.setattr(time, "time", lambda: wall_s() + 3600.0)
     wall.look()
     assert told == []

@@ -9,8 +9,8 @@ import pytest
 
 from afspm.errors import ConfigError
 from afspm.experiment import load
-from afspm.supervisor import resuming
-from afspm.supervisor.edited import differing
+from afspm.supervisor import resume
+from afspm.supervisor.config_diff import differing
 from afspm.supervisor.run import FILES, HOMES
 
 NIGHT = """
@@ -53,9 +53,9 @@ def night(tmp_path: Path) -> Path:
 
 
 def test_by_the_name_of_files_that_are_as_they_were_it_is_found(night: Path) -> None:
-    assert resuming.find(night).folder == night.parent / "runs" / "night-1"
+    assert resume.find(night).folder == night.parent / "runs" / "night-1"
     night.write_text("# reading it again\n" + NIGHT.replace("60.0", "6e1"), encoding="utf-8")
-    assert resuming.find(night).folder == night.parent / "runs" / "night-1"
+    assert resume.find(night).folder == night.parent / "runs" / "night-1"
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_where_the_file_was_edited_that_is_refused_with_what_may_be_done(
 ) -> None:
     night.write_text(NIGHT.replace(before, after), encoding="utf-8")
     with pytest.raises(ConfigError, match=said) as refused:
-        resuming.find(night)
+        resume.find(night)
     assert f"`afspm run --resume {night.parent / 'runs' / 'night-1'}` goes on without" in refused.value.hint
     assert f"`afspm run {night} {night.parent / 'series.toml'}` begins a new run" in refused.value.hint
 
@@ -81,18 +81,18 @@ def test_where_the_file_was_edited_that_is_refused_with_what_may_be_done(
 def test_an_overlay_that_was_edited_is_seen_as_well(night: Path) -> None:
     (night.parent / "series.toml").write_text(OVERLAY.replace("1 um", "5 um"), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"\[series\] size"):
-        resuming.find(night)
+        resume.find(night)
 
 
 def test_an_overlay_that_is_gone_is_missed(night: Path) -> None:
     (night.parent / "series.toml").unlink()
     with pytest.raises(ConfigError, match=r"\[series\] is gone"):
-        resuming.find(night)
+        resume.find(night)
 
 
 def test_by_its_folder_it_goes_on_as_it_was_begun_whatever_was_edited(night: Path) -> None:
     night.write_text(NIGHT.replace("1 um", "100 nm"), encoding="utf-8")
-    found = resuming.find(night.parent / "runs" / "night-1")
+    found = resume.find(night.parent / "runs" / "night-1")
     assert "100 nm" not in found.experiment.expanded()
 
 

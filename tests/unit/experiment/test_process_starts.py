@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import ConfigError
-from afspm.experiment import Experiment, Role, Start, load
+from afspm.experiment import Experiment, ProcessStart, Role, load
 from afspm.launch import Launch
 from afspm.transport.keys import generate
 
@@ -27,7 +27,9 @@ def counting() -> Callable[[], str]:
     return lambda: f"tcp://127.0.0.1:{next(ports)}"
 
 
-def starts(experiment: Experiment, only: Collection[str] = (), without: Collection[str] = ()) -> dict[str, Start]:
+def starts(
+    experiment: Experiment, only: Collection[str] = (), without: Collection[str] = ()
+) -> dict[str, ProcessStart]:
     found = experiment.launches(take_address=counting(), only=only, without=without, run_dir="run", state_dir="state")
     return {start.launch.name: start for start in found}
 

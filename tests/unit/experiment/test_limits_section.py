@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from afspm.experiment.limits import to_settings
+from afspm.experiment.limits_section import to_settings
 from afspm.logic.limit_checker import LimitChecker
 from afspm.model import ControlRequest, ProblemNames, Request
 from afspm.scheduler.settings import scheduler_settings

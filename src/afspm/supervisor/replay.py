@@ -34,7 +34,7 @@ BEFORE_S = 1.0
 
 
 @dataclass(frozen=True)
-class Options:
+class ReplayOptions:
     """How to replay a run.
 
     Attributes:
@@ -53,7 +53,7 @@ class Options:
     runs: Path = Path("runs")
 
 
-def replay(where: Path, options: Options, tell: Callable[[str], None]) -> int:
+def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> int:
     """Publish a recorded run again until its end, or Ctrl-C; returns how many packets were published.
 
     Raises:
@@ -106,7 +106,7 @@ def _clock(run: Run, speed: float | None, first: Packet) -> ExperimentClock:
     return ExperimentClock.starting_now(start_s - BEFORE_S * speed, speed)
 
 
-def _addresses(run: Run, options: Options) -> tuple[str, str]:
+def _addresses(run: Run, options: ReplayOptions) -> tuple[str, str]:
     ports = FreePorts()
     said = _said(run)
     return options.publish or said[0] or ports.address(), options.serve or said[1] or ports.address()

@@ -27,7 +27,7 @@ _ROLE_BY_BASE = (
 
 
 @dataclass(frozen=True)
-class Declared:
+class ComponentDeclaration:
     """What a component says about itself in attributes of its class (a command: in its table)."""
 
     solves: tuple[str, ...] = ()
@@ -38,13 +38,13 @@ class Declared:
     needs_parameters: tuple[str, ...] = ()
 
     @classmethod
-    def of_class(cls, component: type) -> Declared:
+    def of_class(cls, component: type) -> ComponentDeclaration:
         return cls(
             **{key: names for key in DECLARED_KEYS if (names := _names(getattr(component, key, None))) is not None}
         )
 
     @classmethod
-    def of_table(cls, table: Mapping[str, Any]) -> Declared:
+    def of_table(cls, table: Mapping[str, Any]) -> ComponentDeclaration:
         return cls(**{key: names for key in DECLARED_KEYS if (names := _names(table.get(key))) is not None})
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from afspm.addresses import connectable, reaches
 from afspm.client.connect import GUEST_KEYS
-from afspm.experiment import Experiment, Role, Start
+from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.logic.supervisor_registry import SUPERVISOR
 from afspm.record.run_json import STATE_DIR
 from afspm.storage.atomic import replace_file
@@ -24,7 +24,7 @@ WRITTEN_WITHIN_S = 5.0
 
 
 @dataclass(frozen=True)
-class Handed:
+class KeyHandout:
     """What is started, with its keys.
 
     Attributes:
@@ -32,7 +32,7 @@ class Handed:
             have them; None: the file says where keys are, or that there are none.
     """
 
-    starts: Sequence[Start]
+    starts: Sequence[ProcessStart]
     guest: Mapping[str, Any] | None = None
     supervisor: Mapping[str, Any] | None = None
 
@@ -51,31 +51,31 @@ class Handed:
                 run_bounded(lambda: file.unlink(missing_ok=True), WRITTEN_WITHIN_S)
 
 
-def hand_over(experiment: Experiment, starts: Sequence[Start]) -> Handed:
+def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHandout:
     """Give each process that is to be started its keys.
 
     Raises:
         ConfigError: a key of the file is missing, or others may read it.
     """
     if experiment.keys_folder is not None:
-        return Handed([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
+        return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
     security = experiment.resolved.security
     guarded = {} if security.plain or security.insecure else _guarded(experiment, starts)
-    return _made(starts, guarded, _scheduler(experiment)) if guarded else Handed(starts)
+    return _made(starts, guarded, _scheduler(experiment)) if guarded else KeyHandout(starts)
 
 
 def _scheduler(experiment: Experiment) -> str:
     return next((part.name for part in experiment.resolved.with_role(Role.SCHEDULER)), "")
 
 
-def _with(start: Start, own: Keys | None, scheduler: str) -> Start:
+def _with(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
     """A start with its keys; `scheduler`: whom alone a translator obeys."""
     if own is None:
         return start
     return replace(start, launch=replace(start.launch, keys={**own.as_launch(), "scheduler": scheduler}))
 
 
-def _of_file(experiment: Experiment, start: Start) -> Keys | None:
+def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
     """The keys of a process out of the folder, with those of others only where it has to know them."""
     launch = start.launch
     own = keys.from_launch(launch.name, launch.keys)
@@ -86,7 +86,7 @@ def _of_file(experiment: Experiment, start: Start) -> Keys | None:
     return replace(own, peers=known, folder=None)
 
 
-def _guarded(experiment: Experiment, starts: Sequence[Start]) -> dict[str, str]:
+def _guarded(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[str, str]:
     """Whose requests are to be proved, by the address that they come to: all who may send them are started here."""
     slots = experiment.resolved.net.slots
     here = {start.launch.name for start in starts}
@@ -104,7 +104,7 @@ def _guarded(experiment: Experiment, starts: Sequence[Start]) -> dict[str, str]:
     return found
 
 
-def _made(starts: Sequence[Start], guarded: Mapping[str, str], scheduler: str) -> Handed:
+def _made(starts: Sequence[ProcessStart], guarded: Mapping[str, str], scheduler: str) -> KeyHandout:
     """New pairs for all that is started, for those who join, and for who reports."""
     pairs = {name: keys.pair() for name in [*(start.launch.name for start in starts), SUPERVISOR, GUEST]}
     public = {name: pair[0] for name, pair in pairs.items()}
@@ -124,4 +124,4 @@ def _made(starts: Sequence[Start], guarded: Mapping[str, str], scheduler: str) -
     ]
     asked = next((address for address, owner in guarded.items() if owner == scheduler), None)
     outside = [None if (one := of(name, asked)) is None else one.as_launch() for name in (GUEST, SUPERVISOR)]
-    return Handed(handed, *outside)
+    return KeyHandout(handed, *outside)

@@ -29,8 +29,8 @@ from pydantic import Field
 from afspm.errors import AfspmError
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
-from afspm.experiment.lines import Path
 from afspm.experiment.sections import S, Section, parse, report
+from afspm.experiment.toml_lines import Path
 from afspm.logic.limits import ExperimentLimits, Limit
 from afspm.model import Parameter, Region, names
 from afspm.units import Angle, Duration, Length, parse_quantity, si
@@ -55,7 +55,7 @@ class ParameterLimit(ActionLimit):
     rate: Quantity | None = None
 
 
-class Box(Section):
+class RegionSection(Section):
     """[limits] region: from and to in x and y, or a rectangle by its centre that may be turned."""
 
     x: Pair | None = None
@@ -65,15 +65,15 @@ class Box(Section):
     angle: Angle = 0.0
 
 
-class Whole(Section):
+class LimitsSection(Section):
     """The keys of [limits] that are not parameters."""
 
-    region: Box | None = None
+    region: RegionSection | None = None
     most_pixels: Annotated[int, Field(gt=0)] = 8192 * 8192
 
 
 LARGEST_REGION_M: Final = 0.01  # no scanner reaches as far
-_OWN: Final = (*Whole.model_fields, "actions")
+_OWN: Final = (*LimitsSection.model_fields, "actions")
 
 
 class LimitsReader:
@@ -109,7 +109,11 @@ class LimitsReader:
     def read(self, table: Mapping[str, Any]) -> ExperimentLimits:
         """The limits; what is wrong is reported and left out."""
         whole = parse(
-            Whole, "limits", {k: v for k, v in table.items() if k in Whole.model_fields}, self._document, self._findings
+            LimitsSection,
+            "limits",
+            {k: v for k, v in table.items() if k in LimitsSection.model_fields},
+            self._document,
+            self._findings,
         )
         parameters = {k: v for k, v in table.items() if k not in _OWN}
         actions = table.get("actions", {})
@@ -218,7 +222,7 @@ class LimitsReader:
             return None
         return number
 
-    def _region(self, box: Box) -> Region | None:
+    def _region(self, box: RegionSection) -> Region | None:
         place = self._document.place("limits", "region")
         spans, rectangle = (box.x is not None, box.y is not None), (box.center is not None, box.size is not None)
         if any(spans) == any(rectangle) or not (all(spans) or all(rectangle)):

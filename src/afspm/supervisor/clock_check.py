@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from afspm.clock import ExperimentClock
-from afspm.formatting import lasting
+from afspm.formatting import duration_text
 
 PARTED_S = 5.0
 
 
-class Wall:
+class ClockCheck:
     """Says once that the two have parted; of a simulated time that passes faster nobody expects them to agree.
 
     Args:
@@ -29,6 +29,6 @@ class Wall:
         self._is_told = True
         way = "ahead of" if ahead_s > 0.0 else "behind"
         self._tell(
-            f"the clock on the wall is {lasting(abs(ahead_s))} {way} that of the run: it was set, or the computer "
+            f"the clock on the wall is {duration_text(abs(ahead_s))} {way} that of the run: it was set, or the computer "
             "slept; the run goes on by its own, in all that it records"
         )

@@ -8,26 +8,26 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from afspm.errors import AfspmError, InvalidValue, each
+from afspm.errors import AfspmError, InvalidValue, individual_errors
 from afspm.experiment import (
-    abilities,
-    caching,
-    classes,
-    limits,
+    cache_section,
+    capabilities,
+    class_loader,
+    limits_section,
     notifying,
-    planned,
+    planned_measurements,
     recording,
     sections,
     settings,
     wiring,
 )
-from afspm.experiment.abilities import Abilities
-from afspm.experiment.caching import Caching
-from afspm.experiment.classes import Declared
+from afspm.experiment.cache_section import CacheSettings
+from afspm.experiment.capabilities import MicroscopeCapabilities
+from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
-from afspm.experiment.parts import EMULATED, SIMULATED, Part, Parts, Role
-from afspm.experiment.wiring import Net, Slot, Wires
+from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts, Role
+from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
 from afspm.logic.limits import ExperimentLimits
 from afspm.model import ProblemNames
 
@@ -37,35 +37,35 @@ FROM_SECTIONS = ("control", "limits", "cache")
 
 
 @dataclass
-class Resolved:
+class ResolvedExperiment:
     """Everything about the experiment that is known before it starts. Mappings are by the component's name."""
 
-    parts: Parts
+    parts: ExperimentParts
     document: Document
     findings: Findings
-    clock: sections.Clock
-    control: sections.Control
-    security: sections.Security
+    clock: sections.ClockSection
+    control: sections.ControlSection
+    security: sections.SecuritySection
     messages: tuple[str, ...]
-    restart: sections.Restart
-    notify: sections.Notify
+    restart: sections.RestartSection
+    notify: sections.NotifySection
     problems: ProblemNames
     named_problems: dict[str, int]
     refused: dict[str, frozenset[str]] = field(default_factory=dict)
     """Of those whose settings are wrong: which of them."""
-    classes: dict[str, type] = field(default_factory=dict)
+    class_loader: dict[str, type] = field(default_factory=dict)
     class_paths: dict[str, str] = field(default_factory=dict)
     roles: dict[str, Role] = field(default_factory=dict)
-    declared: dict[str, Declared] = field(default_factory=dict)
+    declared: dict[str, ComponentDeclaration] = field(default_factory=dict)
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
-    wires: dict[str, Wires] = field(default_factory=dict)
-    net: Net = field(default_factory=Net)
-    listening: list[Slot] = field(default_factory=list)
+    wires: dict[str, WiringKeys] = field(default_factory=dict)
+    net: Wiring = field(default_factory=Wiring)
+    listening: list[BoundSocket] = field(default_factory=list)
     """Where components listen by settings of their own, beside the wiring."""
-    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
-    caching: Caching = field(default_factory=Caching)
+    limits_section: ExperimentLimits = field(default_factory=ExperimentLimits)
+    cache_section: CacheSettings = field(default_factory=CacheSettings)
 
-    def with_role(self, role: Role) -> list[Part]:
+    def with_role(self, role: Role) -> list[ExperimentPart]:
         return [part for part in self.parts.components if self.roles.get(part.name) is role]
 
     @property
@@ -74,17 +74,17 @@ class Resolved:
         keys = self.security.keys
         return None if keys is None else self.document.folder_of("security", "keys") / keys
 
-    def envelopes(self, part: Part) -> tuple[str, ...] | None:
+    def envelopes(self, part: ExperimentPart) -> tuple[str, ...] | None:
         """The prefixes a component subscribes to: as the file says, else as its class declares; None: all."""
         wanted = part.own.get("envelopes", self.wires[part.name].envelopes)
         if wanted is None:
             return self.declared[part.name].listens
         return (wanted,) if isinstance(wanted, str) else tuple(map(str, wanted))
 
-    def abilities(self, part: Part) -> Abilities | None:
+    def abilities(self, part: ExperimentPart) -> MicroscopeCapabilities | None:
         """What a translator can do; None where that is not known before it runs."""
         microscope = self.classes.get(part.name)
-        return None if microscope is None else abilities.of_class(microscope, self.settings[part.name])
+        return None if microscope is None else capabilities.of_class(microscope, self.settings[part.name])
 
     @property
     def simulated(self) -> bool:
@@ -117,39 +117,39 @@ class Resolved:
         """The emulated controllers among the components."""
         return [part.name for part in self.parts.components if self._says(part, EMULATED)]
 
-    def _is_the_microscope(self, part: Part) -> bool:
+    def _is_the_microscope(self, part: ExperimentPart) -> bool:
         return part.own.get(SIMULATED) is True if part.command else self._says(part, SIMULATED)
 
-    def _says(self, part: Part, attribute: str) -> bool:
+    def _says(self, part: ExperimentPart, attribute: str) -> bool:
         return getattr(self.classes.get(part.name), attribute, False) is True
 
 
-def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:
+def resolve(parts: ExperimentParts, document: Document, findings: Findings) -> ResolvedExperiment:
     """Resolve all that can be; what can't is reported and left out."""
 
     def section(model: type[sections.S], name: str) -> sections.S:
         return sections.parse(model, name, parts.sections.get(name, {}), document, findings)
 
     named = _problems(parts.sections.get("problems", {}), document, findings)
-    resolved = Resolved(
+    resolved = ResolvedExperiment(
         parts=parts,
         document=document,
         findings=findings,
-        clock=section(sections.Clock, "clock"),
-        control=section(sections.Control, "control"),
-        security=section(sections.Security, "security"),
+        clock=section(sections.ClockSection, "clock"),
+        control=section(sections.ControlSection, "control"),
+        security=section(sections.SecuritySection, "security"),
         messages=_messages(parts.variables.get("messages", []), document, findings),
-        restart=section(sections.Restart, "restart"),
-        notify=section(sections.Notify, "notify"),
+        restart=section(sections.RestartSection, "restart"),
+        notify=section(sections.NotifySection, "notify"),
         problems=ProblemNames(named),
         named_problems=named,
     )
     for part in parts.components:
         resolved.wires[part.name] = wiring.read_wires(part, document.place, findings)
-    with classes.importing_from(document.folders):
+    with class_loader.importing_from(document.folders):
         for part in parts.components:
             _resolve_part(part, resolved)
-        recorder = recording.implied(resolved, section(sections.Record, "record"))
+        recorder = recording.implied(resolved, section(sections.RecordSection, "record"))
         notifier = notifying.implied(resolved, resolved.notify)
         for added in filter(None, (recorder, notifier)):
             parts.components.append(added)
@@ -160,20 +160,20 @@ def resolve(parts: Parts, document: Document, findings: Findings) -> Resolved:
     return resolved
 
 
-def _resolve_part(part: Part, resolved: Resolved) -> None:
+def _resolve_part(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
     name, document, findings = part.name, resolved.document, resolved.findings
-    resolved.declared[name] = Declared.of_table(part.own)
+    resolved.declared[name] = ComponentDeclaration.of_table(part.own)
     resolved.roles[name] = _written_role(part, resolved)
     resolved.settings[name] = settings.jsonable(part.settings, document.folder_of(name))
     if part.command:
         return
     try:
-        path = classes.full_path(part.class_path)
-        component = classes.load(path)
-    except classes.Unloadable as error:
+        path = class_loader.full_path(part.class_path)
+        component = class_loader.load(path)
+    except class_loader.Unloadable as error:
         findings.error(f"[{name}] class: {error.what}", document.place(name, "class"), error.hint)
         return
-    role = classes.role_of(component) if isinstance(component, type) else None
+    role = class_loader.role_of(component) if isinstance(component, type) else None
     if role is None:
         findings.error(
             f"[{name}] {path} is not a component",
@@ -190,12 +190,12 @@ def _resolve_part(part: Part, resolved: Resolved) -> None:
     if findings.errors > errors:
         resolved.refused[name] = frozenset(wrong)
     for setting, address, keyed in settings.listening(component, resolved.settings[name]):
-        resolved.listening.append(Slot(name, setting, address, setting, document.place(name, setting), keyed))
+        resolved.listening.append(BoundSocket(name, setting, address, setting, document.place(name, setting), keyed))
 
 
-def _declared(component: type, part: Part) -> Declared:
+def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
     """What the class says; a setting `problem` takes the place of its default there."""
-    said = Declared.of_class(component)
+    said = ComponentDeclaration.of_class(component)
     default, given = settings.default_of(component, "problem"), part.settings.get("problem")
     if not isinstance(given, str) or not isinstance(default, str):
         return said
@@ -206,24 +206,24 @@ def _declared(component: type, part: Part) -> Declared:
     return replace(said, solves=put(said.solves), flags=put(said.flags))
 
 
-def _resolve_sections(resolved: Resolved) -> None:
+def _resolve_sections(resolved: ResolvedExperiment) -> None:
     """The sections whose meaning depends on the components: what is kept, what is allowed, what is planned."""
     parts, document, findings = resolved.parts, resolved.document, resolved.findings
     logic = next((wires.cache_logic for wires in resolved.wires.values() if wires.cache_logic), None)
-    resolved.caching = caching.read(parts.sections.get("cache", {}), logic, document, findings)
+    resolved.caching = cache_section.read(parts.sections.get("cache", {}), logic, document, findings)
     has = next((has for part in resolved.with_role(Role.TRANSLATOR) if (has := resolved.abilities(part))), None)
-    reader = limits.LimitsReader(
+    reader = limits_section.LimitsReader(
         document,
         findings,
         components=tuple(part.name for part in parts.components),
-        parameters=abilities.base() if has is None else {**abilities.base(), **has.parameters},
+        parameters=capabilities.base() if has is None else {**capabilities.base(), **has.parameters},
         actions=None if has is None else has.actions,
         certain=has is not None,
         sets={} if has is None else has.sets,
     )
     resolved.limits = reader.read(parts.sections.get("limits", {}))
     for part in resolved.with_role(Role.TRANSLATOR):
-        for action, reason in planned.refused_actions(resolved.limits):
+        for action, reason in planned_measurements.refused_actions(resolved.limits):
             place = document.place(part.name, "actions", action)
             findings.error(f"[{part.name}] actions: the limits would always refuse {reason}", place)
     for part in parts.components:
@@ -233,7 +233,7 @@ def _resolve_sections(resolved: Resolved) -> None:
             _resolve_plan(part.name, resolved)
 
 
-def _look_inside(name: str, resolved: Resolved) -> None:
+def _look_inside(name: str, resolved: ResolvedExperiment) -> None:
     """What is wrong within the tables of a component some of whose other settings are wrong already.
 
     Only that counts which lies within a setting of the file that is right as far as was seen: what does not fit
@@ -241,9 +241,9 @@ def _look_inside(name: str, resolved: Resolved) -> None:
     """
     sound = resolved.settings[name].keys() - resolved.refused[name]
     try:
-        planned.plan_of(resolved.classes[name], resolved.settings[name])
+        planned_measurements.plan_of(resolved.classes[name], resolved.settings[name])
     except AfspmError as error:
-        for one in each(error):
+        for one in individual_errors(error):
             inside = _inside(one)
             if len(inside) > 1 and inside[0] in sound:
                 _report(name, one, resolved)
@@ -251,7 +251,7 @@ def _look_inside(name: str, resolved: Resolved) -> None:
         return
 
 
-def _report(name: str, error: AfspmError, resolved: Resolved) -> None:
+def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
     inside = _inside(error)
     said = f"{sections.name_of((name, *inside))}{':' if inside else ''} {error.what}"
     resolved.findings.error(said, resolved.document.place(name, *inside), error.hint)
@@ -263,13 +263,13 @@ def _inside(error: AfspmError) -> tuple[str | int, ...]:
     return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 
 
-def _resolve_plan(name: str, resolved: Resolved) -> None:
+def _resolve_plan(name: str, resolved: ResolvedExperiment) -> None:
     """A ready-made component is made once: it knows best whether its settings fit together."""
     place = resolved.document.place(name)
     try:
-        plan = planned.plan_of(resolved.classes[name], resolved.settings[name])
+        plan = planned_measurements.plan_of(resolved.classes[name], resolved.settings[name])
     except AfspmError as error:
-        for one in each(error):
+        for one in individual_errors(error):
             _report(name, one, resolved)
         return
     except Exception as error:
@@ -280,11 +280,11 @@ def _resolve_plan(name: str, resolved: Resolved) -> None:
     resolved.declared[name] = replace(
         resolved.declared[name], needs_actions=plan.needs_actions, needs_parameters=plan.needs_parameters
     )
-    for reason in planned.refusals(name, plan, resolved.limits):
+    for reason in planned_measurements.refusals(name, plan, resolved.limits):
         resolved.findings.error(f"[{name}] plans what its limits refuse: {reason}", place)
 
 
-def _written_role(part: Part, resolved: Resolved) -> Role:
+def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
     """By the key `role`, else by the wiring keys that only one role has."""
     written = part.own.get("role")
     if written is not None:
@@ -310,7 +310,7 @@ def _messages(given: Any, document: Document, findings: Findings) -> tuple[str, 
         place = document.place("messages", i)
         if not one.endswith(".proto"):
             found.append(one)
-            if classes.find_module(one, document.folders) is None:
+            if class_loader.find_module(one, document.folders) is None:
                 findings.error(f"messages: there is no module {one!r}", place, "or give a .proto file")
             continue
         file = document.folder_of("messages") / one
