@@ -16,10 +16,10 @@ from afspm import wire
 from afspm.client.component import Component
 from afspm.errors import ControlLost
 from afspm.exit_codes import ExitCode
-from afspm.logic.liveness import LivenessPolicy
-from afspm.logic.restart import RestartPolicy
 from afspm.logic.settings import SchedulerSettings
-from afspm.logic.supervision import ChildPolicy
+from afspm.logic.supervision.child import ChildPolicy
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.restart import RestartPolicy
 from afspm.model import Problem, Region
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.testing.deterministic.bench import CHANNELS, BenchMicroscope

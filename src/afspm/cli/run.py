@@ -20,14 +20,14 @@ def run(
         typer.Option(
             "--only",
             metavar="NAME[,NAME…]",
-            help="ProcessStart these processes here, and no others.",
+            help="Start these processes here, and no others.",
             show_default=False,
         ),
     ] = None,
     without: Annotated[
         list[str] | None,
         typer.Option(
-            "--without", metavar="NAME[,NAME…]", help="ProcessStart all processes here but these.", show_default=False
+            "--without", metavar="NAME[,NAME…]", help="Start all processes here but these.", show_default=False
         ),
     ] = None,
     runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the run's folder.")] = Path("runs"),
@@ -70,7 +70,7 @@ def run(
 
     from afspm.cli.dashboard import resumed_with_dashboard, with_dashboard
     from afspm.experiment import load
-    from afspm.supervisor import resume
+    from afspm.supervisor import resume as resuming
     from afspm.supervisor import run as running
 
     options = running.RunOptions(
@@ -85,11 +85,11 @@ def run(
         if files or only or without or speed or dry_run:
             said = "a run is resumed as it was begun: give nothing else, but --dashboard"
             raise typer.BadParameter(said, param_hint="--resume")
-        found = resume.find(resume)
+        found = resuming.find(resume)
         if dashboard:
             found = resumed_with_dashboard(found)
         _check(found.experiment)
-        raise typer.Exit(resume.resume(found, options, terminal=sys.stdout).outcome.exit_code)
+        raise typer.Exit(resuming.resume(found, options, terminal=sys.stdout).outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
     experiment = with_dashboard(files) if dashboard else load(*files)

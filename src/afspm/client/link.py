@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from afspm import wire
-from afspm.client.published_state import STATE_MESSAGES, PublishedState
+from afspm.client.published_state import PublishedState
 from afspm.clock import Clock
 from afspm.errors import ConfigError, ExperimentEnded, NoResponse, WireError
 from afspm.logic.sessions import run_of
@@ -22,9 +22,10 @@ from afspm.model import (
     RelayedMessage,
     Request,
     Response,
+    ResponseDetail,
     request_name,
 )
-from afspm.process.context import ProcessActivity
+from afspm.process.context import STATE_MESSAGES, ProcessActivity
 from afspm.process.stopping import StopRequested
 from afspm.transport.port import (
     CaughtUp,
@@ -222,7 +223,8 @@ class ExperimentLink:
                 self.port.send(frames)
                 answer = self._await_answer(connection, self._earlier(answered_within_s, until_s))
                 if answer is not None:
-                    self.ended = self.ended or answer.reason == HAS_ENDED  # that may come before the signal itself
+                    if answer.detail is ResponseDetail.EXPERIMENT_ENDED:
+                        self.ended = True  # this may come before the signal itself
                     self.check()
                     return answer
                 if until_s is not None and self.clock.monotonic_s() >= until_s:

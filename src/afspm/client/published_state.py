@@ -7,8 +7,6 @@ from typing import Any
 
 from afspm.model import ControlState, Feedback, ProbePosition, ScanParameters, ScopeState, ScopeStatus
 
-STATE_MESSAGES = frozenset({"ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition"})
-
 
 class PublishedState:
     """The newest published states, and how often each was published, so that one can wait for the next."""

@@ -38,7 +38,7 @@ from afspm.model import (
     Spectrum,
 )
 
-__all__ = ["PublishedEvent", "Events", "Scope"]
+__all__ = ["Events", "PublishedEvent", "Scope"]
 
 ANSWER_S = 60.0  # by default; what waits for control or for a measurement has no limit by default
 

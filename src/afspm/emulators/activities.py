@@ -1,4 +1,4 @@
-"""What goes on at a simulated instrument: a scan, a spectrum, or anything else that keeps it busy for a while."""
+"""Activities of a simulated instrument: a scan, a spectrum, or anything else that keeps it busy for a while."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Occupied:
     end_s: float
 
     def running(self, now_s: float) -> bool:
-        """Whether it still goes on."""
+        """True until it has ended."""
         return now_s < self.end_s
 
 
@@ -69,7 +69,7 @@ class SimulatedScan:
 
     @property
     def end_s(self) -> float:
-        """When its last line is done, as far as is known: it is later after a pause, or was earlier if stopped."""
+        """End of the last line as far as known: later after a pause, earlier if stopped."""
         if self.stopped_s is not None:
             return self.stopped_s
         return self.start_s + self.shape[0] * self.line_s + self._paused_s
@@ -80,27 +80,27 @@ class SimulatedScan:
 
     @property
     def drawing(self) -> bool:
-        """Its values are still being worked out: it lasts until they are, however fast time passes."""
+        """True while its values are being computed; the scan lasts until then, however fast time passes."""
         return not self._drawn.done()
 
     def running(self, now_s: float) -> bool:
-        """Whether it still goes on, be it paused."""
+        """True until it has ended, also while paused."""
         if self.stopped_s is not None:
             return False
         return self.paused or now_s < self.end_s or self.drawing
 
     def lines_done(self, now_s: float) -> int:
-        """How many lines are complete, in the order in which they are taken."""
+        """Count the complete lines."""
         done = int((self._scanned_until_s(now_s) - self.start_s) / self.line_s + 1e-9)
         rows = self.shape[0]
         return max(0, min(done, rows - 1 if self.drawing and done >= rows else rows))
 
     def passes(self, now_s: float) -> int:
-        """How many lines are complete, forward and backward each counted."""
+        """Count the complete passes, forward and backward separately."""
         return int((self._scanned_until_s(now_s) - self.start_s) / (self.line_s / 2) + 1e-9)
 
     def tip_m(self, now_s: float) -> tuple[float, float]:
-        """Where the tip is: on its way along the line and back."""
+        """Return the position of the tip along the line and back."""
         lines = (self._scanned_until_s(now_s) - self.start_s) / self.line_s
         row = min(int(lines), self.shape[0] - 1)
         there = 1.0 - abs(1.0 - 2.0 * min(lines - row, 1.0))
@@ -119,7 +119,7 @@ class SimulatedScan:
         return drawn.channels(None if until_s is None else self._scanned_until_s(until_s))
 
     def signals(self, now_s: float) -> dict[str, float]:
-        """What each channel shows now; on the way back, those that are recorded there show that."""
+        """Return the present value of each channel; on the way back, the retrace where it is recorded."""
         if self._whole is None:
             self._whole = self._drawn.result().channels()
         rows, columns = self.shape
@@ -179,7 +179,7 @@ class SimulatedSpectrum:
     what = "spectrum"
 
     def running(self, now_s: float) -> bool:
-        """Whether it still goes on."""
+        """True until it has ended."""
         return now_s < self.end_s
 
 
@@ -196,7 +196,7 @@ class ValuesInAir:
     seed: tuple[int, ...]
 
     def channels(self, until_s: float | None = None) -> Channels:
-        """As a real scan's."""
+        """Return noise in the form of a scan's channels."""
         random = np.random.default_rng(self.seed)
         missing = ~self.course.rows_taken(until_s)
         found: Channels = {}
@@ -220,5 +220,5 @@ class NoValues:
 
 
 def noise_in_air(random: np.random.Generator, shape: tuple[int, ...], unit: str) -> Array:
-    """What detectors say of nothing: a few pm, fA, or thousandths of the unit."""
+    """Return detector noise without a sample: a few pm, fA, or thousandths of the unit."""
     return np.asarray(random.normal(0.0, {"m": 5e-12, "A": 5e-15}.get(unit, 1e-3), shape))

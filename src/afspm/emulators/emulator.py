@@ -106,7 +106,7 @@ class Emulator(ABC):
         self._leave_at_s = math.inf
 
     def check(self) -> None:
-        """Whether the settings make sense.
+        """Check the settings.
 
         Raises:
             ConfigError: of the world or the faults. FileError: a sample that can't be read.
@@ -140,7 +140,7 @@ class Emulator(ABC):
         """
 
     def tick(self, now_s: float) -> float | None:
-        """What happens by itself up to now, experiment time: a scan ends, a file is written.
+        """Advance to now, in experiment time: end scans, write files.
 
         Called before every `serve`, so also right after whatever was served.
 

@@ -1,4 +1,4 @@
-"""What goes wrong at an emulated controller, and when: a table that the emulator asks at each point where it can."""
+"""Fault injection: which faults strike an emulated controller, and when."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Fault:
 
     @classmethod
     def parse(cls, text: str) -> Fault:
-        """From the command line: `KIND[@SECONDS][,count=N][,duration=SECONDS]`; count=every for each time.
+        """Parse `KIND[@SECONDS][,count=N][,duration=SECONDS]` of the command line; count=every for each time.
 
         Raises:
             ConfigError: it is not of that form.
@@ -59,7 +59,7 @@ class Fault:
 
     @classmethod
     def of(cls, given: str | Mapping[str, Any] | Fault) -> Fault:
-        """From a text as on the command line, or a table of the experiment file."""
+        """Make a fault from a text as on the command line, or from a table of the experiment file."""
         if isinstance(given, Fault):
             return given
         if isinstance(given, str):
@@ -97,7 +97,7 @@ class Faults:
         self._left.append(replace(fault, at_s=now_s - self._start_s + fault.at_s))
 
     def strikes(self, kind: str, now_s: float) -> Fault | None:
-        """Whether it goes wrong this time: the fault if so. Counts it.
+        """Return the fault if one of this kind strikes now, and count it.
 
         Ask once at the point where this kind would show: each time uses up one of `count`.
         """
@@ -112,13 +112,13 @@ class Faults:
         return None
 
     def lasts(self, kind: str, now_s: float) -> bool:
-        """Whether a state of this kind holds now: from its time on for its duration."""
+        """True while a fault of this kind lasts: from its time on for its duration."""
         self._check(kind)
         begun = ((self._start_s + fault.at_s, fault.duration_s) for fault in self._left if fault.kind == kind)
         return any(at_s <= now_s < at_s + duration_s for at_s, duration_s in begun)
 
     def next_s(self, now_s: float) -> float | None:
-        """When the next one begins or ends, for whoever waits: None if none will."""
+        """Return the time at which the next fault begins or ends; None if there is none."""
         times = (self._start_s + fault.at_s + after_s for fault in self._left for after_s in (0.0, fault.duration_s))
         return min((at_s for at_s in times if at_s > now_s), default=None)
 

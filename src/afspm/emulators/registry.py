@@ -15,7 +15,7 @@ CONSTANT = "EMULATOR"
 
 
 def names() -> list[str]:
-    """Of the emulators that come with afspm: the packages beside this module."""
+    """Return the names of afspm's emulators: the packages beside this module."""
     return sorted(module.name for module in pkgutil.iter_modules(emulators.__path__) if module.ispkg)
 
 

@@ -103,22 +103,21 @@ class Rig:
         return dict(self._units)
 
     def doing(self, now_s: float) -> str:
-        """What it is busy with: "scan", "spectrum", "move", "pulse", "crash", "approach" or what `occupy` was told;
-        empty if it is free."""
+        """Return "scan", "spectrum", "move", "pulse", "crash", "approach", the activity of `occupy`, or "" if free."""
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:
-        """Whether it is doing anything."""
+        """True while something is going on."""
         return bool(self.doing(now_s))
 
     def next_change_s(self, now_s: float) -> float | None:
-        """When it will be free by itself; None if it is, if it is paused, or if `wake` will tell."""
+        """Return when it will be free; None if it is free or paused, or if `wake` will be called."""
         if self._doing is None or not self._doing.running(now_s) or self._doing.end_s <= now_s:
             return None
         return None if isinstance(self._doing, SimulatedScan) and self._doing.paused else self._doing.end_s
 
     def probe_at(self, now_s: float) -> tuple[float, float]:
-        """Where the tip is, also during a move or a scan."""
+        """Return the position of the tip, also during a move or a scan."""
         doing = self._doing
         if isinstance(doing, SimulatedScan) and doing.running(now_s):
             return doing.tip_m(now_s)
@@ -129,7 +128,7 @@ class Rig:
         return self._probe_m
 
     def signals(self, now_s: float) -> Mapping[str, float]:
-        """What each channel shows now, with its noise: along the line during a scan, else where the tip stands."""
+        """Return the present value of each channel with its noise: along the line during a scan, else at rest."""
         scan, place = self.scan, self.probe_at(now_s)
         if not self.engaged:
             return self._noise_alone()
@@ -158,7 +157,7 @@ class Rig:
 
     @property
     def probe_m(self) -> tuple[float, float]:
-        """Where the probe was sent, (x, y); spectra, pulses and crashes happen there."""
+        """The target of the last move, (x, y), at which spectra, pulses and crashes happen."""
         return self._probe_m
 
     # -- what it can be told to do
@@ -278,7 +277,7 @@ class Rig:
         return outcome
 
     def follow(self, velocity_m_per_s: tuple[float, float]) -> None:
-        """From now on the scanner moves along with the sample by itself, with this velocity (x, y).
+        """Move the scanner with this velocity (x, y) from now on, to follow the sample.
 
         Raises:
             InvalidValue: faster than any drift.

@@ -4,4 +4,4 @@ from afspm.experiment.experiment import Experiment, ProcessStart, load, load_exp
 from afspm.experiment.findings import Finding, Level, SourceLocation
 from afspm.experiment.parts import Role
 
-__all__ = ["Experiment", "Finding", "Level", "SourceLocation", "Role", "ProcessStart", "load", "load_expanded"]
+__all__ = ["Experiment", "Finding", "Level", "ProcessStart", "Role", "SourceLocation", "load", "load_expanded"]

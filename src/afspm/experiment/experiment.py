@@ -19,7 +19,7 @@ from afspm.launch import Launch
 
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment
-    from afspm.logic.supervision import ChildPolicy
+    from afspm.logic.supervision.child import ChildPolicy
 
 
 @dataclass(frozen=True)
@@ -175,9 +175,9 @@ class Experiment:
 
     def policy(self) -> ChildPolicy:
         """How processes are watched and started again, from [restart]."""
-        from afspm.logic.liveness import LivenessPolicy
-        from afspm.logic.restart import RestartPolicy
-        from afspm.logic.supervision import ChildPolicy
+        from afspm.logic.supervision.child import ChildPolicy
+        from afspm.logic.supervision.liveness import LivenessPolicy
+        from afspm.logic.supervision.restart import RestartPolicy
 
         r = self.resolved.restart
         return ChildPolicy(

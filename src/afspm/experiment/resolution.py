@@ -53,7 +53,7 @@ class ResolvedExperiment:
     named_problems: dict[str, int]
     refused: dict[str, frozenset[str]] = field(default_factory=dict)
     """Of those whose settings are wrong: which of them."""
-    class_loader: dict[str, type] = field(default_factory=dict)
+    classes: dict[str, type] = field(default_factory=dict)
     class_paths: dict[str, str] = field(default_factory=dict)
     roles: dict[str, Role] = field(default_factory=dict)
     declared: dict[str, ComponentDeclaration] = field(default_factory=dict)
@@ -62,8 +62,8 @@ class ResolvedExperiment:
     net: Wiring = field(default_factory=Wiring)
     listening: list[BoundSocket] = field(default_factory=list)
     """Where components listen by settings of their own, beside the wiring."""
-    limits_section: ExperimentLimits = field(default_factory=ExperimentLimits)
-    cache_section: CacheSettings = field(default_factory=CacheSettings)
+    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    caching: CacheSettings = field(default_factory=CacheSettings)
 
     def with_role(self, role: Role) -> list[ExperimentPart]:
         return [part for part in self.parts.components if self.roles.get(part.name) is role]

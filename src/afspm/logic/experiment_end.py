@@ -6,7 +6,7 @@ from afspm.logic.events import Log, RequestIn
 from afspm.logic.request_pipeline import RequestPipeline
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import Watchdog
-from afspm.model import ControlResponse
+from afspm.model import ControlResponse, ResponseDetail
 
 
 class ExperimentEnd:
@@ -23,19 +23,21 @@ class ExperimentEnd:
         self._settings = settings
         self._pipeline = desk
         self._watchdog = watchdog
-        self._kept: list[tuple[RequestIn, ControlResponse, str]] = []
+        self._kept: list[tuple[RequestIn, ControlResponse, str, ResponseDetail]] = []
 
     def begin(self, now_s: float) -> None:
         """The experiment is over."""
         self._watchdog.hurry(now_s)
         self.by_s = now_s + self._settings.request_timeout_s + self._settings.patience_s
 
-    def answer(self, event: RequestIn, code: ControlResponse, why: str) -> None:
+    def answer(
+        self, event: RequestIn, code: ControlResponse, why: str, detail: ResponseDetail = ResponseDetail.NONE
+    ) -> None:
         """Answer a request, now or when the tip is seen to."""
         if self.by_s is None:
-            self._pipeline.answer(event, code, why)
+            self._pipeline.answer(event, code, why, detail=detail)
         else:
-            self._kept.append((event, code, why))
+            self._kept.append((event, code, why, detail))
 
     def is_due(self, now_s: float) -> bool:
         """Whether all may leave now."""
@@ -47,6 +49,6 @@ class ExperimentEnd:
         if self._watchdog.owes_retract:
             danger = "the experiment ends, and the tip was left in danger: the microscope did not retract it"
             self._pipeline.effects.append(Log("CRITICAL", danger))
-        for kept in self._kept:
-            self._pipeline.answer(*kept)
+        for event, code, why, detail in self._kept:
+            self._pipeline.answer(event, code, why, detail=detail)
         self._kept.clear()

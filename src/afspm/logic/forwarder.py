@@ -13,13 +13,7 @@ from enum import Enum, auto
 
 from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.events import Forward
-from afspm.model import ControlResponse, Request, Response
-
-NOT_SENT = "not sent: "
-"""Begins the reason of a NO_RESPONSE to a request that was certainly not carried out: it may be asked again."""
-
-UNKNOWN = "outcome unknown: "
-"""Begins the reason of a NO_RESPONSE to a request that may have been carried out."""
+from afspm.model import ControlResponse, Request, Response, ResponseDetail
 
 
 @dataclass(slots=True, eq=False)
@@ -220,12 +214,14 @@ class Forwarder:
 
 
 def _not_sent(job: ForwardedRequest, why: str) -> SettledRequest:
-    return SettledRequest(job, ForwardOutcome.NOT_SENT, _no_response(job, NOT_SENT + why))
+    return SettledRequest(job, ForwardOutcome.NOT_SENT, _no_response(job, "not sent: " + why, ResponseDetail.NOT_SENT))
 
 
 def _unknown(job: ForwardedRequest, why: str) -> SettledRequest:
-    return SettledRequest(job, ForwardOutcome.UNKNOWN, _no_response(job, UNKNOWN + why))
+    return SettledRequest(
+        job, ForwardOutcome.UNKNOWN, _no_response(job, "outcome unknown: " + why, ResponseDetail.OUTCOME_UNKNOWN)
+    )
 
 
-def _no_response(job: ForwardedRequest, reason: str) -> Response:
-    return Response(int(ControlResponse.NO_RESPONSE), b"", reason, job.request.id)
+def _no_response(job: ForwardedRequest, reason: str, detail: ResponseDetail) -> Response:
+    return Response(int(ControlResponse.NO_RESPONSE), b"", reason, job.request.id, detail)

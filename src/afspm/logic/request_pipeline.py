@@ -12,7 +12,7 @@ from afspm.logic.arbitration import ArbitrationState, Cause
 from afspm.logic.coordinate_frame import CoordinateFrame, MappedRequest
 from afspm.logic.event_log import SCHEDULER, EventLog
 from afspm.logic.events import Codec, Effect, Log, Reply, RequestIn, SaveState
-from afspm.logic.forwarder import NOT_SENT, UNKNOWN, ForwardedRequest, Forwarder, ForwardOutcome, SettledRequest
+from afspm.logic.forwarder import ForwardedRequest, Forwarder, ForwardOutcome, SettledRequest
 from afspm.logic.idempotency_cache import IdempotencyCache, RequestStatus, fingerprint
 from afspm.logic.lease import Lease
 from afspm.logic.limit_checker import LimitChecker, is_get
@@ -28,6 +28,7 @@ from afspm.model import (
     Parameter,
     Request,
     Response,
+    ResponseDetail,
     component_of,
 )
 
@@ -188,13 +189,21 @@ class RequestPipeline:
         may_send = self.ids_known or request.kind != _ACTION
         if may_send and (self._control().holder == name or reads(request)):
             return False
-        reason = f"{UNKNOWN}it was sent once, and is not sent again"
-        self._tell(event, Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id))
+        reason = "outcome unknown: it was sent once, and is not sent again"
+        unknown = ResponseDetail.OUTCOME_UNKNOWN
+        self._tell(event, Response(int(ControlResponse.NO_RESPONSE), b"", reason, request.id, unknown))
         return True
 
-    def answer(self, event: RequestIn, code: ControlResponse, reason: str = "", payload: bytes = b"") -> None:
+    def answer(
+        self,
+        event: RequestIn,
+        code: ControlResponse,
+        reason: str = "",
+        payload: bytes = b"",
+        detail: ResponseDetail = ResponseDetail.NONE,
+    ) -> None:
         """Answer a request by ourselves, once and for all."""
-        response = Response(int(code), payload, reason, event.request.id)
+        response = Response(int(code), payload, reason, event.request.id, detail)
         self._once.note(event.name, event.request, response)
         self._tell(event, response)
 
@@ -529,7 +538,8 @@ class RequestPipeline:
         """Answer a request that is not sent; it may have waited, and be asked by another connection by now."""
         answer = Response(response.code, b"", response.reason, event.request.id)
         if response.code == ControlResponse.NO_RESPONSE:
-            answer.reason = NOT_SENT + response.reason.removeprefix(NOT_SENT).removeprefix(UNKNOWN)
+            answer.reason = f"not sent: what had to come before it failed ({response.reason})"
+            answer.detail = ResponseDetail.NOT_SENT
             self._once.forget(event.name, event.request)
         else:
             self._once.note(event.name, event.request, answer)
@@ -549,7 +559,7 @@ def _as_sent(job: ForwardedRequest) -> tuple[Request, Collection[str] | None]:
 
 def _was_not_sent(response: Response) -> bool:
     """The translator says that it could not reach the controller, and did nothing."""
-    return response.code == ControlResponse.NO_RESPONSE and response.reason.startswith(NOT_SENT)
+    return response.code == ControlResponse.NO_RESPONSE and response.detail is ResponseDetail.NOT_SENT
 
 
 def _unknown_fate(response: Response) -> RequestStatus | None:

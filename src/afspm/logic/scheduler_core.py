@@ -62,6 +62,7 @@ from afspm.model import (
     Problem,
     Request,
     Response,
+    ResponseDetail,
     ScanParameters,
     ScopeState,
     ScopeStatus,
@@ -311,7 +312,7 @@ class SchedulerCore:
             self._follow(event, self._bulletin.told(event, now_s, now_ns))
             self._farewell.told(self._bulletin.telling.states_of(event.name), now_s)
         elif self.control.ended:
-            self._ending.answer(event, ControlResponse.FAILURE, HAS_ENDED)
+            self._ending.answer(event, ControlResponse.FAILURE, HAS_ENDED, ResponseDetail.EXPERIMENT_ENDED)
         elif kind == RESTART_REQUEST:
             self._follow(event, self._bulletin.ordered(event, now_s))
         elif kind == CLOCK_REQUEST:

@@ -16,6 +16,7 @@ from afspm.model.enums import (
     request_name,
 )
 from afspm.model.events import (
+    ControlEvent,
     JournalEntries,
     JournalEntry,
     LogLine,
@@ -31,7 +32,7 @@ from afspm.model.events import (
 from afspm.model.geometry import Frame, Region, RegionChange
 from afspm.model.packet import Packet, PacketHeader
 from afspm.model.problems import ProblemNames
-from afspm.model.requests import HAS_ENDED, Parameter, Request, Response
+from afspm.model.requests import HAS_ENDED, Parameter, Request, Response, ResponseDetail
 from afspm.model.scan import Scan, ScanParameters, ScanSet, ShapeChange
 from afspm.model.scan_lines import ScanLines
 from afspm.model.spectrum import Spectrum
@@ -41,8 +42,9 @@ __all__ = [
     "CLOCK_REQUEST",
     "HAS_ENDED",
     "OTHER_RUN_RESPONSE",
-    "RESTART_REQUEST",
     "RELAY_REQUEST",
+    "RESTART_REQUEST",
+    "ControlEvent",
     "ControlMode",
     "ControlRequest",
     "ControlResponse",
@@ -66,9 +68,11 @@ __all__ = [
     "Progress",
     "Region",
     "RegionChange",
+    "RelayedMessage",
     "Request",
     "RescanKind",
     "Response",
+    "ResponseDetail",
     "Scan",
     "ScanLines",
     "ScanParameters",
@@ -77,7 +81,6 @@ __all__ = [
     "ScopeStatus",
     "ShapeChange",
     "Spectrum",
-    "RelayedMessage",
     "component_of",
     "is_process_name",
     "request_name",

@@ -6,6 +6,8 @@ import re
 from dataclasses import dataclass
 from enum import IntEnum
 
+from afspm.model.enums import ControlMode
+
 PERSON = ":"
 """Between a component and the person that it acts for: "dashboard:Ada"."""
 LONGEST_PROCESS_NAME = 100
@@ -38,9 +40,23 @@ class ProcessCondition(IntEnum):
     GIVEN_UP = 7
 
 
+class ControlEvent(IntEnum):
+    """A change of control, mode or problems; the numbers of the wire."""
+
+    UNDEFINED = 0
+    STARTED = 1
+    RESTARTED = 2
+    CONTROL_GAINED = 3
+    CONTROL_LOST = 4
+    PROBLEM_FLAGGED = 5
+    PROBLEM_CLEARED = 6
+    MODE_CHANGED = 7
+    EXPERIMENT_ENDED = 8
+
+
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """Something that happened.
+    """Something that happened. Programs go by the codes; `what` and `reason` are for people.
 
     Attributes:
         time_ns: experiment time, ns since the Unix epoch.
@@ -50,6 +66,11 @@ class JournalEntry:
         response: the number of a ControlResponse; None where nothing was asked.
         reason: why it was refused, or why it happened.
         took_s: real, from the question to the answer; None where nothing was asked.
+        event: what changed, of the kind "control".
+        request: the number of the ControlRequest that was asked; None where nothing was, or it could not be read.
+        problem: the number of the problem that was flagged, cleared or is to be solved.
+        mode: the new mode, of a MODE_CHANGED.
+        late: the answer came after the client had been told that there was none.
     """
 
     time_ns: int
@@ -59,6 +80,11 @@ class JournalEntry:
     response: int | None = None
     reason: str = ""
     took_s: float | None = None
+    event: ControlEvent = ControlEvent.UNDEFINED
+    request: int | None = None
+    problem: int | None = None
+    mode: ControlMode | None = None
+    late: bool = False
 
     @property
     def refused(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 from afspm.model.enums import ControlResponse
@@ -43,6 +44,17 @@ class Request:
     id: str = ""
 
 
+class ResponseDetail(IntEnum):
+    """What a program must know of a response beside its code; the numbers of the wire."""
+
+    NONE = 0
+    NOT_SENT = 1
+    """A NO_RESPONSE to a request that was certainly not carried out: it may be asked again."""
+    OUTCOME_UNKNOWN = 2
+    """A NO_RESPONSE to a request that may have been carried out."""
+    EXPERIMENT_ENDED = 3
+
+
 @dataclass(slots=True)
 class Response:
     """The answer to a request.
@@ -52,12 +64,14 @@ class Response:
         payload: an object in bytes (a parameter's value), mostly empty.
         reason: for a person, why it is not a success.
         id: of the request that it answers, if that had one.
+        detail: what a program must know beside the code.
     """
 
     code: int
     payload: bytes = b""
     reason: str = ""
     id: str = ""
+    detail: ResponseDetail = ResponseDetail.NONE
 
     @property
     def ok(self) -> bool:

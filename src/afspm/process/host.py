@@ -13,13 +13,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from afspm import garbage, wire
-from afspm.client.published_state import STATE_MESSAGES
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
 from afspm.launch import Launch
 from afspm.process import failure, log
-from afspm.process.context import DEFAULT_LONGEST_STEP_S, ProcessActivity, ProcessContext, new_session
+from afspm.process.context import (
+    DEFAULT_LONGEST_STEP_S,
+    MEASURED_MESSAGES,
+    STATE_MESSAGES,
+    ProcessActivity,
+    ProcessContext,
+    new_session,
+)
 from afspm.process.loading import load
 from afspm.process.message_types import register_all
 from afspm.process.parent import ParentWatch, end_within, read_launch_line
@@ -31,7 +37,6 @@ from afspm.transport.port import ParentGone, Port
 LOADED_WITHIN_S = 300.0  # a large library off a slow disk, the weights of a network
 FAREWELL_S = 1.0  # that exit handlers and threads of libraries have, once everything of ours is done
 MOST_FILES = 65_536  # more than anybody needs; some programs that are started by ours walk through all that may be
-MEASURED = frozenset({"Scan2d", "Spec1d"})
 
 
 def main() -> int:
@@ -147,7 +152,7 @@ def _open_port(launch: Launch, clock: Clock, parent: ParentWatch) -> Port:
     """The port of a component: hears, besides what it subscribed to, what `Scope` has to know."""
     envelopes = wire.messages_of_the_experiment() if launch.envelopes is None else launch.envelopes
     if launch.sockets.control is not None:
-        envelopes = tuple(sorted({*envelopes, *STATE_MESSAGES, *MEASURED}))
+        envelopes = tuple(sorted({*envelopes, *STATE_MESSAGES, *MEASURED_MESSAGES}))
     launch = replace(launch, envelopes=envelopes)
     port = open_port(launch, clock)
     parent.when_gone(lambda: port.wake_up(ParentGone()))

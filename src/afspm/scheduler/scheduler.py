@@ -27,7 +27,7 @@ from afspm.transport.scheduler_sockets import SchedulerSockets
 
 
 class SchedulerLaunch(Launched, Protocol):
-    """The part of `runtime.launch.Launch` that is needed here."""
+    """The part of `afspm.launch.Launch` that is needed here."""
 
     @property
     def clock(self) -> Mapping[str, Any]: ...
@@ -42,13 +42,13 @@ class SchedulerLaunch(Launched, Protocol):
 
 
 class SchedulerActivity(Protocol):
-    """The part of `runtime.process.Activity` that is needed here."""
+    """The part of `process.context.ProcessActivity` that is needed here."""
 
     def step(self) -> AbstractContextManager[None]: ...
 
 
 class SchedulerContext(Protocol):
-    """The part of `runtime.process.Context` that is needed here."""
+    """The part of `process.context.ProcessContext` that is needed here."""
 
     @property
     def launch(self) -> SchedulerLaunch: ...

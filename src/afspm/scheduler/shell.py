@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 from afspm import wire
 from afspm.errors import WireError
 from afspm.logic import events
-from afspm.model import HAS_ENDED, RELAY_REQUEST, ControlRequest, ControlResponse, Packet, Request, Response
+from afspm.model import (
+    HAS_ENDED,
+    RELAY_REQUEST,
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    Request,
+    Response,
+    ResponseDetail,
+)
 from afspm.storage.atomic import OutageLog
 from afspm.storage.disk import DEADLINE_S, SYNCER, DiskThread
 from afspm.transport.fair_queue import FairQueue
@@ -178,7 +187,8 @@ class SchedulerShell:
         if asked.frames[0] == _TELL:
             self._request(asked)
             return
-        self._answer(asked, Response(ControlResponse.FAILURE, reason=HAS_ENDED, id=_id_of(asked)))
+        ended = ResponseDetail.EXPERIMENT_ENDED
+        self._answer(asked, Response(ControlResponse.FAILURE, b"", HAS_ENDED, _id_of(asked), ended))
 
     def stop(self) -> None:
         """See to what must be known to whoever resumes the run, unless the experiment is over."""

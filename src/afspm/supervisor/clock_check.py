@@ -29,6 +29,6 @@ class ClockCheck:
         self._is_told = True
         way = "ahead of" if ahead_s > 0.0 else "behind"
         self._tell(
-            f"the clock on the wall is {duration_text(abs(ahead_s))} {way} that of the run: it was set, or the computer "
-            "slept; the run goes on by its own, in all that it records"
+            f"the clock on the wall is {duration_text(abs(ahead_s))} {way} that of the run: it was set, or the "
+            "computer slept; the run goes on by its own, in all that it records"
         )

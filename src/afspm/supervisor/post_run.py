@@ -16,10 +16,10 @@ from afspm.components import notifications
 from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
 from afspm.errors import ConfigError
 from afspm.experiment import Role, notifying
+from afspm.logic.supervision.run_end import EndReason
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.record.journal import JOURNAL_FILE
 from afspm.supervisor import summary
-from afspm.supervisor.ending import Why
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -98,7 +98,7 @@ def report(folder: Path, log: RunLog) -> None:
 
 def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
     """Tell people that a run is over, and how. What fails is tried again, for half a minute."""
-    is_lost = ended.outcome.why is Why.LOST
+    is_lost = ended.outcome.why is EndReason.LOST
     what = GIVEN_UP if is_lost and GIVEN_UP in on else END
     if what not in on:
         return

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from typing import Protocol
 
 from afspm.clock import Clock
-from afspm.logic.liveness import LivenessPolicy
-from afspm.logic.supervision import ChildPhase, ChildWatch, HeartbeatReport
+from afspm.logic.supervision.child import ChildPhase, ChildWatch, HeartbeatReport
+from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.model import ProcessCondition, ProcessState
 from afspm.supervisor.task import Task
 

@@ -16,6 +16,7 @@ from afspm.client.connect import find_run
 from afspm.clock import NS_PER_S, ExperimentClock
 from afspm.errors import ConfigError, FileError
 from afspm.experiment import Experiment, load_expanded
+from afspm.logic.supervision.run_end import EndReason
 from afspm.record import ahead
 from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
@@ -23,12 +24,11 @@ from afspm.record.run_lock import lock_run
 from afspm.storage.atomic import load_checkpoint
 from afspm.supervisor import config_diff
 from afspm.supervisor import run as running
-from afspm.supervisor.ending import Why
 from afspm.supervisor.ports import require_free
 from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
 from afspm.supervisor.run_identity import RunIdentity, new_identity
 
-_OVER = {Why.EXPERIMENT_ENDED.name.lower(), Why.ALL_DONE.name.lower()}
+_OVER = {EndReason.EXPERIMENT_ENDED.name.lower(), EndReason.ALL_DONE.name.lower()}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
 ZMTP = b"\xff"
 """What a socket of ZeroMQ says first."""

@@ -67,7 +67,7 @@ class FinishedRun:
 
 
 def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: TextIO | None = None) -> FinishedRun:
-    """FinishedRun an experiment until it ends.
+    """Run an experiment until it ends.
 
     Raises:
         ConfigError: the experiment file has errors, or the options don't fit it; nothing was started.
@@ -96,7 +96,7 @@ def go(
     terminal: TextIO | None,
     names: Sequence[str],
 ) -> FinishedRun:
-    """FinishedRun an experiment in a folder that is there, and locked, until it ends.
+    """Run an experiment in a folder that is there, and locked, until it ends.
 
     Args:
         name: of the experiment; names: of its processes.

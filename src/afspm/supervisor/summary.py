@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from afspm.errors import FileError
 from afspm.formatting import duration_text
+from afspm.logic.supervision.run_end import EndReason
 from afspm.record.run import open_run
 from afspm.record.run_lock import resume_command
 from afspm.storage.disk import DiskTimeout, run_bounded
-from afspm.supervisor.ending import Why
 
 if TYPE_CHECKING:
     from afspm.supervisor.supervisor import RunOutcome
@@ -37,7 +37,7 @@ def lines(outcome: RunOutcome, folder: Path) -> list[str]:
     except DiskTimeout as error:
         told.append(f"what was measured can't be counted: {error}")
     told.append(f"everything is in {folder}")
-    if outcome.why is Why.STOPPED:
+    if outcome.why is EndReason.STOPPED:
         told.append(f"{resume_command(folder)} goes on with it")
     return told
 

@@ -17,13 +17,13 @@ from afspm.clock import ExperimentClock
 from afspm.errors import AfspmError
 from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
-from afspm.logic import supervision
-from afspm.logic.liveness import LivenessPolicy
+from afspm.logic.supervision import child as supervision
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.run_end import EndReason, EndStep, RunEnd
 from afspm.logic.supervisor_registry import LOGGED_AS
 from afspm.supervisor import signals
 from afspm.supervisor.activity_monitor import ActivityMonitor
 from afspm.supervisor.clock_check import ClockCheck
-from afspm.supervisor.ending import Do, Ending, Why
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Exited, LeftOut, Printed, describe_exit
 from afspm.supervisor.process_status import ProcessStatus
@@ -34,7 +34,7 @@ from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 from afspm.transport.wakeup import WakeUp
 
 # why the run ends, told at once; that it has ended as it should the summary tells in a moment
-_LEVELS = {Why.STOPPED: logging.INFO, Why.LOST: logging.CRITICAL}
+_LEVELS = {EndReason.STOPPED: logging.INFO, EndReason.LOST: logging.CRITICAL}
 
 
 LOOK_S = 0.1  # between two looks at how it is with the processes, for those who are told
@@ -58,7 +58,7 @@ class ProcessReport:
 class RunOutcome:
     """How a run ended."""
 
-    why: Why
+    why: EndReason
     text: str
     reports: tuple[ProcessReport, ...]
     duration_s: float
@@ -169,7 +169,7 @@ class Supervisor:
         self._beats = HeartbeatListener(self._wakeup)
         self._reaper = Reaper()
         self._children = {task.name: self._child(task) for task in tasks}
-        self._ending: Ending | None = None
+        self._ending: RunEnd | None = None
         self._scheduler_is_there = threading.Event()
         if reporter is None or all(task.role is not Role.SCHEDULER for task in tasks):
             self._scheduler_is_there.set()  # or nobody here can tell
@@ -287,15 +287,15 @@ class Supervisor:
             return
         self._carry_out(child, child.watch.exited(exited.code, self._clock.monotonic_s(), how))
         if exited.code == ExitCode.ENDED:
-            self._end(Why.EXPERIMENT_ENDED, "the experiment has ended")
+            self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
         elif exited.code == ExitCode.CONFIG:
             self._give_up(child, child.last_error or "its settings can't work")
         elif exited.code == ExitCode.DONE and child.task.essential:
-            self._end(Why.EXPERIMENT_ENDED, f"{child.name} is done")
+            self._end(EndReason.EXPERIMENT_ENDED, f"{child.name} is done")
 
     def _on_signal(self, signalled: signals.EndSignal) -> None:
         if self._ending is None:
-            self._end(Why.STOPPED, f"stopped by {signalled.name}")
+            self._end(EndReason.STOPPED, f"stopped by {signalled.name}")
         else:
             self._ending = self._ending.hurried(self._clock.monotonic_s())
 
@@ -331,9 +331,9 @@ class Supervisor:
             self._carry_out(child, child.watch.tick(now_s, works=child.works))
         if self._ending is None and all(child.over for child in self._children.values()):
             if all(child.given_up for child in self._children.values()):
-                self._end(Why.LOST, "everything is given up")
+                self._end(EndReason.LOST, "everything is given up")
             else:
-                self._end(Why.ALL_DONE, "all is done")
+                self._end(EndReason.ALL_DONE, "all is done")
 
     def _begin_anyway(self, now_s: float) -> None:
         """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
@@ -392,16 +392,16 @@ class Supervisor:
     def _give_up(self, child: _Child, why: str) -> None:
         child.given_up = True
         if child.task.essential:
-            self._end(Why.LOST, f"{child.name} is given up, and the experiment can't go on without it: {why}")
+            self._end(EndReason.LOST, f"{child.name} is given up, and the experiment can't go on without it: {why}")
         else:
             told = f"{child.name} is given up, the rest goes on (Ctrl-C ends it): {why}"
             self._log.write(LOGGED_AS, logging.CRITICAL, told)
 
-    def _end(self, why: Why, text: str) -> None:
+    def _end(self, why: EndReason, text: str) -> None:
         self._scheduler_is_there.set()
         if self._ending is None:
             now_s = self._clock.monotonic_s()
-            self._ending = Ending.begin(why, text, now_s)
+            self._ending = RunEnd.begin(why, text, now_s)
             for child in self._children.values():
                 is_missing = child.process is None and child.watch.phase is supervision.ChildPhase.WAITING
                 child.watch.stop(now_s)
@@ -428,7 +428,7 @@ class Supervisor:
         ending = self._ending
         return (
             ending is not None
-            and ending.why is Why.EXPERIMENT_ENDED
+            and ending.why is EndReason.EXPERIMENT_ENDED
             and ending.last is None
             and child.task.beats
             and child.task.role is Role.COMPONENT
@@ -439,10 +439,10 @@ class Supervisor:
         child.rescued = True
         self._start(child)
 
-    def _waited_for(self, ending: Ending, now_s: float) -> list[str]:
+    def _waited_for(self, ending: RunEnd, now_s: float) -> list[str]:
         """The names of those who have something to finish; a translator has after it was asked to end, too: the tip."""
         liveness = self._policy.liveness
-        is_asked, has_ended = ending.last is not None, ending.why is Why.EXPERIMENT_ENDED
+        is_asked, has_ended = ending.last is not None, ending.why is EndReason.EXPERIMENT_ENDED
         # a scheduler on another computer may be there
         can_hear = all(child.process for child in self._children.values() if child.task.role is Role.SCHEDULER)
         return [
@@ -452,8 +452,8 @@ class Supervisor:
             or (child.may_still_finish(now_s, liveness, can_hear=can_hear) and has_ended and not is_asked)
         ]
 
-    def _go_on_ending(self, ending: Ending, now_s: float) -> None:
-        if ending.last is None and ending.why is Why.EXPERIMENT_ENDED:
+    def _go_on_ending(self, ending: RunEnd, now_s: float) -> None:
+        if ending.last is None and ending.why is EndReason.EXPERIMENT_ENDED:
             self._look_after_the_last(now_s)
         busy = self._waited_for(ending, now_s)
         self._ending, do = ending.step(now_s, busy=bool(busy))
@@ -465,11 +465,11 @@ class Supervisor:
             if child.process is None:
                 continue
             match do:
-                case Do.ASK:
+                case EndStep.ASK:
                     child.process.close_stdin()
-                case Do.KILL:
+                case EndStep.KILL:
                     self._log.write(child.name, logging.WARNING, "does not end: killed")
                     child.process.kill()
-                case Do.LEAVE:
+                case EndStep.LEAVE:
                     self._log.write(child.name, logging.CRITICAL, f"can't be killed (process {child.process.pid})")
                     child.process = None

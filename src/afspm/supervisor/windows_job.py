@@ -1,4 +1,4 @@
-"""WindowsJob objects of Windows: a child, all that it starts, and our own end. Elsewhere `reaper` and groups do that."""
+"""Job objects of Windows: end a child with all that it has started, and with us. Elsewhere `reaper` does that."""
 
 from __future__ import annotations
 

@@ -19,10 +19,19 @@ from afspm.clock import Clock
 from afspm.errors import AfspmError, ConfigError, WireError
 from afspm.exit_codes import ExitCode
 from afspm.logic.fencing import Epoch, SchedulerFence
-from afspm.logic.forwarder import NOT_SENT
 from afspm.logic.sessions import run_of
 from afspm.logic.watchdog import feedback_of
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, ScopeStatus, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Request,
+    Response,
+    ResponseDetail,
+    ScopeState,
+    ScopeStatus,
+    names,
+)
 from afspm.process.memory import Memory
 from afspm.translator import settings
 from afspm.translator.controller_lock import ControllerTaken, commanding
@@ -50,7 +59,7 @@ if TYPE_CHECKING:
 _RECONNECT_S = 1.0
 _TIP_S = 8.0
 """So long, real time, it is tried to retract the tip when the run is stopped: a controller may be lost just then, or
-refuse. A little less than `runtime.parent` leaves."""
+refuse. A little less than `process.parent` leaves."""
 _STARTS_S = 2.0
 """So long, real time, a controller may take that is started together with its translator (an emulated one): until then
 it is looked for every `_SOON_S`, and nothing is wrong."""
@@ -378,8 +387,11 @@ class Translator:
         except LOST as error:
             if self._connected:
                 self._lose(error)
-            reason = f"{'' if self._acting is request else NOT_SENT}the controller can't be reached: {error}"
-            self._finish(request, Response(ControlResponse.NO_RESPONSE, reason=reason, id=request.id))
+            reason = f"the controller can't be reached: {error}"
+            detail = ResponseDetail.OUTCOME_UNKNOWN
+            if self._acting is not request:
+                reason, detail = f"not sent: {reason}", ResponseDetail.NOT_SENT
+            self._finish(request, Response(ControlResponse.NO_RESPONSE, b"", reason, request.id, detail))
 
     def _end(self) -> None:
         """The scheduler says that the experiment is over."""

@@ -13,7 +13,7 @@ from afspm.transport.zmq_server import ZmqServerPort
 
 
 class LaunchedSockets(Protocol):
-    """The part of `runtime.launch.Sockets` that is needed here."""
+    """The part of `afspm.launch.Sockets` that is needed here."""
 
     @property
     def publish(self) -> str | None: ...
@@ -26,7 +26,7 @@ class LaunchedSockets(Protocol):
 
 
 class Launched(Protocol):
-    """The part of `runtime.launch.Launch` that is needed here."""
+    """The part of `afspm.launch.Launch` that is needed here."""
 
     @property
     def name(self) -> str: ...

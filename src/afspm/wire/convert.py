@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 import struct
+from enum import IntEnum
+from typing import TypeVar
 
 from google.protobuf.timestamp_pb2 import Timestamp
 
@@ -20,6 +22,14 @@ LENGTH_UNIT = "m"
 ANGLE_UNIT = "deg"
 _TIMES = 2**63
 _FLOAT32 = struct.Struct("<f")
+
+
+E = TypeVar("E", bound=IntEnum)
+
+
+def known(kind: type[E], number: int) -> E:
+    """Return the member with this number; UNDEFINED (0) for one that only a newer peer knows."""
+    return kind(number) if number in kind._value2member_map_ else kind(0)
 
 
 def timestamp(time_ns: int) -> Timestamp:
@@ -206,9 +216,7 @@ def status_to_wire(status: model.ScopeStatus) -> control_pb2.ScopeStateMsg:
 
 def status_from_wire(message: control_pb2.ScopeStateMsg) -> model.ScopeStatus:
     """A state that a newer peer has and we don't know is UNDEFINED."""
-    number = message.scope_state
-    known = number in model.ScopeState._value2member_map_
-    state = model.ScopeState(number) if known else model.ScopeState.UNDEFINED
+    state = known(model.ScopeState, message.scope_state)
     return model.ScopeStatus(state, message.scan_paused if message.HasField("scan_paused") else None)
 
 
@@ -221,10 +229,8 @@ def control_state_to_wire(state: model.ControlState) -> control_pb2.ControlState
 
 
 def control_state_from_wire(message: control_pb2.ControlState) -> model.ControlState:
-    number = message.control_mode
-    known = number in model.ControlMode._value2member_map_
     return model.ControlState(
-        model.ControlMode(number) if known else model.ControlMode.UNDEFINED,
+        known(model.ControlMode, message.control_mode),
         message.client_in_control_id or None,
         tuple(sorted({int(problem) for problem in message.problems_set})),
     )

@@ -20,10 +20,12 @@ from afspm.model import (
     Parameter,
     Request,
     Response,
+    ResponseDetail,
     request_name,
 )
 from afspm.wire import convert, journal
 from afspm.wire.codec import Buffer, encode
+from afspm.wire.convert import known
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.messages import parse
 from afspm.wire.version import answer_as_version_1, as_version_1
@@ -139,8 +141,9 @@ def _request_id(frame: Buffer) -> str:
 
 
 def encode_response(response: Response) -> list[bytes]:
-    """[number] and, where there is any of it, [object, reason, id]."""
-    frames = [bytes([response.code]), response.payload, response.reason.encode(), response.id.encode()]
+    """[number] and, where there is any of it, [object, reason, id, detail]."""
+    detail = bytes([response.detail]) if response.detail else b""
+    frames = [bytes([response.code]), response.payload, response.reason.encode(), response.id.encode(), detail]
     while len(frames) > 1 and not frames[-1]:
         frames.pop()
     return frames
@@ -157,18 +160,19 @@ def encode_answer(response: Response, asked: int) -> list[bytes]:
 
 
 def decode_response(frames: Sequence[Buffer]) -> Response:
-    """A response of one to four frames.
+    """A response of one to five frames; what a newer peer appends is not looked at.
 
     Raises:
         WireError: it is none.
     """
     count = len(frames)
-    if not 1 <= count <= 4 or len(frames[0]) != 1:
+    if not count or len(frames[0]) != 1:
         raise WireError(f"a response of {count} frames, the first of {len(frames[0]) if frames else 0} bytes")
     payload = bytes(frames[1]) if count > 1 else b""
     reason = str(frames[2], "utf-8", "replace") if count > 2 and frames[2] else ""
     request_id = str(frames[3], "utf-8", "replace") if count > 3 else ""
-    return Response(frames[0][0], payload, reason, request_id)
+    detail = known(ResponseDetail, frames[4][0]) if count > 4 and frames[4] else ResponseDetail.NONE
+    return Response(frames[0][0], payload, reason, request_id, detail)
 
 
 def decode_parameter(payload: Buffer) -> Parameter:

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 from afspm import model
 from afspm.errors import WireError
-from afspm.wire.convert import time_ns, timestamp
-from afspm.wire.generated import journal_pb2
+from afspm.wire.convert import known, time_ns, timestamp
+from afspm.wire.generated import control_pb2, journal_pb2
 from afspm.wire.messages import parse
 
 Buffer = bytes | memoryview
@@ -24,6 +24,11 @@ def entries_to_wire(entries: model.JournalEntries) -> journal_pb2.JournalEntries
             response=entry.response,
             reason=entry.reason or None,
             took=entry.took_s,
+            event=journal_pb2.ControlEvent.ValueType(entry.event) if entry.event else None,
+            request=entry.request,
+            problem=entry.problem,
+            mode=control_pb2.ControlMode.ValueType(entry.mode) if entry.mode else None,
+            late=entry.late or None,
         )
     return message
 
@@ -40,6 +45,11 @@ def entries_from_wire(payload: Buffer) -> model.JournalEntries:
                 entry.response if entry.HasField("response") else None,
                 entry.reason,
                 entry.took if entry.HasField("took") else None,
+                known(model.ControlEvent, entry.event),
+                entry.request if entry.HasField("request") else None,
+                entry.problem if entry.HasField("problem") else None,
+                known(model.ControlMode, entry.mode) if entry.HasField("mode") else None,
+                entry.late,
             )
             for entry in message.entries
         )
@@ -64,7 +74,6 @@ def processes_to_wire(states: model.ProcessStates) -> journal_pb2.ProcessStates:
 
 def processes_from_wire(payload: Buffer) -> model.ProcessStates:
     message = parse(journal_pb2.ProcessStates, payload)
-    known = {int(condition) for condition in model.ProcessCondition}
     return model.ProcessStates(
         time_ns(message.timestamp),
         message.supervisor,
@@ -72,7 +81,7 @@ def processes_from_wire(payload: Buffer) -> model.ProcessStates:
             model.ProcessState(
                 state.name,
                 state.role,
-                model.ProcessCondition(state.condition if state.condition in known else 0),
+                known(model.ProcessCondition, state.condition),
                 time_ns(state.since),
                 state.step_age,
                 state.starts,

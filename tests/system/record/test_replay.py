@@ -19,7 +19,8 @@ from afspm.client.follower import Follower
 from afspm.errors import ConfigError, RequestError, TransportError
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.store import RecordSettings, RecordStore
-from afspm.supervisor import replay, resume
+from afspm.supervisor import resume
+from afspm.supervisor.replay import ReplayOptions, _addresses, replay
 
 START_NS = 1_773_518_400_000_000_000
 STEP_NS = 60_000_000_000  # experiment time between two packets
@@ -51,7 +52,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def replay(recorded: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+def replaying(recorded: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A replay that has said where it is: a scan a tenth of a second."""
     command = [sys.executable, "-m", "afspm", "replay", str(recorded), "--stay"]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -65,7 +66,7 @@ def replay(recorded: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_notebook_joins_gets_what_was_published_and_is_refused_clearly(
-    replay: subprocess.Popen[str], recorded: Path, tmp_path: Path
+    replaying: subprocess.Popen[str], recorded: Path, tmp_path: Path
 ) -> None:
     with afspm.open_run(recorded) as run:
         published = {(packet.envelope, packet.time_ns): bytes(packet.payload) for packet in run.packets()}
@@ -91,8 +92,8 @@ def test_a_notebook_joins_gets_what_was_published_and_is_refused_clearly(
 
 def test_it_ends_as_an_experiment_does_with_its_folder_saying_so(recorded: Path, tmp_path: Path) -> None:
     told: list[str] = []
-    options = replay.ReplayOptions(speed=1e6, only=["Scan2d"], runs=tmp_path / "runs")
-    assert replay.replay(recorded, options, told.append) == SCANS
+    options = ReplayOptions(speed=1e6, only=["Scan2d"], runs=tmp_path / "runs")
+    assert replay(recorded, options, told.append) == SCANS
     assert "1e+06 experiment seconds a second" in told[0]
     (folder,) = (tmp_path / "runs").glob("replay-*")
     facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
@@ -105,13 +106,13 @@ def test_it_ends_as_an_experiment_does_with_its_folder_saying_so(recorded: Path,
 @pytest.mark.skipif(sys.platform == "win32", reason="there a program can't send these")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
 def test_one_that_is_stopped_says_so_in_its_folder_and_to_who_listens(
-    replay: subprocess.Popen[str], tmp_path: Path, number: signal.Signals
+    replaying: subprocess.Popen[str], tmp_path: Path, number: signal.Signals
 ) -> None:
     (folder,) = (tmp_path / "runs").glob("replay-*")
     with Follower(folder) as follower:
         follower.catch_up()
-        replay.send_signal(number)
-        assert replay.wait(20.0) == 0
+        replaying.send_signal(number)
+        assert replaying.wait(20.0) == 0
         assert json.loads((folder / "run.json").read_text(encoding="utf-8"))["ended"] == "the replay is over"
         until_s = follower.clock.monotonic_s() + 20.0
         while not follower.ended:
@@ -121,16 +122,16 @@ def test_one_that_is_stopped_says_so_in_its_folder_and_to_who_listens(
 
 def test_an_address_that_is_taken_leaves_no_folder(recorded: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        options = replay.ReplayOptions(publish=f"tcp://127.0.0.1:{taken.getsockname()[1]}", runs=tmp_path / "runs")
+        options = ReplayOptions(publish=f"tcp://127.0.0.1:{taken.getsockname()[1]}", runs=tmp_path / "runs")
         with pytest.raises(TransportError):
-            replay.replay(recorded, options, lambda _: None)
+            replay(recorded, options, lambda _: None)
     assert not (tmp_path / "runs").exists()
 
 
 def test_what_cannot_be_replayed_is_told(recorded: Path, tmp_path: Path) -> None:
     for only, said in ((["Scan3d"], "no message 'Scan3d'"), (["Spec1d"], "nothing to replay")):
         with pytest.raises(ConfigError, match=said):
-            replay.replay(recorded, replay.ReplayOptions(only=only, runs=tmp_path), lambda _: None)
+            replay(recorded, ReplayOptions(only=only, runs=tmp_path), lambda _: None)
 
 
 def test_the_addresses_of_the_experiment_file_are_taken(recorded: Path, tmp_path: Path) -> None:
@@ -141,8 +142,8 @@ def test_the_addresses_of_the_experiment_file_are_taken(recorded: Path, tmp_path
         encoding="utf-8",
     )
     with afspm.open_run(recorded) as run:
-        assert replay._addresses(run, replay.ReplayOptions()) == ("tcp://127.0.0.1:19471", "tcp://127.0.0.1:19472")
-        assert replay._addresses(run, replay.ReplayOptions(publish="tcp://127.0.0.1:1", serve="tcp://127.0.0.1:2")) == (
+        assert _addresses(run, ReplayOptions()) == ("tcp://127.0.0.1:19471", "tcp://127.0.0.1:19472")
+        assert _addresses(run, ReplayOptions(publish="tcp://127.0.0.1:1", serve="tcp://127.0.0.1:2")) == (
             "tcp://127.0.0.1:1",
             "tcp://127.0.0.1:2",
         )

@@ -9,7 +9,7 @@ from typing import Any
 import zmq
 
 from afspm import wire
-from afspm.model import ControlRequest, ControlResponse
+from afspm.model import ControlRequest, ControlResponse, ResponseDetail
 
 GOLDEN = json.loads((Path(__file__).parents[3] / "proto" / "golden.json").read_text(encoding="utf-8"))
 REQUESTS = {entry["name"]: [bytes.fromhex(frame) for frame in entry["frames"]] for entry in GOLDEN["requests"]}
@@ -91,7 +91,7 @@ def test_a_plain_translator_is_asked_and_its_packets_pass(rig: Any, plain: Any) 
             known = asked[0][0] in (1, 12) and b"scan" in asked[1]
             server.send(SUCCESS if known else bytes([ControlResponse.ACTION_NOT_SUPPORTED]))
         answer = component.answer_to(asked_for[-1])
-        if answer is not None and answer.reason.startswith("not sent"):  # the scheduler has not found it yet
+        if answer is not None and answer.detail is ResponseDetail.NOT_SENT:  # the scheduler has not found it yet
             asked_for.append(component.send(ControlRequest.ACTION, "start-scan"))
             return None
         return answer

@@ -9,7 +9,7 @@ import pytest
 from supervisor_lab import DEADLINE_S, QUICK, Running, RunTasks, Terminal
 
 from afspm.clock import ExperimentClock
-from afspm.logic.supervision import ChildPolicy
+from afspm.logic.supervision.child import ChildPolicy
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.reporter import Reporter
 from afspm.supervisor.supervisor import RunOutcome, Supervisor

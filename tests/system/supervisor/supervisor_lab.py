@@ -12,9 +12,9 @@ from typing import Any
 
 from afspm.experiment import Role
 from afspm.launch import Launch
-from afspm.logic.liveness import LivenessPolicy
-from afspm.logic.restart import RestartPolicy
-from afspm.logic.supervision import ChildPolicy
+from afspm.logic.supervision.child import ChildPolicy
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.restart import RestartPolicy
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.supervisor.task import Task
 

@@ -14,7 +14,7 @@ from supervisor_lab import DEADLINE_S, QUICK, RunTasks, peer
 from afspm.clock import ExperimentClock
 from afspm.exit_codes import ExitCode
 from afspm.experiment import Role
-from afspm.supervisor.ending import Why
+from afspm.logic.supervision.run_end import EndReason
 from afspm.supervisor.task import Task
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -23,7 +23,7 @@ look_only = pytest.mark.skipif(sys.platform not in ("linux", "win32"), reason="a
 
 def test_when_all_are_done_the_run_ends_well(run_tasks: RunTasks) -> None:
     outcome = run_tasks(peer("a", first="exit", code=0), peer("b", first="exit", code=0)).outcome()
-    assert outcome.why is Why.ALL_DONE
+    assert outcome.why is EndReason.ALL_DONE
     assert outcome.exit_code == 0
     assert [report.starts for report in outcome.reports] == [1, 1]
 
@@ -43,7 +43,7 @@ def test_a_translator_that_ends_without_a_word_has_crashed_whatever_its_exit_cod
     running.terminal.wait_for(" scope ", "before the experiment has ended")
     running.terminal.wait_for(" scope ", "life 2")
     outcome = running.stop()
-    assert (outcome.why, outcome.reports[0].starts) == (Why.STOPPED, 2)
+    assert (outcome.why, outcome.reports[0].starts) == (EndReason.STOPPED, 2)
 
 
 @posix_only
@@ -120,7 +120,7 @@ def test_what_always_crashes_is_given_up_and_the_rest_goes_on(run_tasks: RunTask
 @pytest.mark.parametrize("role", [Role.SCHEDULER, Role.TRANSLATOR])
 def test_without_scheduler_or_translator_the_run_ends_and_says_so(run_tasks: RunTasks, role: Role) -> None:
     outcome = run_tasks(peer("vital", role, first="crash"), peer("other")).outcome()
-    assert outcome.why is Why.LOST
+    assert outcome.why is EndReason.LOST
     assert outcome.exit_code == 1
     assert "vital" in outcome.text
 
@@ -147,7 +147,7 @@ def test_a_program_that_is_not_there_does_not_end_the_rest(run_tasks: RunTasks) 
 def test_the_end_of_the_experiment_ends_all_even_the_deaf(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("ends", first="exit", code=80), peer("waits"), peer("deaf", first="deaf"))
     outcome = running.outcome()
-    assert outcome.why is Why.EXPERIMENT_ENDED
+    assert outcome.why is EndReason.EXPERIMENT_ENDED
     assert outcome.exit_code == 0
     assert [report.starts for report in outcome.reports] == [1, 1, 1]
     running.terminal.wait_for(" deaf ", "does not end: killed")
@@ -169,13 +169,13 @@ def test_at_the_end_of_the_experiment_one_that_is_busy_may_finish(
 
 def test_a_scheduler_that_is_done_ends_the_experiment(run_tasks: RunTasks) -> None:
     outcome = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=0), peer("waits")).outcome()
-    assert outcome.why is Why.EXPERIMENT_ENDED
+    assert outcome.why is EndReason.EXPERIMENT_ENDED
 
 
 def test_a_component_that_is_done_does_not(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("done", first="exit", code=0), peer("waits"))
     running.terminal.wait_for(" done ", "done")
-    assert running.stop().why is Why.STOPPED
+    assert running.stop().why is EndReason.STOPPED
 
 
 def test_who_does_not_end_when_asked_is_killed_and_the_others_end_by_themselves(run_tasks: RunTasks) -> None:
@@ -184,7 +184,7 @@ def test_who_does_not_end_when_asked_is_killed_and_the_others_end_by_themselves(
     running.terminal.wait_for(" waits ", "life 1")
     running.terminal.wait_for(" deaf ", "life 1")
     outcome = running.stop()
-    assert outcome.why is Why.STOPPED
+    assert outcome.why is EndReason.STOPPED
     waits, deaf = outcome.reports
     assert waits.last_exit == "ended as it was asked to"  # by itself, since its stdin was closed
     assert deaf.last_exit != "ended as it was asked to"
@@ -195,7 +195,7 @@ def test_a_translator_that_sees_to_the_tip_is_not_killed_meanwhile(run_tasks: Ru
     running = run_tasks(scope, peer("other", first="busy", busy_s=600.0, longest_step_s=900.0))
     for name in ("scope", "other"):
         running.terminal.wait_for(f" {name} ", "is up")
-    assert running.stop().why is Why.STOPPED
+    assert running.stop().why is EndReason.STOPPED
     running.terminal.wait_for(" scope ", "no longer busy")
     running.terminal.wait_for("waiting for scope to finish", "Ctrl-C")
     running.terminal.wait_for(" other ", "does not end: killed")
@@ -218,7 +218,7 @@ def test_a_wish_to_stop_does_not_wait_behind_what_a_process_prints(run_tasks: Ru
     running.terminal.wait_for(" quiet ", "life 1")
     running.terminal.wait_for(" loud ", "waiting 1000")
     running.stop()
-    assert running.outcome().why is Why.STOPPED
+    assert running.outcome().why is EndReason.STOPPED
 
 
 def test_nothing_is_restarted_while_the_run_ends(run_tasks: RunTasks, tmp_path: Path) -> None:
@@ -254,4 +254,4 @@ def test_a_program_that_sends_no_heartbeats_is_not_waited_for(run_tasks: RunTask
 def test_a_scheduler_that_somebody_asks_to_end_is_started_again(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=int(ExitCode.ORPHAN)))
     running.terminal.wait_for(" scheduler ", "it is started again")
-    assert running.stop().why is Why.STOPPED
+    assert running.stop().why is EndReason.STOPPED

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from runtime_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
+from client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
 
 from afspm import model, wire
 from afspm.client.link import ExperimentLink

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runtime_lab import Lab, context_of, run
+from client_lab import Lab, context_of, run
 
 from afspm import wire
 from afspm.components import line_file

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runtime_lab import OTHER_REGION, Lab, run
+from client_lab import OTHER_REGION, Lab, run
 
 from afspm.components import ScanSeries
 from afspm.errors import MeasurementFailed

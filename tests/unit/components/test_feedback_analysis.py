@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from runtime_lab import Lab, run
+from client_lab import Lab, run
 
 from afspm import wire
 from afspm.components.feedback_analysis import MESSAGE, FeedbackAnalysis

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from runtime_lab import Lab, run
+from client_lab import Lab, run
 
 from afspm.components.feedback_tuner import FeedbackTuner
 from afspm.exit_codes import ExitCode

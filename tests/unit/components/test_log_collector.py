@@ -7,7 +7,7 @@ import threading
 import time
 from pathlib import Path
 
-from runtime_lab import Lab, run
+from client_lab import Lab, run
 
 from afspm.clock import ExperimentClock
 from afspm.components.log_collector import LogCollector, told

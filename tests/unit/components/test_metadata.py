@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from runtime_lab import REGION, Lab, Nothing, context_of, run
+from client_lab import REGION, Lab, Nothing, context_of, run
 
 from afspm.clock import iso_utc
 from afspm.components.line_file import LineFile

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runtime_lab import REGION, Lab, context_of, run
+from client_lab import REGION, Lab, context_of, run
 
 from afspm import wire
 from afspm.components.night_picture import NightPicture

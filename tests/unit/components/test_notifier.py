@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from runtime_lab import FakeClock
+from client_lab import FakeClock
 
 from afspm import model
 from afspm.components import notifications, notifier

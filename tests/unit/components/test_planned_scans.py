@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from runtime_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
+from client_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
 
 from afspm import wire
 from afspm.client.component import Component

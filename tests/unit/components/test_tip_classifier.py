@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from runtime_lab import Lab, run
+from client_lab import Lab, run
 from tip_scans_lab import channels
 
 from afspm import wire

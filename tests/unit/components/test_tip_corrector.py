@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from runtime_lab import REGION, Kill9, Lab, LabPort, context_of, run
+from client_lab import REGION, Kill9, Lab, LabPort, context_of, run
 from tip_scans_lab import HOME, channels
 
 from afspm import wire

@@ -12,8 +12,20 @@ from afspm.experiment.known import WIRE_KEYS, WIRE_SETTINGS, WiringClass
 from afspm.experiment.parts import DECLARED_KEYS, OWN_KEYS, SECTIONS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "experiment-file.md").read_text(encoding="utf-8")
-MODELS = [sections.ClockSection, sections.ControlSection, sections.RolesSection, sections.SecuritySection, sections.RestartSection, sections.RecordSection,
-          cache_section.CacheSection, cache_section.CacheRuleSection, limits_section.ParameterLimit, limits_section.ActionLimit, limits_section.LimitsSection, limits_section.RegionSection]  # fmt: skip
+MODELS = [
+    sections.ClockSection,
+    sections.ControlSection,
+    sections.RolesSection,
+    sections.SecuritySection,
+    sections.RestartSection,
+    sections.RecordSection,
+    cache_section.CacheSection,
+    cache_section.CacheRuleSection,
+    limits_section.ParameterLimit,
+    limits_section.ActionLimit,
+    limits_section.LimitsSection,
+    limits_section.RegionSection,
+]
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)

@@ -38,6 +38,7 @@ from afspm.model import (
     RelayedMessage,
     Request,
     Response,
+    ResponseDetail,
     ScopeState,
     ScopeStatus,
 )
@@ -101,8 +102,10 @@ class Lab:
         code: ControlResponse = ControlResponse.SUCCESS,
         payload: bytes = b"",
         reason: str = "",
+        detail: ResponseDetail = ResponseDetail.NONE,
     ) -> list[Effect]:
-        return self.step(TranslatorReply(forward.number, Response(int(code), payload, reason, forward.request.id)))
+        response = Response(int(code), payload, reason, forward.request.id, detail)
+        return self.step(TranslatorReply(forward.number, response))
 
     def ask(self, name: str, kind: int, subject: Any = None, id_: str = "", user: str | None = None) -> list[Effect]:
         connection = self.connections.get(name) or self.connect(name)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from afspm.logic.forwarder import NOT_SENT, UNKNOWN, ForwardedRequest, Forwarder, ForwardOutcome, SettledRequest
+from afspm.logic.forwarder import ForwardedRequest, Forwarder, ForwardOutcome, SettledRequest
 from afspm.logic.idempotency_cache import IdempotencyCache, RequestStatus
-from afspm.model import ControlResponse, Request, Response
+from afspm.model import ControlResponse, Request, Response, ResponseDetail
 
 OK = Response(int(ControlResponse.SUCCESS))
 
@@ -39,7 +39,7 @@ def test_without_a_translator_everybody_is_answered_at_once() -> None:
     refused = Forwarder().ask(job("a"), 0.0)
     assert refused is not None
     assert (refused.end, refused.response.code) == (ForwardOutcome.NOT_SENT, ControlResponse.NO_RESPONSE)
-    assert refused.response.reason.startswith(NOT_SENT)
+    assert refused.response.detail is ResponseDetail.NOT_SENT
 
 
 def test_a_loss_says_what_may_have_been_done_and_what_was_not() -> None:
@@ -48,7 +48,7 @@ def test_a_loss_says_what_may_have_been_done_and_what_was_not() -> None:
     forwarder.ask(job("b"), 0.0)
     ends = {settled.job.client: settled for settled in forwarder.lost()}
     assert ends["a"].end is ForwardOutcome.UNKNOWN
-    assert ends["a"].response.reason.startswith(UNKNOWN)
+    assert ends["a"].response.detail is ResponseDetail.OUTCOME_UNKNOWN
     assert ends["b"].end is ForwardOutcome.NOT_SENT
 
 
@@ -116,7 +116,7 @@ def test_the_queue_is_bounded() -> None:
     results = [forwarder.ask(job(str(n)), 0.0) for n in range(10)]
     refused = [result for result in results if isinstance(result, SettledRequest)]
     assert len(refused) == 6
-    assert all(r.response.reason.startswith(NOT_SENT) for r in refused)
+    assert all(r.response.detail is ResponseDetail.NOT_SENT for r in refused)
 
 
 def test_what_waits_can_be_called_back_and_what_was_sent_not() -> None:

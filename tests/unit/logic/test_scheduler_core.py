@@ -42,6 +42,7 @@ from afspm.model import (
     Parameter,
     Request,
     Response,
+    ResponseDetail,
     ScopeState,
 )
 
@@ -302,7 +303,7 @@ def test_a_silent_translator_is_told_of_and_its_late_answer_is_kept_for_a_repeti
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.later(5.0)
     silent = replies(lab.step(Tick()))[0].response
-    assert (silent.code, silent.reason.startswith("outcome unknown")) == (NO_RESPONSE, True)
+    assert (silent.code, silent.detail) == (NO_RESPONSE, ResponseDetail.OUTCOME_UNKNOWN)
     assert replies(lab.answer(lab.forwarded[-1])) == []
     assert lab.says("experiment", ACTION, "x-pulse", "experiment/a/1") is OK
     assert len(lab.forwarded) == 1
@@ -352,7 +353,7 @@ def test_what_was_not_sent_may_be_asked_again(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.step(TranslatorDown())
     answer = replies(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1"))[0].response
-    assert (answer.code, answer.reason.startswith("not sent")) == (NO_RESPONSE, True)
+    assert (answer.code, answer.detail) == (NO_RESPONSE, ResponseDetail.NOT_SENT)
     lab.translator()
     assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
 
@@ -360,9 +361,8 @@ def test_what_was_not_sent_may_be_asked_again(lab: Lab) -> None:
 def test_what_the_translator_could_not_even_begin_is_asked_again(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
-    reason = "not sent: the controller can't be reached"
-    answer = replies(lab.answer(lab.forwarded[-1], NO_RESPONSE, reason=reason))[0].response
-    assert (answer.code, answer.reason) == (NO_RESPONSE, reason)
+    answer = replies(lab.answer(lab.forwarded[-1], NO_RESPONSE, detail=ResponseDetail.NOT_SENT))[0].response
+    assert (answer.code, answer.detail) == (NO_RESPONSE, ResponseDetail.NOT_SENT)
     assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
 
 

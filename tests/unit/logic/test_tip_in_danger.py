@@ -8,7 +8,16 @@ from logic_lab import Lab, in_control, killed, kinds, replies, resumed
 from afspm.logic.events import Kill, Log, Stopped, Tick, TranslatorDown, TranslatorUp
 from afspm.logic.settings import SchedulerSettings
 from afspm.logic.watchdog import WatchdogSettings
-from afspm.model import ControlMode, ControlRequest, ControlResponse, Feedback, Parameter, Problem, ScopeState
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Parameter,
+    Problem,
+    ResponseDetail,
+    ScopeState,
+)
 
 ACTION, PARAM = ControlRequest.ACTION, ControlRequest.PARAM
 OFF = Feedback(on=False)
@@ -309,7 +318,7 @@ def test_a_scan_that_goes_on_when_the_controller_is_found_again_is_stopped_and_t
     lab.later(real_s=6.0)
     lab.step(Tick())
     for _ in range(3):
-        lab.answer(lab.forwarded[-1], ControlResponse.NO_RESPONSE, reason="not sent: the controller can't be reached")
+        lab.answer(lab.forwarded[-1], ControlResponse.NO_RESPONSE, detail=ResponseDetail.NOT_SENT)
     lab.scope_is(ScopeState.SCANNING)
     lab.later(real_s=10.0)
     lab.step(Tick())

@@ -20,7 +20,7 @@ OURS = Path(Dispatcher.give.__code__.co_filename).parents[1]
 
 def made_up(code: str, **names: object) -> dict[str, Any]:
     """The names that `code` defines, as if it stood in a file of ours."""
-    exec(compile(code, str(OURS / "runtime" / "made_up.py"), "exec"), names)
+    exec(compile(code, str(OURS / "client" / "made_up.py"), "exec"), names)
     return names
 
 

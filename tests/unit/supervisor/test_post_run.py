@@ -13,10 +13,10 @@ from afspm.clock import ExperimentClock
 from afspm.components import notifications
 from afspm.components.notifications import OCCASIONS, Targets
 from afspm.experiment import load
+from afspm.logic.supervision.run_end import EndReason
 from afspm.record.report import REPORT_FILE
 from afspm.record.store import RecordStore
 from afspm.supervisor import post_run
-from afspm.supervisor.ending import Why
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.post_run import EndedRun
 from afspm.supervisor.supervisor import ProcessReport, RunOutcome
@@ -32,7 +32,7 @@ class Log:
         self.lines.append((level, text))
 
 
-def told(folder: Path, why: Why, on: tuple[str, ...] = OCCASIONS) -> list[dict[str, object]]:
+def told(folder: Path, why: EndReason, on: tuple[str, ...] = OCCASIONS) -> list[dict[str, object]]:
     """What a command is told of a run that ended so."""
     file = folder / "told.txt"
     code = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
@@ -46,20 +46,20 @@ def told(folder: Path, why: Why, on: tuple[str, ...] = OCCASIONS) -> list[dict[s
 @pytest.mark.parametrize(
     ("why", "on", "what"),
     [
-        (Why.EXPERIMENT_ENDED, OCCASIONS, "end"),
-        (Why.STOPPED, ("end",), "end"),
-        (Why.LOST, OCCASIONS, "given-up"),
-        (Why.LOST, ("end",), "end"),
+        (EndReason.EXPERIMENT_ENDED, OCCASIONS, "end"),
+        (EndReason.STOPPED, ("end",), "end"),
+        (EndReason.LOST, OCCASIONS, "given-up"),
+        (EndReason.LOST, ("end",), "end"),
     ],
 )
-def test_the_end_is_told_with_how_it_ended(tmp_path: Path, why: Why, on: tuple[str, ...], what: str) -> None:
+def test_the_end_is_told_with_how_it_ended(tmp_path: Path, why: EndReason, on: tuple[str, ...], what: str) -> None:
     (notice,) = told(tmp_path, why, on)
     assert (notice["what"], notice["experiment"], notice["run"]) == (what, "night", str(tmp_path))
     assert notice["text"] == "the microscope is given up; given up: judge"
 
 
 def test_who_does_not_want_to_know_is_not_told(tmp_path: Path) -> None:
-    assert told(tmp_path, Why.EXPERIMENT_ENDED, ("unsolved-problem",)) == []
+    assert told(tmp_path, EndReason.EXPERIMENT_ENDED, ("unsolved-problem",)) == []
 
 
 class TenSeconds:
@@ -80,7 +80,7 @@ def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.M
     monkeypatch.setattr(notifications, "FIRST_DELAY_S", 0.01)
     log, count = Log(), tmp_path / "count"
     code = "import sys; open(sys.argv[1], 'a').write('x'); sys.exit('no network')"
-    ended = EndedRun("night", tmp_path, RunOutcome(Why.ALL_DONE, "all is done", (), 1.0), False)
+    ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all is done", (), 1.0), False)
     targets = Targets([sys.executable, "-c", code, str(count)])
     post_run.tell(ended, targets, ("end",), TenSeconds(), log)  # type: ignore[arg-type]
     assert count.read_text() == "xxx"
@@ -122,6 +122,6 @@ def test_people_are_told_before_the_report_is_made(monkeypatch: pytest.MonkeyPat
     file.write_text("\n".join(parts))
     experiment = load(file)
     starts = experiment.launches(take_address=FreePorts().address)
-    ended = EndedRun("night", tmp_path, RunOutcome(Why.ALL_DONE, "all is done", (), 1.0), True)
+    ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all is done", (), 1.0), True)
     post_run.follow(experiment, ended, starts, ExperimentClock.real(), Log(), with_report=True)  # type: ignore[arg-type]
     assert done == ["told", "reported"]

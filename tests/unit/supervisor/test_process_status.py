@@ -8,8 +8,8 @@ import pytest
 
 from afspm.experiment import Role
 from afspm.launch import Launch
-from afspm.logic.liveness import LivenessPolicy
-from afspm.logic.supervision import ChildPolicy, ChildWatch
+from afspm.logic.supervision.child import ChildPolicy, ChildWatch
+from afspm.logic.supervision.liveness import LivenessPolicy
 from afspm.model import ProcessCondition
 from afspm.supervisor.process_status import ProcessStatus
 from afspm.supervisor.task import Task

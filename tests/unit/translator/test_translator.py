@@ -20,6 +20,7 @@ from afspm.model import (
     Parameter,
     ProbePosition,
     Region,
+    ResponseDetail,
     ScanParameters,
     ScopeState,
     names,
@@ -492,7 +493,7 @@ def test_a_controller_that_is_gone_is_said_and_found_again(bench: Any) -> None:
     bench.look()
     assert bench.heard() == ["UNDEFINED"]
     response = bench.ask(PARAM, Parameter("scan-speed"))
-    assert (response.code, response.reason.split(":")[0]) == (ControlResponse.NO_RESPONSE, "not sent")
+    assert (response.code, response.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.NOT_SENT)
     bench.microscope.lost = False
     bench.look(after_s=5.0)
     assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]

@@ -26,6 +26,7 @@ from afspm.model import (
     RegionChange,
     Request,
     Response,
+    ResponseDetail,
     Scan,
     ScanLines,
     ScanParameters,
@@ -179,9 +180,22 @@ def test_requests_that_break_off_are_refused(frames: list[bytes]) -> None:
         wire.decode_request(frames)
 
 
-def test_a_response_carries_reason_and_id() -> None:
-    response = Response(ControlResponse.PARAM_ERROR, b"", "tip-bias-voltage: 12 V is above 10 V", "a/1/2")
+def test_a_response_carries_reason_id_and_detail() -> None:
+    response = Response(ControlResponse.NO_RESPONSE, b"", "not sent: why", "a/1/2", ResponseDetail.NOT_SENT)
     assert wire.decode_response(wire.encode_response(response)) == response
+    plain = Response(ControlResponse.PARAM_ERROR, b"", "tip-bias-voltage: 12 V is above 10 V", "a/1/2")
+    assert wire.decode_response(wire.encode_response(plain)) == plain
+    assert len(wire.encode_response(plain)) == 4
+
+
+def test_what_a_newer_peer_appends_to_a_response_is_not_looked_at() -> None:
+    newer = [b"\1", b"", b"why", b"a/1/2", bytes([200]), b"more"]
+    assert wire.decode_response(newer) == Response(ControlResponse.FAILURE, b"", "why", "a/1/2")
+
+
+def test_peers_of_version_1_are_sent_no_detail() -> None:
+    response = Response(ControlResponse.FAILURE, b"", "why", "", ResponseDetail.EXPERIMENT_ENDED)
+    assert wire.encode_answer(response, ControlRequest.ACTION) == [b"\1"]
 
 
 def test_a_parameter_without_a_value_asks_for_it() -> None:

@@ -123,7 +123,7 @@ class AsylumEmulator(Emulator):
         return f"tcp://{LOOPBACK}:{self._server.port}"
 
     def functions(self) -> dict[str, wire.IgorFunction]:
-        """All that can be called, by names in lower case."""
+        """Return the functions that a client may call, by name in lower case."""
         software = AsylumFunctions(
             self.controller,
             self.clock.now_s,
@@ -144,7 +144,7 @@ class AsylumEmulator(Emulator):
             self.controller.advance(self.clock.now_s())
 
     def tick(self, now_s: float) -> float | None:
-        """What Asylum's software does by itself, and replies that come late."""
+        """Advance Asylum's software, and send delayed replies."""
         while self._delayed and self._delayed[0].at_s <= now_s:
             delayed = self._delayed.popleft()
             self._server.send(delayed.client, delayed.payload)

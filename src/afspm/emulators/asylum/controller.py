@@ -93,7 +93,7 @@ class AsylumController:
     # --- what goes on ---
 
     def advance(self, now_s: float) -> float | None:
-        """All that happens up to now; returns when to look again."""
+        """Advance to now; return the time of the next change."""
         if self._engages and not self.rig.busy(now_s):
             self._engages = False
             self.rig.engage()
@@ -113,7 +113,7 @@ class AsylumController:
 
     @property
     def scanning(self) -> bool:
-        """What the panels go by."""
+        """True while the panels show a running scan."""
         return bool(self.values.get("ScanStatus"))
 
     def status(self, now_s: float) -> int:
@@ -204,7 +204,6 @@ class AsylumController:
         self._image = rig.region
 
     def _frame(self) -> Region:
-        """Of the next image."""
         center = (self.values.get("XOffset"), self.values.get("YOffset"))
         return Region(center, self.values.size(), 0.0 - math.radians(self.values.get("ScanAngle")))  # clockwise
 
@@ -250,7 +249,7 @@ class AsylumController:
             self.rig.abandon()  # the curve itself takes the time
 
     def stop_curve(self) -> None:
-        """At once."""
+        """Stop the force curve at once."""
         self._curve_running = False
         self.rig.stop_spectrum()
 

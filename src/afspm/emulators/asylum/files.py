@@ -32,7 +32,7 @@ class FilePart:
 
 
 class PendingWrites:
-    """What is still to be written."""
+    """The file parts that are still to be written."""
 
     def __init__(self) -> None:
         self._writes: list[FilePart] = []
@@ -85,7 +85,7 @@ def curve(name: str, spectrum: SimulatedSpectrum, values: IgorValues, now_s: flo
 
 
 def _of_curve(spectrum: SimulatedSpectrum, distance_m: float, points: int, values: IgorValues) -> Entries:
-    """What the note of a force curve says of how it was taken."""
+    """Return the entries of a force curve's note that describe its acquisition."""
     duration_s = spectrum.end_s - spectrum.start_s
     velocity_m_s = distance_m / (duration_s / 2)
     place = zip(("XLVDT", "YLVDT"), spectrum.position_m, strict=True)

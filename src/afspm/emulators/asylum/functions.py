@@ -47,7 +47,7 @@ class AsylumFunctions:
         self._image_open = image_open
 
     def table(self) -> dict[str, IgorFunction]:
-        """By their names in lower case, as Igor does not tell the two apart."""
+        """Return the functions by name in lower case, since Igor ignores case."""
         values = self._controller.values
         table = {
             "GV": IgorFunction(self._get, "s"),

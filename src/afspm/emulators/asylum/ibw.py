@@ -15,7 +15,7 @@ _FLOAT32: Final = 2
 
 
 def moment(time_s: float) -> tuple[datetime, float]:
-    """On the clock of the controller's computer, and as Igor counts: seconds of that clock since 1904."""
+    """Return the local time of the controller's computer, and Igor's: seconds of local time since 1904."""
     local = datetime.fromtimestamp(time_s, UTC).astimezone()
     offset = local.utcoffset()
     return local, time_s + _SINCE_1904_S + (offset.total_seconds() if offset else 0.0)
@@ -63,5 +63,5 @@ def wave(
 
 
 def _printed(value: float) -> str:
-    """As Igor prints a number: 5e-06 and 3.7407e+05, and whole numbers up to five digits as they are."""
+    """Format as Igor does: 5e-06, 3.7407e+05, and whole numbers up to five digits in full."""
     return f"{value:.5g}"

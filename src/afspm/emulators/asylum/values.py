@@ -36,7 +36,7 @@ class IgorValues:
         return self._numbers.get(name.lower(), math.nan)
 
     def put(self, names: str, value: float) -> None:
-        """To one name or a list "A;B;", without any check, and without what a panel would do besides."""
+        """Set one name or a list "A;B;", without checks and without the side effects of a panel."""
         for name in names.split(";"):
             if name.lower() in self._numbers:
                 self._numbers[name.lower()] = value
@@ -55,7 +55,7 @@ class IgorValues:
         return (longer / ratio, longer) if ratio > 1.0 else (longer, longer * ratio)
 
     def settle(self) -> None:
-        """What the software works out when it begins to scan."""
+        """Derive the values that the software computes when a scan starts."""
         fast, slow = self.size()
         self.put("FastScanSize", fast)
         self.put("SlowScanSize", slow)

@@ -58,7 +58,7 @@ class CallFailed(Exception):
 
 @dataclass(frozen=True)
 class FunctionCall:
-    """What a request asks for."""
+    """The function call of a request."""
 
     name: str
     parameters: tuple[str, ...]
@@ -129,7 +129,7 @@ def _function_call(wanted: dict[str, Any]) -> tuple[str, tuple[str, ...]]:
 
 
 def arguments(function: IgorFunction | None, parameters: Sequence[str]) -> list[float | str]:
-    """What a function is called with.
+    """Return the arguments for a function.
 
     Raises:
         CallFailed: 101 to 106: it is not there, or can't be called so.

@@ -58,7 +58,7 @@ class SharedMemoryBlock:
 
     @property
     def pid(self) -> int:
-        """Of the process that is signalled."""
+        """Process id to send the signal to."""
         return self._process.pid
 
     def fileno(self) -> int:

@@ -64,7 +64,7 @@ class NoAnswer(Exception):
 
 
 class Uninitialised:
-    """What must not be looked at."""
+    """A value that the real program leaves uninitialised."""
 
 
 class GxsmFunctions:
@@ -200,7 +200,6 @@ class GxsmFunctions:
         return (_NEVER_WRITTEN, _NEVER_WRITTEN, _NEVER_WRITTEN)
 
     def _pixel(self, now_s: float, *, centred: bool) -> tuple[float, float, float]:
-        """Where the tip is in the scan."""
         rows, columns = self._program.last.shape if self._program.last is not None else (0, 0)
         x, y = columns // 2, self._program.y_current(now_s)
         return (float(x - columns // 2), float(rows // 2 - y), 0.0) if centred else (float(x), float(y), 0.0)

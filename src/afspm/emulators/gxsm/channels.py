@@ -1,4 +1,4 @@
-"""Which channels of the simulated instrument GXSM records, and what it calls them."""
+"""The channels that GXSM records, with its names for them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class GxsmChannel:
     dz: float
 
     def ending(self, *, master: bool) -> str:
-        """Of its files' names, after the number."""
+        """Ending of the file's name, after the number."""
         return f"{'M-' if master else ''}{self.direction}-{self.label.replace('-', 'm')}.nc"
 
     def raw(self, values: np.ndarray) -> np.ndarray:

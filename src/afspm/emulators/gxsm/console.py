@@ -84,7 +84,7 @@ class ScriptConsole:
         self._thread.start()
 
     def poll(self) -> str | None:
-        """Where its script listens, once it does.
+        """Return the address of the script once it listens.
 
         Raises:
             whatever ended it before.
@@ -93,7 +93,7 @@ class ScriptConsole:
 
     @property
     def runs(self) -> bool:
-        """Whether the script has not ended."""
+        """True until the script has ended."""
         return self._runs
 
     def end(self) -> None:

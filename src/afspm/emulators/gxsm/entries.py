@@ -43,7 +43,7 @@ class GxsmEntry:
 
 
 class GxsmEntries:
-    """All of them, by reference name.
+    """The entries by reference name.
 
     Args:
         user_unit: of lengths, as preferred.
@@ -73,7 +73,7 @@ class GxsmEntries:
         return self._entries[ref].value
 
     def put(self, ref: str, value: float) -> None:
-        """As somebody at the panel, lengths in ångström: nothing is refused, nothing else follows."""
+        """Set an entry as at the panel, lengths in ångström, without checks or side effects."""
         self._entries[ref].value = value
 
     def set(self, ref: str, text: str) -> int:
@@ -124,7 +124,7 @@ class GxsmEntries:
         return USER_UNITS[self._user_unit] if entry.unit == _ANGSTROM else 1.0
 
     def _atof(self, text: str) -> float:
-        """What C makes of a text: as much of it as is a number, 0 of what is none."""
+        """Parse the longest numeric prefix, as C's atof does; 0 if there is none."""
         wanted = text.replace(".", "\0").replace(",", ".") if self._comma else text
         match = _FLOAT.match(wanted)
         return float(match[0]) if match else 0.0

@@ -1,4 +1,4 @@
-"""How GXSM saves: late, one file after the other, each in parts; and how it numbers what it saves."""
+"""GXSM's files: written late, one after the other, in parts, and numbered."""
 
 from __future__ import annotations
 

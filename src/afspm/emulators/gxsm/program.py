@@ -105,7 +105,6 @@ class GxsmProgram:
             self.entries.add(ref, entry)
 
     def _told(self, ref: str) -> Callable[[float], None]:
-        """What follows from setting a length: the tip goes along."""
         if ref in ("ScanX", "ScanY", "OffsetX", "OffsetY"):
             return lambda _: self._move()
         return lambda _: None
@@ -223,7 +222,7 @@ class GxsmProgram:
         return done - 1 if done else self._y_before
 
     def frame(self) -> Region:
-        """Of the next scan."""
+        """The frame of the next scan."""
         x, y, width, height = (self.entries[ref] * ANGSTROM_M for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY"))
         return Region((x, y), (width, height), -math.radians(self.entries["Rotation"]))
 
@@ -305,7 +304,7 @@ class GxsmProgram:
             self.rig.move_probe(self.tip_m())
 
     def tip_m(self) -> tuple[float, float]:
-        """Where it was sent."""
+        """The position that the tip was sent to."""
         angle, (cx, cy) = -math.radians(self.entries["Rotation"]), self.frame().center_m
         u, v = (self.entries[ref] * ANGSTROM_M for ref in ("ScanX", "ScanY"))
         return cx + math.cos(angle) * u - math.sin(angle) * v, cy + math.sin(angle) * u + math.cos(angle) * v
@@ -322,7 +321,7 @@ class GxsmProgram:
             self.dialogs.append(str(error))
 
     def columns(self, curve: SimulatedSpectrum) -> dict[str, np.ndarray]:
-        """As GXSM labels them."""
+        """Return the columns with GXSM's labels."""
         blanks = "    " if self.card == "RPSPMC" else ""
         found = {}
         for name, unit, values in zip(curve.names, curve.units, curve.values.T, strict=True):

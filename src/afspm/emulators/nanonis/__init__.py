@@ -218,7 +218,7 @@ class NanonisEmulator(Emulator):
     # --- requests ---
 
     def _answer_all(self, connection: ClientConnection) -> None:
-        """What has come on a connection, as far as it does not wait for something."""
+        """Answer the requests received on a connection until one has to wait."""
         while connection.waits_for is None and not connection.closing:
             now_s = self.clock.now_s()
             if self.faults.lasts("dialog", now_s):

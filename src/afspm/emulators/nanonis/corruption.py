@@ -1,4 +1,4 @@
-"""What a controller might reply that has lost its mind: fields of the right kind, with values of no sense."""
+"""Senseless replies: fields of the right type with values that make no sense."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the functions of the protocol are answered; what each does stands in the modules `on_…`."""
+"""Dispatch of the protocol's functions to their handlers in the modules `on_…`."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def answers(*names: str) -> Callable[[Handler], Handler]:
 
 
 def answer(panel: NanonisState, name: str, arguments: list[Any]) -> Answer:
-    """What is done and replied.
+    """Execute a function and return its results.
 
     Raises:
         FunctionRefused, RigBusy, InvalidValue.
@@ -101,14 +101,14 @@ def deadline_s(panel: NanonisState, timeout_ms: int) -> float:
 
 
 def chosen(number: int, *choices: Any) -> Any:
-    """What a number stands for; as a rule 0 is what it is already."""
+    """Return the choice of a number; choice 0 is usually "no change"."""
     if not 0 <= number < len(choices):
         raise FunctionRefused(f"{number} is none of the choices")
     return choices[number]
 
 
 def until_free(panel: NanonisState, wait: int, timeout_ms: int = -1) -> Answer:
-    """At once, or once the instrument has done what it was told."""
+    """Return at once, or when the instrument is free if `wait` is set."""
     if not wait:
         return ()
     return DeferredResult(lambda now_s: None if panel.rig.busy(now_s) else (), deadline_s(panel, timeout_ms))

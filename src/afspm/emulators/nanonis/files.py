@@ -13,7 +13,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SxmContent:
-    """What goes into a scan's file.
+    """The content of a scan's file.
 
     Attributes:
         center_m, range_m: of the frame of whole pixels; angle_deg clockwise.

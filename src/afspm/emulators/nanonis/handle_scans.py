@@ -54,7 +54,7 @@ def _scan_status(panel: NanonisState) -> Answer:
 
 @answers("Scan.WaitEndOfScan")
 def _wait_end_of_scan(panel: NanonisState, timeout_ms: int) -> Answer:
-    """Of the next end: one that has been is none.
+    """Wait for the next end of a scan; an earlier one does not count.
 
     A client's pause since it has begun the scan, or since its last wait has timed out, is taken to last as long in
     experiment time as it does in real time, as if the clock went no faster.
@@ -76,7 +76,7 @@ def _wait_end_of_scan(panel: NanonisState, timeout_ms: int) -> Answer:
 
 @answers("Scan.WaitEndOfLine")
 def _wait_end_of_line(panel: NanonisState, timeout_ms: int) -> Answer:
-    """Of a line forward (0) or backward (1), its number counted from 1."""
+    """Wait for the end of a line, forward (0) or backward (1), counted from 1."""
     scan = panel.rig.scan
     timed_out = (1, 0, 0, 0)
     if scan is None or not scan.running(panel.clock.now_s()):

@@ -157,7 +157,7 @@ def _log_status(panel: NanonisState) -> Answer:
 
 @answers("PLL.FreqShiftGet")
 def _frequency_shift(panel: NanonisState, modulator: int) -> Answer:
-    """Of the first modulator where the sensor has one; else what was set."""
+    """Return the measured shift of the first modulator, or the stored value of the others."""
     measured = panel.frequency_shift_hz(panel.clock.now_s()) if modulator == 1 else None
     return panel.registers.got("PLL.FreqShiftGet", [modulator]) if measured is None else (measured,)
 

@@ -17,7 +17,7 @@ _DISCONNECTED, _IDLE, _RUNNING, _OVERFLOW = 0, 1, 4, 7
 
 
 class TcpLogger:
-    """What is logged, while it is started.
+    """The TCP TcpLogger: which slots it streams, and its frames.
 
     Attributes:
         slots: of the Signals Manager, which the channels are.
@@ -34,7 +34,7 @@ class TcpLogger:
 
     @property
     def running(self) -> bool:
-        """Whether anybody is to get anything."""
+        """True while frames are sent."""
         return self._started_s is not None and bool(self.unread)
 
     def start(self, now_s: float) -> None:
@@ -46,7 +46,7 @@ class TcpLogger:
         self._started_s = None
 
     def status(self) -> int:
-        """As the protocol counts."""
+        """Return the status code of the protocol."""
         if not self.unread:
             return _DISCONNECTED
         if self._started_s is None:
@@ -63,7 +63,7 @@ class TcpLogger:
         return found
 
     def next_s(self) -> float:
-        """When the next frame is due."""
+        """Return the time of the next frame."""
         return math.inf if self._started_s is None else self._started_s + self._period_s * (self._counter + 1)
 
     def frame(self, counter: int, values: Sequence[float]) -> bytes:

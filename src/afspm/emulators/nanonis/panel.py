@@ -1,4 +1,4 @@
-"""What Nanonis' software has set and is doing, with the simulated instrument behind it, and the files that it saves."""
+"""The state of the Nanonis software: its settings, its activity on the simulated instrument, and its files."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ class NanonisState:
             self.z_controller = "safe"
 
     def begin_scan(self, upwards: bool) -> None:
-        """As somebody asks for it. Raises RigBusy."""
+        """Start a scan on request, possibly late. Raises RigBusy."""
         now_s = self.clock.now_s()
         late = self.faults.strikes("late-start", now_s)
         if late is not None:
@@ -176,7 +176,7 @@ class NanonisState:
             self.start_scan(upwards)
 
     def start_scan(self, upwards: bool) -> None:
-        """At once. Raises RigBusy."""
+        """Start a scan at once. Raises RigBusy."""
         x, y, width, height, clockwise_deg = self.frame
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
         self.rig.region = Region((x, y), size_m, -math.radians(clockwise_deg))
@@ -255,7 +255,7 @@ class NanonisState:
         self.lines = lines or max(1, round(self.pixels * ratio))
 
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> None:
-        """What does not fit into the scanner's range is made to."""
+        """Set the frame, moved into the scanner's range as the real one does."""
         width, height = min(width, self.range_m[0]), min(height, self.range_m[1])
         x, y = (
             float(np.float32(np.clip(value, (size - whole) / 2, (whole - size) / 2)))
@@ -292,7 +292,7 @@ class NanonisState:
         return {"off": 1, "on": 2, "safe": 5}[self.z_controller]
 
     def z_is_on(self, now_s: float) -> bool:
-        """As the real-time part has it."""
+        """True while the real-time controller has the z feedback on."""
         return self.z_status(now_s) in (2, 4)
 
     def set_session_path(self, path: str) -> None:
@@ -308,26 +308,26 @@ class NanonisState:
         self.folder, self.session_path = folder, path
 
     def name(self, text: str) -> str:
-        """What part of a file's name may be. Raises InvalidValue: Windows, where Nanonis runs, can't have it."""
+        """Check a part of a file's name. Raises InvalidValue: Windows, where Nanonis runs, does not allow it."""
         if not _NO_FILE_NAME.isdisjoint(text) or len(text) > _LONGEST_NAME or text.strip(". ") != text:
             raise InvalidValue(f"{text!r} can't be part of a file's name")
         return text
 
     def experiment_s(self, real_s: float) -> float:
-        """How long that is in experiment time."""
+        """Convert real to experiment seconds."""
         return real_s / self.clock.real_s(1.0)
 
     # --- what is measured ---
 
     def signal_values(self, indexes: Sequence[int], now_s: float) -> list[float]:
-        """Of signals, all of the same moment; those that nothing is connected to are zero."""
+        """Return the values of signals at one moment; unconnected ones are zero."""
         shown = self.rig.signals(now_s)
         values = {_SIGNALS[name]: value for name, value in shown.items() if name in _SIGNALS}
         values |= {_SIGNALS["Height"]: self._z_m(shown["Height"]), _BIAS: self.rig.bias_v}
         return [values.get(index, 0.0) for index in indexes]
 
     def frequency_shift_hz(self, now_s: float) -> float | None:
-        """Of the sensor; None where the feedback's mode has none."""
+        """Return the sensor's frequency shift; None if the feedback's mode has none."""
         index = _SIGNALS["Frequency Shift"]
         return self.signal_values([index], now_s)[0] if self._shifts else None
 
@@ -337,7 +337,7 @@ class NanonisState:
         return ("OC M1 Freq. Shift", "Hz") if self._shifts else ("log Current", "A")
 
     def z_m(self, now_s: float) -> float:
-        """Where the tip is in z."""
+        """Return the height of the tip."""
         return self._z_m(self.rig.signals(now_s)["Height"])
 
     def _z_m(self, shown_m: float) -> float:
@@ -357,7 +357,7 @@ class NanonisState:
         self.rig.stop("motor")
 
     def motor_at_m(self, now_s: float) -> tuple[float, float, float]:
-        """Where the motor has come to, of all the steps that it was told."""
+        """Return the position of the coarse motor."""
         axis, steps, since_s = self._motor_walks
         walked = math.copysign(min(abs(steps), (now_s - since_s) / _STEP_S), steps)
         at_m = list(self._motor_m)
@@ -369,7 +369,7 @@ class NanonisState:
     def images(
         self, scanning: StartedScan, until_s: float | None
     ) -> dict[int, tuple[str, str, np.ndarray, np.ndarray]]:
-        """By channel: name, unit, forward and backward [y, x], lines not yet scanned NaN."""
+        """Return for each channel name, unit, forward and backward values [y, x]; lines not yet scanned are NaN."""
         drawn = scanning.scan.channels(until_s)
         found = {}
         for channel, (unit, values) in drawn.items():
@@ -417,7 +417,7 @@ class NanonisState:
         return path if self._save(name, files.sxm(saved), now_s) else ""
 
     def told_path(self, name: str) -> str:
-        """How a file of the session is called on the controller's computer."""
+        """Return the path of a session file on the controller's computer."""
         windows = "\\" in self.session_path
         return str(PureWindowsPath(self.session_path) / name) if windows else str(Path(self.session_path) / name)
 
@@ -482,7 +482,7 @@ class NanonisState:
 
 
 def curve_columns(curve: SimulatedSpectrum) -> list[str]:
-    """As Nanonis names them: "Current [bwd] (A)"; what is swept comes first, and has a name of its own."""
+    """Return a curve's column names as Nanonis writes them: "Current [bwd] (A)"; the swept signal comes first."""
     columns: list[str] = []
     for name, unit in zip(curve.names, curve.units, strict=True):
         forward = name.removesuffix(RETRACE)

@@ -1,4 +1,4 @@
-"""What is set and got again: pairs of functions `…Set` and `…Get`, of modules whose settings change nothing here."""
+"""Settings without effect on the emulation: pairs of functions `…Set` and `…Get` that only store values."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Registers:
         self._kept: dict[tuple[str, Values], Values] = {}
 
     def set(self, name: str, arguments: Sequence[Any]) -> None:
-        """As the function `name` asks. Raises ValueError: an argument that is none of its choices."""
+        """Store the arguments of the function `name`. Raises ValueError: an argument is none of its choices."""
         register = name.removesuffix("Set")
         fields = wire.functions()[name].arguments
         by, taken = _parts(register, len(arguments))
@@ -75,7 +75,7 @@ class Registers:
         self._kept[register, ()] = values
 
     def get(self, register: str, belongs_to: Sequence[Any] = ()) -> Values:
-        """What was set last, or is there at first; empty if neither."""
+        """Return the stored values, or the initial ones; empty if there are none."""
         return self._kept.get((register, tuple(belongs_to)), AT_FIRST.get(register, ()))
 
     def got(self, name: str, arguments: Sequence[Any]) -> Values:
@@ -101,7 +101,7 @@ def _keys_without_getter(register: str) -> int:
 
 
 def _set(mark: str, value: Any, before: Any) -> Any:
-    """How it is got from then on; NaN is no change."""
+    """Store a value; NaN is no change."""
     if isinstance(value, float) and math.isnan(value):
         return before
     if mark == "?":

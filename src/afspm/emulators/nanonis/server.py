@@ -69,22 +69,22 @@ class NanonisServer:
 
     @property
     def ports(self) -> list[int]:
-        """That are listened on for requests."""
+        """Ports that listen for requests."""
         return [int(listener.getsockname()[1]) for listener in self._listeners]
 
     @property
     def stream_port(self) -> int:
-        """That of the stream; 0 without one."""
+        """Port of the stream; 0 without one."""
         return 0 if self._stream is None else int(self._stream.getsockname()[1])
 
     @property
     def connections(self) -> list[ClientConnection]:
-        """Of the clients that ask."""
+        """Connections of clients that send requests."""
         return [connection for connection, listener in self._of.items() if listener is not self._stream]
 
     @property
     def readers(self) -> list[ClientConnection]:
-        """Of those who have connected to the stream."""
+        """Connections of clients that read the stream."""
         return [connection for connection, listener in self._of.items() if listener is self._stream]
 
     def poll(self, timeout_s: float) -> None:
@@ -99,7 +99,7 @@ class NanonisServer:
                 self._accept(key.data)
 
     def send(self, connection: ClientConnection, content: bytes = b"") -> None:
-        """As much as the client takes, the rest later."""
+        """Send what the client takes now, and the rest later."""
         connection.sending += content
         try:
             while connection.sending:

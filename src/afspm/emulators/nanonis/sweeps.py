@@ -1,4 +1,4 @@
-"""What a spectrum sweeps, had from the simulated curve, which goes over a range of its own."""
+"""The sweep of a spectrum, resampled from the simulated curve, which has its own range."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from afspm.emulators.activities import SimulatedSpectrum
 
 @dataclass
 class SweepSettings:
-    """As the panel of a module of spectra has it.
+    """The sweep settings of a spectroscopy module.
 
     Attributes:
         points: how many; None: as many as the simulated curve has.
@@ -33,7 +33,7 @@ class SweepSettings:
     dialog: bool = False
 
     def of(self, curve: SimulatedSpectrum) -> SimulatedSpectrum:
-        """The same curve, swept like this."""
+        """Return the curve resampled to this sweep."""
         values = curve.values
         if self.points is not None or self.limits is not None:
             swept = values[:, 0]

@@ -79,7 +79,7 @@ class NanonisFunction:
 
 @cache
 def functions() -> Mapping[str, NanonisFunction]:
-    """All that there are, by name."""
+    """Return the protocol's functions by name."""
     found = {}
     for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
         if line and not line.startswith("#"):
@@ -94,7 +94,7 @@ def _by_lower_case() -> Mapping[str, str]:
 
 
 def known_as(name: str) -> str | None:
-    """How the table has the name, of which neither case counts; None if it does not have it."""
+    """Return the table's spelling of a name, ignoring case; None if it is not there."""
     return _by_lower_case().get(name.lower())
 
 
@@ -182,20 +182,20 @@ def reply(name: str, body: bytes) -> bytes:
 
 
 def body(name: str, results: Sequence[Any], release: int, encoding: str = "utf-8") -> bytes:
-    """Of a reply without an error."""
+    """Encode the body of a reply without an error."""
     values = zip(functions()[name].results, results, strict=True)
     packed = (_packed(field.code, value, encoding) for field, value in values if field.is_in(release))
     return b"".join(packed) + error_block("", 0)
 
 
 def error_body(name: str, text: str, release: int, *, bare: bool) -> bytes:
-    """Of a reply with an error: after the results, all zero, or without any."""
+    """Encode the body of a reply with an error, after results that are all zero, or without results."""
     codes = [] if bare or name not in functions() else functions()[name].result_codes(release)
     return b"".join(_packed(code, ZEROS[code], "utf-8") for code in codes) + error_block(text, 1)
 
 
 def error_block(text: str, status: int) -> bytes:
-    """What every reply ends with."""
+    """Encode the error block at the end of every reply."""
     return struct.pack(">I", status) + _packed("S", text, "utf-8")
 
 

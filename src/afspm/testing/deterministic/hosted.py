@@ -1,6 +1,6 @@
 """Real components and the real translator as simulated processes: their own code, in-memory ports, a folder for a disk.
 
-`HostedComponent` runs a `Component` as the host of `afspm.runtime` does, `HostedTranslator` a `Driver` behind the
+`HostedComponent` runs a `Component` as the host of `afspm.process` does, `HostedTranslator` a `Driver` behind the
 real `Translator`. All of it speaks the real wire format.
 """
 
@@ -13,11 +13,9 @@ from pathlib import Path
 
 from afspm import wire
 from afspm.client.component import Component
-from afspm.client.published_state import STATE_MESSAGES
 from afspm.launch import Launch, Sockets
 from afspm.model import Packet, Request, Response
-from afspm.process.context import ProcessActivity, ProcessContext
-from afspm.process.host import MEASURED
+from afspm.process.context import MEASURED_MESSAGES, STATE_MESSAGES, ProcessActivity, ProcessContext
 from afspm.process.memory import Memory
 from afspm.testing.deterministic.baton import Baton
 from afspm.testing.deterministic.network import ControlLine, Feed, Weather
@@ -157,7 +155,9 @@ class HostedComponent(HostedProcess):
         self._inbox = []
         self._newest = {}
         self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.name)
-        self._feed = Feed(self.timeline, self._weather, self, self._scheduler, sorted({*STATE_MESSAGES, *MEASURED}))
+        self._feed = Feed(
+            self.timeline, self._weather, self, self._scheduler, sorted({*STATE_MESSAGES, *MEASURED_MESSAGES})
+        )
 
     def disconnect(self) -> None:
         self._line.close()

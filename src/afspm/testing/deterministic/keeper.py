@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from afspm.logic.supervision import ChildEffect, ChildPhase, ChildPolicy, ChildWatch, GiveUpChild, KillChild, StartChild
+from afspm.logic.supervision.child import (
+    ChildEffect,
+    ChildPhase,
+    ChildPolicy,
+    ChildWatch,
+    GiveUpChild,
+    KillChild,
+    StartChild,
+)
 from afspm.model import ProcessCondition, ProcessState
 from afspm.testing.deterministic.process import Process
 from afspm.testing.deterministic.timeline import Timeline

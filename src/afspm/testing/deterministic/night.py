@@ -9,11 +9,11 @@ from typing import Any
 from afspm.logic.arbitration import Cause, RoleTable, Rules
 from afspm.logic.envelopes import Envelopes
 from afspm.logic.limits import ExperimentLimits, Limit
-from afspm.logic.liveness import LivenessPolicy
 from afspm.logic.microscope_status import FEEDBACK_OFF
-from afspm.logic.restart import RestartPolicy
 from afspm.logic.scheduler_core import SchedulerSettings
-from afspm.logic.supervision import ChildPolicy
+from afspm.logic.supervision.child import ChildPolicy
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.restart import RestartPolicy
 from afspm.logic.watchdog import WatchdogSettings
 from afspm.model import Packet, PacketHeader, ScopeState, names
 from afspm.testing.deterministic import behaviours

@@ -32,7 +32,16 @@ from afspm.logic.events import (
     TranslatorUp,
 )
 from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
-from afspm.model import HAS_ENDED, RELAY_REQUEST, ControlResponse, Packet, PacketHeader, Request, Response
+from afspm.model import (
+    HAS_ENDED,
+    RELAY_REQUEST,
+    ControlResponse,
+    Packet,
+    PacketHeader,
+    Request,
+    Response,
+    ResponseDetail,
+)
 from afspm.testing.deterministic.network import ControlLine, ControlServer, Feed, Publisher, Weather
 from afspm.testing.deterministic.process import Alarm, Process
 from afspm.testing.deterministic.timeline import Timeline
@@ -188,7 +197,8 @@ class SchedulerHost(Process):
     def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
         connection = self._lines.get(line)
         if self._has_ended and request.kind != RELAY_REQUEST:
-            line.answer(Response(int(ControlResponse.FAILURE), b"", HAS_ENDED, request.id))
+            ended = ResponseDetail.EXPERIMENT_ENDED
+            line.answer(Response(int(ControlResponse.FAILURE), b"", HAS_ENDED, request.id, ended))
         elif connection is not None:
             self._step(RequestIn(connection, line.name, request), late=True)
 

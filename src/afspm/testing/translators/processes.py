@@ -35,7 +35,7 @@ class Processes:
         self._running: dict[str, ChildProcess] = {}
 
     def start(self, starts: Sequence[ProcessStart]) -> None:
-        """ProcessStart these.
+        """Start these.
 
         Raises:
             AfspmError: one can't be started.

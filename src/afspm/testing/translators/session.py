@@ -124,7 +124,7 @@ def prepare(options: Options) -> Experiment:
 
 @contextmanager
 def opened(options: Options) -> Iterator[Session]:
-    """ProcessStart, or join, what is to be checked; in control of the microscope while in the block.
+    """Start, or join, what is to be checked; in control of the microscope while in the block.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
@@ -165,7 +165,7 @@ def _interrupting(bench: Bench) -> Iterator[None]:
 def _bench(
     experiment: Experiment, options: Options, stack: ExitStack, complaints: list[str]
 ) -> tuple[Bench, Path, bool]:
-    """ProcessStart what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
+    """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
     common = _common(experiment, options)
     clock = common.clock
     folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())

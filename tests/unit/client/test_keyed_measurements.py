@@ -7,9 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+from client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from runtime_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 
 from afspm.client.link import ExperimentLink
 from afspm.client.scope import Scope

@@ -8,8 +8,8 @@ from enum import Enum, auto
 from typing import Protocol
 
 from afspm.exit_codes import ExitCode
-from afspm.logic.liveness import Liveness, LivenessPolicy, ProcessHealth
-from afspm.logic.restart import RestartBudget, RestartPolicy
+from afspm.logic.supervision.liveness import Liveness, LivenessPolicy, ProcessHealth
+from afspm.logic.supervision.restart import RestartBudget, RestartPolicy
 
 
 @dataclass(frozen=True)

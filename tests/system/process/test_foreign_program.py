@@ -53,7 +53,7 @@ def test_a_guard_that_is_terminated_takes_its_command_along(start: Any) -> None:
 
 TERMINATED_AT_ONCE = """
 import os, signal, subprocess, sys
-from afspm.runtime import guard
+from afspm.process import foreign
 
 class Popen(subprocess.Popen):
     def __init__(self, *args, **settings):
@@ -61,7 +61,7 @@ class Popen(subprocess.Popen):
         os.kill(os.getpid(), signal.SIGTERM)
 
 subprocess.Popen = Popen
-sys.exit(int(guard.main(sys.argv[1:])))
+sys.exit(int(foreign.main(sys.argv[1:])))
 """
 
 

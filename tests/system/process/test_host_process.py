@@ -21,7 +21,7 @@ CLOCK = ExperimentClock.real()
 
 
 def part(name: str, **launch: Any) -> Launch:
-    return Launch(name.lower(), f"runtime_parts.{name}", **launch)
+    return Launch(name.lower(), f"process_parts.{name}", **launch)
 
 
 def test_a_component_ends_cleanly_when_its_parent_lets_go(host: Host) -> None:
@@ -83,10 +83,10 @@ def test_garbage_is_looked_for_in_what_a_component_makes_and_not_in_what_was_loa
 @pytest.mark.parametrize(
     ("launch", "said"),
     [
-        (Launch("x", "runtime_parts.Dairy"), "did you mean 'Diary'"),
+        (Launch("x", "process_parts.Dairy"), "did you mean 'Diary'"),
         (Launch("x", "no_such_module.Diary"), "can't be imported"),
         (Launch("x", "Diary"), "names no class"),
-        (Launch("x", "runtime_parts.Path"), "can't be run"),
+        (Launch("x", "process_parts.Path"), "can't be run"),
         (part("NeedsThreshold"), "it takes threshold"),
         (part("NeedsThreshold", settings={"treshold": 1}), "it takes threshold"),
         (part("Diary", messages=("no_such_messages",)), "can't be imported"),

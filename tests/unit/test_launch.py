@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from afspm.errors import ConfigError
 from afspm.exit_codes import ExitCode
 from afspm.launch import Launch, Sockets
-from afspm.logic.supervision import ChildPolicy
+from afspm.logic.supervision.child import ChildPolicy
 
 FULL = Launch(
     name="tip classifier",

@@ -65,7 +65,7 @@ class Experiment:
 
     def component_launch(self, name: str, class_: str = "", **settings: Any) -> Launch:
         sockets = Sockets(subscribe=(self.scheduler_pub,), control=self.router)
-        return Launch(name, class_ and f"runtime_parts.{class_}", settings, sockets, **self._common)
+        return Launch(name, class_ and f"process_parts.{class_}", settings, sockets, **self._common)
 
     def start(self, name: str, class_: str, **settings: Any) -> Any:
         return self._host(self.component_launch(name, class_, **settings))

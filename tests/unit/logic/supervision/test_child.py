@@ -8,9 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.logic.liveness import Liveness, LivenessPolicy, ProcessHealth
-from afspm.logic.restart import RestartBudget, RestartPolicy
-from afspm.logic.supervision import ChildLog, ChildPhase, ChildPolicy, ChildWatch, GiveUpChild, KillChild, StartChild
+from afspm.logic.supervision.child import (
+    ChildLog,
+    ChildPhase,
+    ChildPolicy,
+    ChildWatch,
+    GiveUpChild,
+    KillChild,
+    StartChild,
+)
+from afspm.logic.supervision.liveness import Liveness, LivenessPolicy, ProcessHealth
+from afspm.logic.supervision.restart import RestartBudget, RestartPolicy
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from runtime_lab import REGION, Lab
+from client_lab import REGION, Lab
 
 from afspm import model
 from afspm.client.scope import Scope

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from runtime_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
+from client_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
 
 from afspm import model, wire
 from afspm.client.component import Component
 from afspm.errors import ConfigError, ExperimentEnded, Refused
 from afspm.exit_codes import ExitCode
 from afspm.launch import Launch
-from afspm.model import HAS_ENDED, ControlResponse, Problem, Response, Scan, ScopeState, ScopeStatus
+from afspm.model import ControlResponse, Problem, Response, ResponseDetail, Scan, ScopeState, ScopeStatus
 from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
 from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
 
@@ -240,7 +240,7 @@ def test_who_asks_for_control_before_it_has_heard_of_the_end_has_ended_too() -> 
                 raise AssertionError("there is nothing to control any more")
 
     lab = Lab()
-    lab.intercept = lambda request: Response(ControlResponse.FAILURE, reason=HAS_ENDED)
+    lab.intercept = lambda request: Response(ControlResponse.FAILURE, detail=ResponseDetail.EXPERIMENT_ENDED)
     assert run(Script(), lab) == ExitCode.ENDED
 
 

@@ -6,17 +6,15 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
-from afspm.process.parent import TIP_WITHIN_S
-
 OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and may finish a file
 AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
 FAREWELL_S = 60.0  # but not for ever
 KILL_AFTER_S = 1.5  # after being asked, or after having finished what may be finished then
-TIP_S = TIP_WITHIN_S + 1.0  # after being asked: who sees to the tip ends by itself before
+TIP_S = 15.0  # after being asked: a process that retracts the tip ends by itself before
 LEAVE_AFTER_S = 3.0  # after being killed
 
 
-class Why(Enum):
+class EndReason(Enum):
     """What ended a run."""
 
     EXPERIMENT_ENDED = auto()
@@ -28,10 +26,10 @@ class Why(Enum):
     @property
     def exit_code(self) -> int:
         """Of `afspm run`."""
-        return {Why.EXPERIMENT_ENDED: 0, Why.ALL_DONE: 0, Why.STOPPED: 130, Why.LOST: 1}[self]
+        return {EndReason.EXPERIMENT_ENDED: 0, EndReason.ALL_DONE: 0, EndReason.STOPPED: 130, EndReason.LOST: 1}[self]
 
 
-class Do(Enum):
+class EndStep(Enum):
     """What is to be done with those that still run."""
 
     ASK = auto()
@@ -42,7 +40,7 @@ class Do(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Ending:
+class RunEnd:
     """A run that is ending: those that still run are asked to end, then killed, then left.
 
     Attributes:
@@ -53,44 +51,44 @@ class Ending:
         busy_s: when somebody was last seen to be busy after being asked.
     """
 
-    why: Why
+    why: EndReason
     text: str
     ask_s: float
     kill_s: float
     latest_s: float
-    last: Do | None = None
+    last: EndStep | None = None
     in_haste: bool = False
     busy_s: float = -math.inf
 
     @classmethod
-    def begin(cls, why: Why, text: str, now_s: float) -> Ending:
+    def begin(cls, why: EndReason, text: str, now_s: float) -> RunEnd:
         """Begin to end. Where the experiment itself ended, all know and close by themselves: not disturbed at first."""
-        if why is not Why.EXPERIMENT_ENDED:
+        if why is not EndReason.EXPERIMENT_ENDED:
             return cls(why, text, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s)
         ask_s = now_s + OWN_PACE_S
         return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S)
 
-    def hurried(self, now_s: float) -> Ending:
+    def hurried(self, now_s: float) -> RunEnd:
         """Somebody wants it to be over: those not asked yet are, those that were are killed."""
-        if self.last in (Do.KILL, Do.LEAVE):
+        if self.last in (EndStep.KILL, EndStep.LEAVE):
             return self
-        if self.last is None and self.why is not Why.STOPPED:
+        if self.last is None and self.why is not EndReason.STOPPED:
             return replace(self, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s)
-        return replace(self, kill_s=now_s, last=Do.ASK, in_haste=True)
+        return replace(self, kill_s=now_s, last=EndStep.ASK, in_haste=True)
 
     def deadline_s(self) -> float | None:
         """When `step` has something to do next; None: never again."""
         match self.last:
             case None:
                 return self.ask_s
-            case Do.ASK:
+            case EndStep.ASK:
                 return self.kill_s
-            case Do.KILL:
+            case EndStep.KILL:
                 return self.kill_s + LEAVE_AFTER_S
-            case Do.LEAVE:
+            case EndStep.LEAVE:
                 return None
 
-    def step(self, now_s: float, *, busy: bool = False) -> tuple[Ending, Do | None]:
+    def step(self, now_s: float, *, busy: bool = False) -> tuple[RunEnd, EndStep | None]:
         """What the time has come for, if anything, and the ending after it.
 
         Args:
@@ -98,15 +96,15 @@ class Ending:
                 of the night, say), and then a translator, which does not leave before the tip is safe.
         """
         deadline_s = self.deadline_s()
-        seen = replace(self, busy_s=now_s) if busy and self.last is Do.ASK else self
+        seen = replace(self, busy_s=now_s) if busy and self.last is EndStep.ASK else self
         if deadline_s is None or now_s < deadline_s:
             return seen, None
         if self.last is None and busy and now_s < self.latest_s:
             ask_s = min(now_s + AGAIN_S, self.latest_s)
             return replace(self, ask_s=ask_s, kill_s=ask_s + KILL_AFTER_S), None
-        if self.last is Do.ASK and not self.in_haste:
+        if self.last is EndStep.ASK and not self.in_haste:
             kill_s = min(now_s + AGAIN_S, self.ask_s + TIP_S) if busy else self.busy_s + KILL_AFTER_S
             if now_s < kill_s:
                 return replace(seen, kill_s=kill_s), None
-        do = {None: Do.ASK, Do.ASK: Do.KILL, Do.KILL: Do.LEAVE}[self.last]
+        do = {None: EndStep.ASK, EndStep.ASK: EndStep.KILL, EndStep.KILL: EndStep.LEAVE}[self.last]
         return replace(self, last=do), do
