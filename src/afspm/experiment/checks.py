@@ -12,10 +12,9 @@ from afspm.experiment import notifying, wiring
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.handlers import check_handlers
 from afspm.experiment.known import WIRE_SETTINGS
-from afspm.experiment.parts import Role
 from afspm.experiment.published import wire_of
 from afspm.experiment.resolution import ResolvedExperiment
-from afspm.model import component_of, is_process_name
+from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
 

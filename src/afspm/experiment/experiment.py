@@ -14,8 +14,8 @@ from afspm.experiment import document as documents
 from afspm.experiment import parts as sorting
 from afspm.experiment import recording
 from afspm.experiment.findings import Finding, Findings
-from afspm.experiment.parts import Role
 from afspm.launch import Launch
+from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.svg import Svg, text_width
+from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment

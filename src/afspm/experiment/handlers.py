@@ -10,8 +10,9 @@ from afspm import wire
 from afspm.client.component import Component
 from afspm.client.dispatch import HANDLERS, snake_case
 from afspm.experiment.findings import closest
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.resolution import ResolvedExperiment
+from afspm.model import Role
 
 _NEARLY = 0.8
 _CALLED = ("run", *(name for name in vars(Component) if name.startswith("on_")))

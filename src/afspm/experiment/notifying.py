@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from afspm.components.notifications import END, OCCASIONS, Targets, address
 from afspm.errors import ConfigError
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
+from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment

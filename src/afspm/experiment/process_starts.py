@@ -13,12 +13,12 @@ from afspm.experiment import limits_section, wiring
 from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import nearest
 from afspm.experiment.known import DASHBOARD, DASHBOARD_PASSWORD
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.toml_writer import SECRET
 from afspm.launch import Launch, Sockets
 from afspm.logic.microscope_status import FEEDBACK_OFF
 from afspm.logic.watchdog import WatchdogSettings
-from afspm.model import Frame
+from afspm.model import Frame, Role
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment

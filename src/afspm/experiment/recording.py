@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
+from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.resolution import ResolvedExperiment

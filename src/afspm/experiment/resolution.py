@@ -26,10 +26,10 @@ from afspm.experiment.capabilities import MicroscopeCapabilities
 from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.document import Document
 from afspm.experiment.findings import Findings, nearest
-from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts, Role
+from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
 from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
 from afspm.logic.limits import ExperimentLimits
-from afspm.model import ProblemNames
+from afspm.model import ProblemNames, Role
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")

@@ -15,8 +15,9 @@ from afspm.addresses import hint_on, is_address
 from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.findings import Findings, SourceLocation
 from afspm.experiment.known import WIRE_KEYS, WiringClass
-from afspm.experiment.parts import ExperimentPart, Role
+from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.published import wire_of
+from afspm.model import Role
 
 
 @dataclass(frozen=True)

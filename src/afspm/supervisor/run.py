@@ -20,13 +20,14 @@ from afspm.record import ahead
 from afspm.record.run_json import ENDED, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
-from afspm.supervisor import key_handout, post_run, reporting, run_folder, run_identity
+from afspm.supervisor import key_handout, post_run, run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
 from afspm.supervisor.post_run import EndedRun
+from afspm.supervisor.process import from_start
+from afspm.supervisor.reporter import reporter_of
 from afspm.supervisor.run_identity import RunIdentity
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
-from afspm.supervisor.task import from_start
 
 TAKES_WHO_COMES = ""
 """The identity of a run of a real microscope's translator alone, which obeys the scheduler that comes."""
@@ -114,7 +115,7 @@ def go(
             ahead.expect_record(folder / STATE_DIR)
         log.write(LOGGED_AS, logging.INFO, f"{name}: {len(starts)} processes, into {folder}")
         handed = key_handout.hand_over(experiment, starts)
-        reporter = reporting.reporter(experiment, starts, clock, common.run, handed.supervisor)
+        reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
         supervisor = Supervisor(tasks, log, clock, experiment.policy(), reporter)
         with handed.laid_down(folder):
