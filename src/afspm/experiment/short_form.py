@@ -107,10 +107,10 @@ def _shown(path: tuple[str, ...]) -> str:
 def _table(part: ExperimentPart, resolved: ResolvedExperiment) -> dict[str, Any]:
     what: dict[str, Any] = {"class": part.class_path} if part.class_path else {"command": list(part.command)}
     own = {key: value for key, value in part.own.items() if key not in {"class", "command", *WIRE_KEYS}}
-    wires = resolved.wires[part.name]
+    wires = resolved.processes[part.name].wires
     if wires.envelopes is not None and "envelopes" not in own:
         own["envelopes"] = wires.envelopes
-    return {"component": True, **what, **own, **_remote(wires, resolved.roles[part.name]), **part.settings}
+    return {"component": True, **what, **own, **_remote(wires, resolved.processes[part.name].role), **part.settings}
 
 
 def _remote(wires: WiringKeys, role: Role) -> dict[str, Any]:
@@ -134,13 +134,14 @@ def _is_remote(address: str) -> bool:
 
 def _sections(resolved: ResolvedExperiment) -> dict[str, dict[str, Any]]:
     sections = {name: dict(table) for name, table in resolved.parts.sections.items()}
-    timeouts = [wires.request_timeout_s for wires in resolved.wires.values() if wires.request_timeout_s]
-    retries = [wires.request_retries for wires in resolved.wires.values() if wires.request_retries is not None]
+    wirings = [process.wires for process in resolved.processes.values()]
+    timeouts = [wires.request_timeout_s for wires in wirings if wires.request_timeout_s]
+    retries = [wires.request_retries for wires in wirings if wires.request_retries is not None]
     given = {"request_timeout": f"{max(timeouts):g} s"} if timeouts else {}
     asked = {"request_retries": max(retries)} if retries else {}
     if control := {**given, **asked, **sections.get("control", {})}:
         sections["control"] = control
-    if any(wires.cache_logic for wires in resolved.wires.values()):
+    if any(wires.cache_logic for wires in wirings):
         sections["cache"] = {**_cache(resolved), **sections.get("cache", {})}
     return sections
 

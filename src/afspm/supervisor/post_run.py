@@ -17,7 +17,7 @@ from afspm.clock import Clock
 from afspm.components import notifications
 from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
 from afspm.errors import ConfigError, FileError
-from afspm.experiment import Role, notifying
+from afspm.experiment import Role, implied_parts
 from afspm.formatting import duration_text
 from afspm.logic.supervision.run_end import EndReason
 from afspm.logic.supervisor_registry import LOGGED_AS
@@ -63,9 +63,9 @@ def follow(
 
     Of the end of an experiment on several computers that one tells where its scheduler ran.
     """
-    notify = experiment.resolved.notify
+    notify = experiment.resolved.sections.notify
     if any(start.role is Role.SCHEDULER for start in starts):
-        tell(ended, notifying.targets(notify, experiment.folder), notify.on, clock, log)
+        tell(ended, implied_parts.targets(notify, experiment.folder), notify.on, clock, log)
     for line in summary(ended.outcome, ended.folder):
         log.write(LOGGED_AS, logging.INFO, line)
     if with_report:

@@ -102,7 +102,7 @@ def go(
     Args:
         name: of the experiment; names: of its processes.
     """
-    if experiment.resolved.clock.waits:
+    if experiment.resolved.sections.clock.waits:
         common = replace(common, clock=common.clock.waiting_in(folder / STATE_DIR / CLOCK_FILE))
     clock = common.clock
     log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
@@ -258,7 +258,7 @@ def _common(
 
 
 def _require_real_time(clock: ExperimentClock, experiment: Experiment) -> None:
-    if clock.speed != 1.0 or experiment.resolved.clock.start is not None:
+    if clock.speed != 1.0 or experiment.resolved.sections.clock.start is not None:
         raise ConfigError(
             "the experiment has a simulation's time, and nothing here proves that its microscope is simulated",
             where="[clock]",
