@@ -15,8 +15,8 @@ from google.protobuf.message import DecodeError, Message
 from afspm.errors import Refused
 from afspm.model import ControlRequest, ControlResponse, names
 from afspm.translator.parameters import FEEDBACK_ON, ParameterSpec, ParameterTable, Value
-from afspm.wire.convert import shortest
-from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
+from afspm.wire import messages
+from afspm.wire.mapping import shortest
 
 _ANY: Final = (-math.inf, math.inf)
 
@@ -30,7 +30,7 @@ class AskedValue:
     unit: str | None
 
 
-def _scan_parameters(message: scan_pb2.ScanParameters2d) -> Iterator[AskedValue]:
+def _scan_parameters(message: messages.ScanParameters2d) -> Iterator[AskedValue]:
     spatial, roi, shape = message.spatial, message.spatial.roi, message.data.shape
     length, angle = spatial.length_units or None, spatial.angular_units or None
     for name, part, axis, unit in (
@@ -46,7 +46,7 @@ def _scan_parameters(message: scan_pb2.ScanParameters2d) -> Iterator[AskedValue]
             yield AskedValue(name, getattr(part, axis), unit)
 
 
-def _feedback(message: feedback_pb2.ZCtrlParameters) -> Iterator[AskedValue]:
+def _feedback(message: messages.ZCtrlParameters) -> Iterator[AskedValue]:
     for name, field in (
         (FEEDBACK_ON, "feedbackOn"),
         (names.ZCTRL_PGAIN, "proportionalGain"),
@@ -58,22 +58,22 @@ def _feedback(message: feedback_pb2.ZCtrlParameters) -> Iterator[AskedValue]:
             yield AskedValue(name, value if isinstance(value, bool) else shortest(value), None)
 
 
-def _probe_position(message: spectroscopy_pb2.ProbePosition) -> Iterator[AskedValue]:
+def _probe_position(message: messages.ProbePosition) -> Iterator[AskedValue]:
     for name, axis in ((names.PROBE_POS_X, "x"), (names.PROBE_POS_Y, "y")):
         if message.point.HasField(axis):
             yield AskedValue(name, getattr(message.point, axis), message.units or None)
 
 
-def _parameter(message: control_pb2.ParameterMsg) -> Iterator[AskedValue]:
+def _parameter(message: messages.ParameterMsg) -> Iterator[AskedValue]:
     if message.HasField("value"):
         yield AskedValue(message.parameter, message.value, message.units or None)
 
 
 _READERS = {
-    ControlRequest.SET_SCAN_PARAMS: (scan_pb2.ScanParameters2d, _scan_parameters),
-    ControlRequest.SET_ZCTRL_PARAMS: (feedback_pb2.ZCtrlParameters, _feedback),
-    ControlRequest.SET_PROBE_POS: (spectroscopy_pb2.ProbePosition, _probe_position),
-    ControlRequest.PARAM: (control_pb2.ParameterMsg, _parameter),
+    ControlRequest.SET_SCAN_PARAMS: (messages.ScanParameters2d, _scan_parameters),
+    ControlRequest.SET_ZCTRL_PARAMS: (messages.ZCtrlParameters, _feedback),
+    ControlRequest.SET_PROBE_POS: (messages.ProbePosition, _probe_position),
+    ControlRequest.PARAM: (messages.ParameterMsg, _parameter),
 }
 
 

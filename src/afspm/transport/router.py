@@ -13,7 +13,7 @@ from afspm.transport.keys import MARK
 from afspm.transport.network import ACCEPTED, DISCONNECTED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.tcp_guard import TcpGuard
-from afspm.wire.version import ANSWER, QUESTION
+from afspm.wire.protocol import ANSWER, QUESTION
 
 MOST_A_TURN = 20
 """Messages taken before everything else is looked at again. The socket takes one of each client in turn."""

@@ -10,7 +10,7 @@ from afspm.testing.translators.frames import NEAR, in_words
 from afspm.testing.translators.registry import check
 from afspm.testing.translators.taking import Taking, number
 from afspm.testing.translators.verdicts import Failed, expect
-from afspm.wire.generated import spectroscopy_pb2
+from afspm.wire import messages
 
 _NEEDS = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
@@ -39,7 +39,7 @@ def one_axis(kit: Taking) -> None:
     kit.move_probe(kit.frames.other.region.center_m)
     x_m, y_m = kit.frames.other.region.center_m
     y_m += 0.1 * min(kit.frames.whole.size_m)
-    message = spectroscopy_pb2.ProbePosition(units="nm")
+    message = messages.ProbePosition(units="nm")
     message.point.y = y_m * 1e9
     mark = kit.bench.story.mark()
     kit.bench.asked(ControlRequest.SET_PROBE_POS, message, "moving the probe in y, given in nm")
