@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 import weakref
 from pathlib import Path
 from typing import Any
@@ -49,15 +48,7 @@ def connect(where: str | Path = "runs", name: str = "notebook") -> Scope:
     register_all(launch.messages)
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
-    link = ExperimentLink(
-        port,
-        name,
-        source=launch.sockets.subscribe[0],
-        session=new_session(launch.run),
-        request_timeout_s=launch.request_timeout_s,
-        request_retries=launch.request_retries,
-        log=logging.getLogger(f"afspm.{name}"),
-    )
+    link = ExperimentLink.of_launch(launch, port, new_session(launch.run))
     try:
         if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
             hint = cut_off_message(folder) or "is the experiment still running?"

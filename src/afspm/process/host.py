@@ -28,8 +28,7 @@ from afspm.process.context import (
 )
 from afspm.process.loading import load
 from afspm.process.message_types import register_all
-from afspm.process.parent import ParentWatch, end_within, read_launch_line
-from afspm.process.stopping import StopRequested
+from afspm.process.parent import ParentWatch, StopRequested, end_within, read_launch_line
 from afspm.transport.heartbeat import HeartbeatSender
 from afspm.transport.port import ParentGone, Port
 from afspm.transport.zmq_port import open_port
