@@ -11,7 +11,8 @@ from afspm import wire
 from afspm.client.link import ExperimentLink
 from afspm.client.parameter_values import from_parameter, to_parameter
 from afspm.dashboard.watch import Watch
-from afspm.dashboard.words import position, quantity
+from afspm.dashboard.words import position
+from afspm.formatting import quantity
 from afspm.model import (
     RESTART_REQUEST,
     ControlMode,
@@ -34,15 +35,15 @@ SETTLED_S = 2.0  # what was set is published by then, if it changed anything
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What came of an act; `text` says it to the person, with the reason where it was refused."""
+class ActionResult:
+    """What came of an action; `text` says it to the person, with the reason where it was refused."""
 
     text: str
     ok: bool = True
 
 
-class Acts:
-    """Acts in the name of one person, for one thread. None raises for a refusal; it is in the outcome."""
+class Actions:
+    """Actions in the name of one person, for one thread. None raises for a refusal; it is in the result."""
 
     def __init__(self, link: ExperimentLink, watch: Watch) -> None:
         self._link = link
@@ -50,83 +51,84 @@ class Acts:
 
     # --- the experiment ---
 
-    def set_mode(self, mode: ControlMode) -> Outcome:
-        """MANUAL or AUTOMATED."""
-        return self._told(self._ask(ControlRequest.SET_CONTROL_MODE, int(mode)), f"The mode is {mode.name}")
+    def set_mode(self, mode: ControlMode) -> ActionResult:
+        """Set MANUAL or AUTOMATED."""
+        return _result(self._ask(ControlRequest.SET_CONTROL_MODE, int(mode)), f"The mode is {mode.name}")
 
-    def end(self) -> Outcome:
+    def end(self) -> ActionResult:
         """End the experiment for everybody."""
-        return self._told(self._ask(ControlRequest.END_EXPERIMENT), "The experiment ends")
+        return _result(self._ask(ControlRequest.END_EXPERIMENT), "The experiment ends")
 
-    def flag(self, problem: int) -> Outcome:
+    def flag(self, problem: int) -> ActionResult:
         """Raise a problem."""
         response = self._ask(ControlRequest.ADD_EXP_PRBLM, problem)
-        return self._told(response, f"{self._watch.problems.name(problem)} is flagged")
+        return _result(response, f"{self._watch.problems.name(problem)} is flagged")
 
-    def clear(self, problem: int) -> Outcome:
+    def clear(self, problem: int) -> ActionResult:
         """Remove the flag of a problem."""
         response = self._ask(ControlRequest.RMV_EXP_PRBLM, problem)
-        return self._told(response, f"{self._watch.problems.name(problem)} is cleared")
+        return _result(response, f"{self._watch.problems.name(problem)} is cleared")
 
-    def clear_all(self, problems: Sequence[int]) -> Outcome:
+    def clear_all(self, problems: Sequence[int]) -> ActionResult:
         """Remove the flags of these problems; the first refusal ends it."""
         for problem in problems:
-            if not (outcome := self.clear(problem)).ok:
-                return outcome
-        return Outcome(f"{len(problems)} problems are cleared")
+            if not (result := self.clear(problem)).ok:
+                return result
+        return ActionResult(f"{len(problems)} problems are cleared")
 
-    def restart(self, process: str) -> Outcome:
+    def restart(self, process: str) -> ActionResult:
         """Have a process ended and started anew."""
-        return self._told(self._ask(RESTART_REQUEST, process), f"{process} will be started anew")
+        return _result(self._ask(RESTART_REQUEST, process), f"{process} will be started anew")
 
     # --- the microscope, in MANUAL ---
 
-    def stop_scan(self, *, by_manual: bool = False) -> Outcome:
+    def stop_scan(self, *, by_manual: bool = False) -> ActionResult:
         """Stop the scan or spectrum that runs.
 
         Args:
             by_manual: switch to MANUAL before, which alone lets a person command the microscope.
         """
         if by_manual:
-            outcome = self.set_mode(ControlMode.MANUAL)
-            if not outcome.ok:
-                return outcome
-        is_spectrum = self._state() is ScopeState.SPEC
+            result = self.set_mode(ControlMode.MANUAL)
+            if not result.ok:
+                return result
+        with self._watch.reading() as overview:
+            is_spectrum = overview.status is not None and overview.status.state is ScopeState.SPEC
         response = self._ask(ControlRequest.ACTION, names.STOP_SPEC if is_spectrum else names.STOP_SCAN)
-        return self._told(response, "The spectrum is stopped" if is_spectrum else "The scan is stopped")
+        return _result(response, "The spectrum is stopped" if is_spectrum else "The scan is stopped")
 
-    def read(self, parameter: str) -> Outcome:
-        """The value of a parameter that is in force, with its unit, as the text of the outcome."""
+    def read(self, parameter: str) -> ActionResult:
+        """Return the value of a parameter that is in force, with its unit, as the text of the result."""
         response = self._ask(ControlRequest.PARAM, Parameter(parameter))
-        return self._told(response, "") if not response.ok else Outcome(_in_force(parameter, response))
+        return _result(response, "") if not response.ok else ActionResult(_in_force(parameter, response))
 
-    def set(self, parameter: str, text: str) -> Outcome:
+    def set(self, parameter: str, text: str) -> ActionResult:
         """Set a parameter to a quantity as a person writes it: "0.5 V", "2 um/s", "12"; without a unit it is SI."""
         response = self._ask(ControlRequest.PARAM, to_parameter(parameter, _number_or(text.strip()), None))
         if not response.ok or not response.payload:
-            return self._told(response, f"{parameter} is set to {text}")
-        return Outcome(f"{parameter} is now {_in_force(parameter, response)}")
+            return _result(response, f"{parameter} is set to {text}")
+        return ActionResult(f"{parameter} is now {_in_force(parameter, response)}")
 
-    def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> Outcome:
+    def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
         """Begin a scan; `region` and `shape` None: as they are set. It is done when the scan has begun."""
         if region is not None or shape is not None:
             wanted = ScanParameters(region, shape)
             response = self._ask(ControlRequest.SET_SCAN_PARAMS, wanted)
             if not response.ok:
-                return self._told(response, "")
+                return _result(response, "")
             self._settle(lambda o: o.scan_parameters is not None and _fits(o.scan_parameters, wanted))
         where = "" if region is None else f" at {position(region.center_m)}"
-        return self._told(self._when_free(names.START_SCAN), f"The scan{where} begins")
+        return _result(self._when_free(names.START_SCAN), f"The scan{where} begins")
 
-    def spectrum(self, at_m: XY | None = None) -> Outcome:
+    def spectrum(self, at_m: XY | None = None) -> ActionResult:
         """Begin a spectrum at (x, y); None: where the probe stands. It is done when it has begun."""
         if at_m is not None:
             response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
             if not response.ok:
-                return self._told(response, "")
+                return _result(response, "")
             self._settle(lambda o: o.probe_position is not None and _near(o.probe_position.xy_m, at_m))
         where = "" if at_m is None else f" at {position(at_m)}"
-        return self._told(self._when_free(names.START_SPEC), f"The spectrum{where} begins")
+        return _result(self._when_free(names.START_SPEC), f"The spectrum{where} begins")
 
     # --- within ---
 
@@ -150,22 +152,19 @@ class Acts:
         """Wait until what was set is published; it is not where nothing changed."""
         self._watch.wait_for(done, SETTLED_S)
 
-    def _state(self) -> ScopeState | None:
-        with self._watch.reading() as overview:
-            return overview.status.state if overview.status else None
 
-    def _told(self, response: Response, done: str) -> Outcome:
-        return Outcome(f"{done}.") if response.ok else Outcome(refusal(response), ok=False)
+def _result(response: Response, done: str) -> ActionResult:
+    return ActionResult(f"{done}.") if response.ok else ActionResult(refusal(response), ok=False)
 
 
 def refusal(response: Response) -> str:
-    """Why something was not done, for a person."""
+    """Return why something was not done, for a person."""
     code = ControlResponse(response.code).name if response.code in ControlResponse._value2member_map_ else response.code
     return f"Refused: {response.reason or 'no reason was given'} ({code})"
 
 
 def _in_force(parameter: str, response: Response) -> str:
-    """A value in SI where it has a unit, with the prefix that reads well."""
+    """Return a value in SI where it has a unit, with the prefix that reads well."""
     if not response.payload:
         return "not told"
     said = wire.decode_parameter(response.payload)
@@ -173,9 +172,7 @@ def _in_force(parameter: str, response: Response) -> str:
     unit = names.BASE_PARAMETERS.get(parameter) or said.unit or ""
     if isinstance(value, bool) or not isinstance(value, float | int):
         return str(value)
-    if unit == "rad":
-        return f"{math.degrees(value):.6g} deg"
-    return quantity(value, unit, 6)
+    return f"{math.degrees(value):.6g} deg" if unit == "rad" else quantity(value, unit, 6)
 
 
 def _number_or(text: str) -> float | str:
@@ -188,10 +185,8 @@ def _number_or(text: str) -> float | str:
 def _fits(now: ScanParameters, wanted: ScanParameters) -> bool:
     if wanted.shape is not None and now.shape != wanted.shape:
         return False
-    if wanted.region is None:
-        return True
     a, b = now.region, wanted.region
-    return isinstance(a, Region) and isinstance(b, Region) and _near(a.center_m, b.center_m)
+    return b is None or (isinstance(a, Region) and isinstance(b, Region) and _near(a.center_m, b.center_m))
 
 
 def _near(a: XY, b: XY) -> bool:

@@ -1,4 +1,4 @@
-"""Scans made level, as they are looked at: what is published stays as it is."""
+"""Level scans for looking at them; what is published stays as it is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class Levelling(Enum):
-    """What is taken off before a scan is shown."""
+    """The background that is subtracted before a scan is shown."""
 
     NONE = "none"
     PLANE = "plane"
@@ -21,7 +21,7 @@ class Levelling(Enum):
 
 
 def levelled(values: Array, how: Levelling) -> Array:
-    """Values [y, x] less what `how` says, of the same shape; what is not finite stays, and counts for nothing."""
+    """Return values [y, x] without their background; what is not finite stays, and counts for nothing."""
     if how is Levelling.NONE or not values.size:
         return values
     finite = np.isfinite(values)
