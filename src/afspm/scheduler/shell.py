@@ -28,7 +28,7 @@ from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
 from afspm.transport.translator_link import LinkReply, LinkUp
-from afspm.wire.frames import LONGEST_ID
+from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
