@@ -1,4 +1,4 @@
-"""Who is in control: the whole transition table as data, and the one function that applies it.
+"""The arbitration table: who may control the microscope, as data, and the one function that applies it.
 
 `TABLE` is read from the top: the first row of an event whose condition holds applies, and each event's last row always
 does. Nothing but a row changes who is in control, the mode or the flagged problems.
@@ -17,7 +17,7 @@ _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
 
 class ArbitrationEvent(Enum):
-    """What control depends on: the requests, by kind, and two that time brings."""
+    """An event on which control depends: the requests, by kind, and two that time brings."""
 
     REQUEST_CONTROL = "asks for control"
     RELEASE_CONTROL = "gives control back"
@@ -32,7 +32,7 @@ class ArbitrationEvent(Enum):
 
 
 class ControlChange(Enum):
-    """What a row does."""
+    """A change that a row makes."""
 
     GRANT = auto()
     """The asker gets control, to solve the problem it named (or none)."""
@@ -82,13 +82,13 @@ class ArbitrationState:
         )
 
     def published(self) -> ControlState:
-        """What all peers are told of it."""
+        """Return the state as all peers are told it."""
         return ControlState(self.mode, self.holder, tuple(sorted(self.problems)))
 
 
 @dataclass(frozen=True, slots=True)
 class RoleTable:
-    """Who may do what is not everybody's. None: everybody may; but nobody may `operate` unless named.
+    """The roles: who may do what not everybody may. None: everybody; but nobody may `operate` unless named.
 
     Who acts for a person ("dashboard:Ada") has the roles of the component and those given to just that person there.
 
@@ -109,7 +109,7 @@ class RoleTable:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What the table takes from the experiment file: roles, and the problems there are."""
+    """The part of the experiment file that the table needs: roles, and the known problems."""
 
     roles: RoleTable = RoleTable()
     problems: ProblemNames = field(default_factory=ProblemNames)
@@ -151,7 +151,7 @@ class Transition:
 
 
 def may(role: Collection[str] | None, who: str) -> bool:
-    """Whether `who` has a role."""
+    """Return whether `who` has a role."""
     return role is None or who in role or component_of(who) in role
 
 

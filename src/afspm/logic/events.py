@@ -1,4 +1,4 @@
-"""What happens to a scheduler, and what it does about it: the inputs and effects of `SchedulerCore`.
+"""The inputs and effects of `SchedulerCore`.
 
 Times are given beside the input: `now_s`, real and monotonic, for timeouts; `now_ns`, the experiment's, for whatever
 means something in the experiment.
@@ -59,7 +59,7 @@ class RequestIn:
 
 @dataclass(frozen=True, slots=True)
 class Unreadable:
-    """What came from the peer `name` was no request, and was refused with `response`."""
+    """A message from the peer `name` was no request, and was refused with `response`."""
 
     name: str
     response: Response

@@ -204,7 +204,7 @@ class LimitChecker:
                 self._check_value(name, value, limit, now_ns)
 
     def _set_by(self, request: Request) -> Collection[object]:
-        """What a request sets: its subject, or for an action what the microscope does as that."""
+        """Return what a request sets: its subject, or for an action what the microscope does as that."""
         if request.kind == ControlRequest.ACTION:
             return self.limits.sets.get(str(request.subject), ())
         return () if is_get(request) else (request.subject,)
@@ -252,7 +252,7 @@ class LimitChecker:
             )
 
     def _check_scan(self, wanted: ScanParameters, reach: float = _REACH) -> None:
-        """What is checked is the scan as it would be afterwards: a request may give only a part of it."""
+        """Check the scan as it would be afterwards: a request may give only a part of it."""
         shape, region = wanted.shape, wanted.region
         if isinstance(shape, ShapeChange):
             shape = shape.onto(self.state.position.shape or (1, 1))
@@ -324,7 +324,7 @@ def _inside(allowed: Region, xy_m: XY, reach: float) -> bool:
 
 
 def is_get(request: Request) -> bool:
-    """Whether a parameter is asked for, not set."""
+    """Return whether a parameter is asked for, not set."""
     return isinstance(request.subject, Parameter) and request.subject.value is None
 
 

@@ -165,7 +165,7 @@ class SchedulerCore:
 
     @property
     def control(self) -> ArbitrationState:
-        """Who is in control, for what, and who flagged which problem."""
+        """The state of control: its holder, for which problem, and who flagged which."""
         return self.state.control
 
     @property

@@ -121,7 +121,7 @@ class SchedulerState:
 
 @dataclass(frozen=True, slots=True)
 class Environment:
-    """What a step needs beside the state.
+    """Everything that a step needs beside the state.
 
     Attributes:
         cache: the packets published lately; the one part that is changed in place, since it holds up to all memory that

@@ -55,7 +55,7 @@ class Journal:
         self._thread: threading.Thread | None = None
 
     def load(self) -> list[Entry]:
-        """What was cached, oldest first. Damaged files are told of and deleted."""
+        """Return the cached packets, oldest first. Damaged files are logged and deleted."""
         if self._folder is None:
             return []
         entries: list[Entry] = []
