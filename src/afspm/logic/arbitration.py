@@ -7,10 +7,11 @@ does. Nothing but a row changes who is in control, the mode or the flagged probl
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from types import MappingProxyType
 
+from afspm.logic.frozen import replace
 from afspm.model import ControlMode, ControlResponse, ControlState, Problem, ProblemNames, component_of
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
@@ -58,7 +59,7 @@ class Cause(Enum):
     ENDED = "the experiment ends"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ArbitrationState:
     """The state that control is in.
 
@@ -86,7 +87,7 @@ class ArbitrationState:
         return ControlState(self.mode, self.holder, tuple(sorted(self.problems)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RoleTable:
     """The roles: who may do what not everybody may. None: everybody; but nobody may `operate` unless named.
 
@@ -107,7 +108,7 @@ class RoleTable:
     restart: Collection[str] | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Rules:
     """The part of the experiment file that the table needs: roles, and the known problems."""
 
@@ -115,7 +116,7 @@ class Rules:
     problems: ProblemNames = field(default_factory=ProblemNames)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ControlInput:
     """An event of `who`; `number` is the problem or mode that it is about."""
 
@@ -124,7 +125,7 @@ class ControlInput:
     number: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Condition:
     """Something that may hold of a state and an ask, with words for it."""
 
@@ -132,7 +133,7 @@ class Condition:
     holds: Callable[[ArbitrationState, ControlInput, Rules], bool]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Transition:
     """One line of the table.
 

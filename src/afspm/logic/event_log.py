@@ -6,11 +6,12 @@ is published.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 from afspm.logic.arbitration import ArbitrationState, ControlInput, Transition
 from afspm.logic.descriptions import asked
+from afspm.logic.frozen import replace
 from afspm.model import (
     CLOCK_REQUEST,
     RELAY_REQUEST,
@@ -40,7 +41,7 @@ SCHEDULER = "scheduler"
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class AnsweredRequest:
     """A request with its answer, not in words yet.
 
@@ -75,7 +76,7 @@ class AnsweredRequest:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class EventLog:
     """The entries that are still to be published.
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum, auto
 
+from afspm.logic.frozen import replace
 from afspm.model import ControlResponse, Request, Response
 
 _SENT_REMEMBERED = 100
@@ -25,7 +26,7 @@ SentAction = tuple[str, str, int]
 """An action that was sent: client, request id, fingerprint."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class IdempotencyCache:
     """The status or answer of the latest request ids of each client.
 

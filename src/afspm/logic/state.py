@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
+from operator import attrgetter
 
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.cache import PacketCache
@@ -12,6 +13,7 @@ from afspm.logic.coordinate_frame import CoordinateFrame
 from afspm.logic.event_log import EventLog
 from afspm.logic.events import Codec, Effect, Log, SaveState
 from afspm.logic.forwarder import Forwarder
+from afspm.logic.frozen import replace
 from afspm.logic.holder_timeout import HolderTimeout, Lease
 from afspm.logic.idempotency_cache import IdempotencyCache, SentAction
 from afspm.logic.lifecycle import ExperimentEnd, StartupBarrier
@@ -28,7 +30,7 @@ KIND, VERSION = "scheduler", 1
 """Of snapshots of `SavedState`."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SavedState:
     """The state that survives a restart.
 
@@ -57,7 +59,7 @@ class SavedState:
         return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SchedulerState:
     """All that a scheduler decides by, but for the packets in its cache.
 
@@ -119,7 +121,7 @@ class SchedulerState:
         return min((due_s for due_s in dues if due_s is not None), default=None)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Environment:
     """Everything that a step needs beside the state.
 
@@ -156,7 +158,7 @@ class StateParts:
     logged: frozenset[str]
 
 
-PARTS = tuple(StateParts.__slots__)
+_parts_of = attrgetter(*(one.name for one in fields(StateParts)))
 
 
 class StateDraft(StateParts):
@@ -168,8 +170,7 @@ class StateDraft(StateParts):
     """
 
     def __init__(self, state: SchedulerState, env: Environment, now_s: float, now_ns: int) -> None:
-        for part in PARTS:
-            setattr(self, part, getattr(state, part))
+        super().__init__(*_parts_of(state))
         self.env = env
         self.now_s = now_s
         self.now_ns = now_ns
@@ -192,7 +193,7 @@ class StateDraft(StateParts):
     def finish(self) -> tuple[SchedulerState, list[Effect]]:
         """Return the new state and the effects: first of all it is saved, and requests are sent last."""
         self.send_forwards()
-        state = SchedulerState(*(getattr(self, part) for part in PARTS))
+        state = SchedulerState(*_parts_of(self))
         if self._is_to_be_saved or state.saved_parts() != self._before:
             self.effects.insert(0, SaveState(saved_state(state, self.env)))
         return state, self.effects
