@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from operator import attrgetter
 
 from afspm.logic.arbitration import ArbitrationState
 from afspm.logic.cache import PacketCache
@@ -137,9 +136,8 @@ class Environment:
     frame: CoordinateFrame | None = None
 
 
-@dataclass(slots=True)
 class StateParts:
-    """The parts of a state, each to be replaced."""
+    """The parts of a state while a step replaces them, one after the other."""
 
     control: ArbitrationState
     lease: Lease
@@ -158,7 +156,7 @@ class StateParts:
     logged: frozenset[str]
 
 
-_parts_of = attrgetter(*(one.name for one in fields(StateParts)))
+_PARTS = tuple(one.name for one in fields(SchedulerState))
 
 
 class StateDraft(StateParts):
@@ -170,12 +168,12 @@ class StateDraft(StateParts):
     """
 
     def __init__(self, state: SchedulerState, env: Environment, now_s: float, now_ns: int) -> None:
-        super().__init__(*_parts_of(state))
+        self.__dict__.update(state.__dict__)
         self.env = env
         self.now_s = now_s
         self.now_ns = now_ns
         self.effects: list[Effect] = []
-        self._before = state.saved_parts()
+        self._before = state
         self._is_to_be_saved = False
 
     def save(self) -> None:
@@ -193,8 +191,9 @@ class StateDraft(StateParts):
     def finish(self) -> tuple[SchedulerState, list[Effect]]:
         """Return the new state and the effects: first of all it is saved, and requests are sent last."""
         self.send_forwards()
-        state = SchedulerState(*_parts_of(self))
-        if self._is_to_be_saved or state.saved_parts() != self._before:
+        parts = self.__dict__
+        state = replace(self._before, **{name: parts[name] for name in _PARTS})
+        if self._is_to_be_saved or state.saved_parts() != self._before.saved_parts():
             self.effects.insert(0, SaveState(saved_state(state, self.env)))
         return state, self.effects
 
