@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 from afspm.logic.arbitration import ArbitrationState, ControlInput, Transition
 from afspm.logic.descriptions import asked
@@ -41,8 +42,7 @@ SCHEDULER = "scheduler"
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
 
 
-@dataclass(frozen=True)
-class AnsweredRequest:
+class AnsweredRequest(NamedTuple):
     """A request with its answer, not in words yet.
 
     Attributes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from afspm.logic.coordinate_frame import MappedRequest
 from afspm.logic.events import Forward, RequestIn
@@ -23,8 +23,7 @@ OwnAnswer = Callable[["StateDraft", Response], None]
 """Called with the answer to a request of the scheduler's own."""
 
 
-@dataclass(frozen=True, eq=False)
-class ForwardedRequest:
+class ForwardedRequest(NamedTuple):
     """A request for the translator.
 
     Attributes:
@@ -84,8 +83,7 @@ class ForwardOutcome(Enum):
     """The true answer, after the client was told that none had come."""
 
 
-@dataclass(frozen=True)
-class SettledRequest:
+class SettledRequest(NamedTuple):
     job: ForwardedRequest
     end: ForwardOutcome
     response: Response
@@ -144,7 +142,7 @@ class Forwarder:
             return self._sent(job, now_s), None
         if len(self.queue) >= self.longest_queue:
             return self, _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
-        job = replace(job, number=self.number + 1, deadline_s=job.deadline_s or now_s + self.timeout_s)
+        job = job._replace(number=self.number + 1, deadline_s=job.deadline_s or now_s + self.timeout_s)
         queue = sorted((*self.queue, job), key=lambda waiting: waiting.deadline_s)
         return replace(self, number=job.number, queue=tuple(queue)), None
 
@@ -179,7 +177,7 @@ class Forwarder:
         """Answer those that have waited too long."""
         settled, flight = list[SettledRequest](), self.flight
         if flight is not None and not flight.answered and now_s >= flight.deadline_s:
-            flight = replace(flight, answered=True)
+            flight = flight._replace(answered=True)
             settled.append(_unknown(flight, f"the translator did not answer within {self.timeout_s:g} s"))
         late = [job for job in (*self.own, *self.queue) if now_s >= job.deadline_s]
         settled += [_not_sent(job, f"the translator was busy for {self.timeout_s:g} s") for job in late]
@@ -199,7 +197,7 @@ class Forwarder:
         job = self.flight
         if job is None or job.client != client or job.request.id != request_id:
             return None
-        return replace(self, flight=replace(job, answered=False, deadline_s=now_s + self.timeout_s))
+        return replace(self, flight=job._replace(answered=False, deadline_s=now_s + self.timeout_s))
 
     def called_back(self, which: Callable[[ForwardedRequest], bool]) -> tuple[Forwarder, list[ForwardedRequest]]:
         """Take back requests that wait and have not been sent; the caller answers them."""
@@ -216,7 +214,7 @@ class Forwarder:
     def _sent(self, job: ForwardedRequest, now_s: float) -> Forwarder:
         """Send a request; one that waited has its number and deadline already."""
         number, deadline_s = job.number or self.number + 1, job.deadline_s or now_s + self.timeout_s
-        flight = replace(job, number=number, deadline_s=deadline_s, sent_s=now_s)
+        flight = job._replace(number=number, deadline_s=deadline_s, sent_s=now_s)
         outbox = (*self.outbox, Forward(number, job.outgoing))
         return replace(self, number=max(number, self.number), flight=flight, outbox=outbox)
 

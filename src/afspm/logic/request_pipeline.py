@@ -54,7 +54,7 @@ _CONTROL_EVENTS = {
 def handle(draft: StateDraft, event: RequestIn) -> None:
     """Take a request through its stages, as far as it gets without waiting."""
     if event.heard_s < 0.0:
-        event = replace(event, heard_s=draft.now_s)
+        event.heard_s = draft.now_s
     if admit(draft, event) and authorise(draft, event):
         pass_on(draft, event)
 
