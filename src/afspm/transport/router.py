@@ -201,10 +201,6 @@ class Router:
                 "nothing of keys are let in by [security] plain = true"
             )
 
-    def close(self) -> None:
-        self.monitor.close()
-        self.socket.close()
-
 
 def _name(identity: bytes) -> str:
     """What a peer calls itself; the socket gives others an identity that begins with a zero byte."""
