@@ -233,7 +233,7 @@ class Monitor:
     def drain(self) -> list[ConnectionEvent]:
         """Return all events that have come."""
         events: list[ConnectionEvent] = []
-        while self.socket.poll(0):
+        while zmq.zmq_poll([(self.socket, zmq.POLLIN)], 0):
             kind, value = _EVENT.unpack(self.socket.recv_multipart(zmq.NOBLOCK)[0])
             events.append(ConnectionEvent(kind & 0xFFFF, value))
         return events

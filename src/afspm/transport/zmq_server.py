@@ -74,8 +74,9 @@ class ZmqServerPort(BasePort[Served]):
     def _request(self) -> list[Served]:
         """The next request, if the last one was answered."""
         while self._asker is None and (frames := receive_frames(self._socket)):
+            self._guard.heard(descriptor_of(frames[0]))
             if not is_readable(self._socket):
-                self._guard.settled([descriptor_of(frames[0])])
+                self._guard.settle()
             request = self._accepted(frames)
             if request is not None:
                 return [request]
