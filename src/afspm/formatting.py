@@ -121,3 +121,13 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
         return "–"
     factor, shown = scale(value, unit)
     return f"{value * factor:.{digits}g} {shown}".strip()
+
+
+def typeset_position(xy_m: tuple[float, float]) -> str:
+    """Return a position for a page: "(1.2, −0.5) µm"."""
+    return typeset(position_text(xy_m))
+
+
+def typeset_area(size_m: Sequence[float]) -> str:
+    """Return a size for a page: "2 × 1 µm"."""
+    return typeset(area_text(size_m))
