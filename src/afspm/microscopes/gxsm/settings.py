@@ -7,16 +7,17 @@ from the centre of the first pixel to that of the last, as everywhere in afspm.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
 
 from afspm import units
 from afspm.errors import AfspmError, Refused
 from afspm.microscopes.gxsm.errors import BadReply
+from afspm.microscopes.gxsm.hardware import Doing
 from afspm.microscopes.gxsm.link import Asking
 from afspm.model import ControlResponse, Region, names
-from afspm.translator.parameters import Value
-from afspm.translator.settings import FRAME, frame
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.settings import FRAME, POSITION, SettingsGroup, frame
 
 ANGSTROM_M: Final = 1e-10
 _UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03bcm": "um", "\u00b5m": "um"}
@@ -47,14 +48,12 @@ def user_unit_m(ask: Asking) -> float:
     return unit_m
 
 
-class Frame:
+class ScanFrame:
     """The frame of the next scan.
 
     Args:
         unit_m: what `user_unit_m` says.
     """
-
-    names = FRAME
 
     def __init__(self, ask: Asking, unit_m: float) -> None:
         self._ask = ask
@@ -118,6 +117,84 @@ class Frame:
 
     def _send(self, ref: str, value: float) -> None:
         send(self._ask, ref, value)
+
+
+class FrameSettings(SettingsGroup):
+    """The frame of the next scan, as settings.
+
+    Args:
+        is_led: True if the tip goes along with its frame, and GXSM does not tell that it moves.
+    """
+
+    names = FRAME
+
+    def __init__(self, scan_frame: ScanFrame, tip: TipPlace, *, is_led: bool) -> None:
+        self._frame = scan_frame
+        self._tip = tip
+        self._is_led = is_led
+
+    def read(self) -> dict[str, Value]:
+        return self._frame.read()
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        moves = self._is_led and not values.keys() <= PIXELS
+        before_m = self._frame.tip() if moves else None
+        self._frame.write(values)
+        if before_m is not None:
+            self._tip.on_move(math.dist(before_m, self._frame.tip()))
+
+
+class TipPlace(SettingsGroup):
+    """The place that the tip was sent to, which GXSM's files of spectra do not tell.
+
+    Args:
+        kept: JSON-able, and lasts.
+        on_move: called with the length of the way when the tip is sent away.
+    """
+
+    names = POSITION
+
+    def __init__(self, scan_frame: ScanFrame, kept: dict[str, Any], on_move: Callable[[float], None]) -> None:
+        self._frame = scan_frame
+        self._kept = kept
+        self.on_move = on_move
+
+    def xy_m(self) -> tuple[float, float]:
+        """Return where the tip was sent, (x, y) in m."""
+        sent = self._kept.get("probe")
+        return self._frame.tip() if sent is None else (float(sent[0]), float(sent[1]))
+
+    def read(self) -> dict[str, Value]:
+        return dict(zip(POSITION, self.xy_m(), strict=True))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        x, y = (float(values.get(name, was)) for name, was in zip(POSITION, self.xy_m(), strict=True))
+        way_m = math.dist(self._frame.tip(), (x, y))
+        self._frame.move_tip((x, y))
+        self._kept["probe"] = [x, y]
+        self.on_move(way_m)
+
+
+class FeedbackSwitch(SettingsGroup):
+    """The feedback, which only some hardware has actions to switch.
+
+    Args:
+        actions: that switch it on and off.
+    """
+
+    names = (FEEDBACK_ON,)
+
+    def __init__(self, ask: Asking, doing: Callable[[], Doing], actions: Sequence[str]) -> None:
+        self._ask = ask
+        self._doing = doing
+        self._actions = actions
+
+    def read(self) -> dict[str, Value]:
+        return {FEEDBACK_ON: self._doing().feedback_on}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        on, off = self._actions
+        self._ask.call("action", on if values[FEEDBACK_ON] else off)
 
 
 def number(ask: Asking, ref: str) -> float:
