@@ -22,6 +22,7 @@ class Document:
         homes: the folders that relative file names are meant from, and where modules are found; empty: those of the
             files. (An expanded file is in the folder of its run, and speaks of files beside the one it was made of.)
         is_whole: whether all files could be read.
+        findings: what is wrong or doubtful in them.
     """
 
     files: tuple[Path, ...]
@@ -29,6 +30,15 @@ class Document:
     places: dict[toml_lines.Path, SourceLocation] = field(default_factory=dict)
     homes: tuple[Path, ...] = ()
     is_whole: bool = True
+    findings: Findings = field(default_factory=Findings)
+
+    def error(self, what: str, *path: str | int, hint: str = "") -> None:
+        """Report an error at the line where `path` is set."""
+        self.findings.error(what, self.place(*path), hint)
+
+    def warning(self, what: str, *path: str | int, hint: str = "") -> None:
+        """Report a warning at the line where `path` is set."""
+        self.findings.warning(what, self.place(*path), hint)
 
     def place(self, *path: str | int) -> SourceLocation:
         """Where `path` was set: its own line, or that of the nearest thing around it."""
@@ -48,12 +58,12 @@ class Document:
         return list(self.homes or dict.fromkeys(file.resolve().parent for file in self.files))
 
 
-def read(files: Sequence[Path], findings: Findings, homes: Sequence[Path] = ()) -> Document:
+def read(files: Sequence[Path], homes: Sequence[Path] = ()) -> Document:
     """Read the files and lay each over those before it: tables merge, of anything else the later wins."""
     document = Document(tuple(files), homes=tuple(homes))
     for file in files:
-        text = _text(file, findings)
-        data = None if text is None else _parse(text, file, findings)
+        text = _text(file, document.findings)
+        data = None if text is None else _parse(text, file, document.findings)
         if text is None or data is None:
             document.is_whole = False
             continue

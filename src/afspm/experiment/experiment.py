@@ -12,7 +12,7 @@ from afspm.clock import ExperimentClock
 from afspm.errors import ConfigError
 from afspm.experiment import document as documents
 from afspm.experiment import parts as sorting
-from afspm.experiment.findings import Finding, Findings
+from afspm.experiment.findings import Finding
 from afspm.experiment.implied_parts import RECORDS
 from afspm.launch import Launch
 from afspm.model import Role
@@ -48,10 +48,9 @@ class ProcessStart:
 class Experiment:
     """What the files say. Made by `load`."""
 
-    def __init__(self, document: documents.Document, found: Findings) -> None:
+    def __init__(self, document: documents.Document) -> None:
         self._document = document
-        self._found = found
-        self.parts = sorting.sort(document, found)
+        self.parts = sorting.sort(document)
 
     @property
     def name(self) -> str:
@@ -96,7 +95,7 @@ class Experiment:
     def check(self) -> list[Finding]:
         """Everything that is wrong or doubtful; nothing is started. Errors first, then by line."""
         self.resolved  # noqa: B018  (finds what there is to find)
-        return self._found.ordered()
+        return self._document.findings.ordered()
 
     @cached_property
     def resolved(self) -> ResolvedExperiment:
@@ -104,7 +103,7 @@ class Experiment:
         from afspm.experiment import checks
         from afspm.experiment.resolution import resolve
 
-        resolved = resolve(self.parts, self._document, self._found)
+        resolved = resolve(self.parts, self._document)
         if self._document.is_whole:  # what is missing may be in a file that can't be read, which has been reported
             checks.check(resolved)
         return resolved
@@ -203,8 +202,7 @@ def load_expanded(path: Path, homes: Sequence[Path], *overlays: Path) -> Experim
     Args:
         homes: the folders of the files that it was made of (`Experiment.folders`).
     """
-    found = Findings()
-    return Experiment(documents.read([path, *overlays], found, homes), found)
+    return Experiment(documents.read([path, *overlays], homes))
 
 
 def load(path: str | Path, *overlays: str | Path) -> Experiment:
@@ -212,6 +210,4 @@ def load(path: str | Path, *overlays: str | Path) -> Experiment:
 
     Nothing is raised for what is wrong in the files: `Experiment.check` tells it all at once.
     """
-    found = Findings()
-    document = documents.read([Path(path), *map(Path, overlays)], found)
-    return Experiment(document, found)
+    return Experiment(documents.read([Path(path), *map(Path, overlays)]))

@@ -26,11 +26,11 @@ def check_handlers(resolved: ResolvedExperiment) -> None:
         for name, method in _methods(component):
             shown, path = f"[{process.name}] {component.__name__}.{name}", (process.name, "class")
             if hint := _hint_on_name(name, resolved):
-                resolved.warning(f"{shown} is never called: there is no such handler", *path, hint=hint)
+                resolved.document.warning(f"{shown} is never called: there is no such handler", *path, hint=hint)
             wanted = _arguments(name)
             if wrong := _wrong_signature(method, wanted):
                 hint = f"write `def {name}({', '.join(wanted)})`"
-                resolved.error(f"{shown} can't be called as it will be: {wrong}", *path, hint=hint)
+                resolved.document.error(f"{shown} can't be called as it will be: {wrong}", *path, hint=hint)
 
 
 def _methods(component: type[Component]) -> Iterator[tuple[str, Callable[..., Any]]]:

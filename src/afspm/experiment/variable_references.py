@@ -10,17 +10,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from afspm.experiment.document import Document
-from afspm.experiment.findings import Findings
 from afspm.experiment.toml_lines import Path
 
 
 class VariableReferences:
     """Replaces references in values; reports cycles; remembers which keys were used."""
 
-    def __init__(self, document: Document, variables: Mapping[str, Any], findings: Findings) -> None:
+    def __init__(self, document: Document, variables: Mapping[str, Any]) -> None:
         self._document = document
         self._variables = variables
-        self._findings = findings
         self.used: set[str] = set()
 
     def expand(self, value: Any, path: Path) -> Any:
@@ -46,4 +44,4 @@ class VariableReferences:
         start = ring.index(min(ring))
         ring = ring[start:] + ring[:start]
         what = " -> ".join((*ring, ring[0]))
-        self._findings.error(f"the references go in a circle: {what}", self._document.place(ring[0]))
+        self._document.error(f"the references go in a circle: {what}", ring[0])
