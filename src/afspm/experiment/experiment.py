@@ -142,7 +142,7 @@ class Experiment:
         from afspm.experiment import process_starts
 
         self.require_valid()
-        starts = process_starts.starts(self, take_address, only, without)
+        starts = process_starts.starts(self.resolved, take_address, only, without)
         knowing = process_starts.knowing_the_run(self.resolved)
         return [
             replace(
@@ -164,13 +164,13 @@ class Experiment:
         """True if the microscope is simulated for certain, where these parts are started on this computer."""
         from afspm.experiment import process_starts
 
-        return process_starts.simulated(self, only, without)
+        return self.resolved.simulated_with(process_starts.chosen_names(self.resolved, only, without))
 
     def asking(self, names: Collection[str]) -> Launch | None:
         """A launch line by which those of `names` ask the scheduler where it is started elsewhere; None: nobody can."""
         from afspm.experiment import process_starts
 
-        return process_starts.asking(self, names)
+        return process_starts.asking(self.resolved, names)
 
     def policy(self) -> ChildPolicy:
         """How processes are watched and started again, from [restart]."""
