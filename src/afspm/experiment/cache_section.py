@@ -60,7 +60,7 @@ class CacheSection(Section):
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """What the scheduler is told of the cache."""
+    """The settings of the scheduler's cache."""
 
     rules: tuple[CacheRule, ...] = ()
     mapping: str | None = None
@@ -68,7 +68,7 @@ class CacheSettings:
 
     @property
     def envelopes(self) -> tuple[str, ...]:
-        """How the envelopes of the rules begin, as far as that is fixed."""
+        """The beginnings of the rules' envelopes, as far as they are fixed."""
         return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
     def to_settings(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class CacheSettings:
 
 
 def read(table: Mapping[str, Any], logic: Mapping[str, Any] | None, document: Document) -> CacheSettings:
-    """The section, with what the paper's form says of the cache where the section says nothing.
+    """Return the section, with what the paper's form says of the cache where the section says nothing.
 
     Args:
         logic: the table that the scheduler's cache refers to in the paper's form.

@@ -1,4 +1,4 @@
-"""What must hold between the parts of an experiment: who is there, who talks to whom, who solves what."""
+"""Checks between the parts of an experiment: its processes, their connections, the problems they solve."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Document:
         self.findings.warning(what, self.place(*path), hint)
 
     def place(self, *path: str | int) -> SourceLocation:
-        """Where `path` was set: its own line, or that of the nearest thing around it."""
+        """Return where `path` was set: its own line, or that of the nearest thing around it."""
         for depth in range(len(path), 0, -1):
             found = self.places.get(path[:depth])
             if found is not None:
@@ -49,7 +49,7 @@ class Document:
         return SourceLocation(str(self.files[0]))
 
     def folder_of(self, *path: str | int) -> Path:
-        """The folder of the file that set `path`; relative file names in it are meant from there."""
+        """Return the folder of the file that set `path`; relative file names in it are meant from there."""
         return self.homes[0] if self.homes else Path(self.place(*path).file).resolve().parent
 
     @property
@@ -120,7 +120,7 @@ _HABITS = (
 
 
 def _habit(what: str, written: str) -> str:
-    """What to write instead of a line that would be right elsewhere."""
+    """Return what to write instead of a line that would be right elsewhere."""
     return next((hint for said, line, hint in _HABITS if what.startswith(said) and re.search(line, written)), "")
 
 

@@ -46,7 +46,7 @@ class ProcessStart:
 
 
 class Experiment:
-    """What the files say. Made by `load`."""
+    """An experiment as its files say it. Made by `load`."""
 
     def __init__(self, document: documents.Document) -> None:
         self._document = document
@@ -127,7 +127,7 @@ class Experiment:
         state_dir: str = "",
         log_level: str = "INFO",
     ) -> list[ProcessStart]:
-        """What is to be started: translator and scheduler first.
+        """Return what is to be started: translator and scheduler first.
 
         Args:
             take_address: gives a free loopback address for each that the file leaves open.
@@ -173,7 +173,7 @@ class Experiment:
         return process_starts.asking(self.resolved, names)
 
     def policy(self) -> ChildPolicy:
-        """How processes are watched and started again, from [restart]."""
+        """Return how processes are watched and started again, from [restart]."""
         from afspm.logic.supervision.child import ChildPolicy
         from afspm.logic.supervision.liveness import LivenessPolicy
         from afspm.logic.supervision.restart import RestartPolicy
@@ -190,7 +190,7 @@ class Experiment:
         return ExperimentClock.starting_now(settings.start.timestamp() if settings.start else None, settings.speed)
 
     def expanded(self, *, secrets: bool = True) -> str:
-        """The whole experiment as one TOML text: references replaced, defaults filled in; see `expanded.to_toml`."""
+        """Return the whole experiment as one TOML text: references replaced, defaults filled in."""
         from afspm.experiment.toml_writer import to_toml
 
         return to_toml(self, secrets=secrets)

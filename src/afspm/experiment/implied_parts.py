@@ -83,5 +83,5 @@ def check_notify(resolved: ResolvedExperiment) -> None:
 
 
 def is_program(name: str, folder: Path) -> bool:
-    """Whether a command may begin with this: "python", which is ours, a program that is found, a file in a folder."""
+    """Return whether a command may begin with this: "python", which is ours, a program, a file in a folder."""
     return name == "python" or shutil.which(name) is not None or (folder / name).is_file()

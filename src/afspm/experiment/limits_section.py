@@ -167,7 +167,7 @@ class LimitsReader:
         return read
 
     def _in(self, read: ParameterLimit, key: str, unit: str | None, path: tuple[str, ...]) -> float | None:
-        """A quantity of a limit in the unit of its parameter; a rate in that per second."""
+        """Return a quantity of a limit in the unit of its parameter; a rate in that per second."""
         value = getattr(read, key)
         if value is None:
             return None
@@ -214,7 +214,7 @@ class LimitsReader:
 
 
 def _unit_of(read: ParameterLimit) -> str | None:
-    """The unit of the first value given: the operating mode of the microscope decides what it is."""
+    """Return the unit of the first value given: the operating mode of the microscope decides what it is."""
     for value in (read.min, read.max, read.step):
         if isinstance(value, str):
             with contextlib.suppress(AfspmError):
@@ -223,7 +223,7 @@ def _unit_of(read: ParameterLimit) -> str | None:
 
 
 def _rate(value: Quantity, unit: str) -> float:
-    """A change per second, in `unit` per second: "1 V/s", "0.1 V/min"."""
+    """Return a change per second, in `unit` per second: "1 V/s", "0.1 V/min"."""
     if not isinstance(value, str):
         return float(value)
     number, given = parse_quantity(value)

@@ -1,4 +1,4 @@
-"""What is to be started, as launch lines."""
+"""Launch lines of the processes to start."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: C
 
 
 def _subscribing(resolved: ResolvedExperiment, name: str, chosen: set[str], without: set[str]) -> ProcessSockets:
-    """The sockets of a process, without those that nobody can know of.
+    """Return the sockets of a process, without those that nobody can know of.
 
     A component that is left out, and has no address, is not there. And nobody has to write down an address for the
     sake of what is not in the file.
@@ -186,7 +186,7 @@ def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | Non
 
 
 def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mapping[str, str]) -> dict[str, str] | None:
-    """The folder of the keys, and whose key to expect at each address; see `transport.network.Network.from_launch`."""
+    """Return the folder of the keys, and whose key to expect at each address; see `Network.from_launch`."""
     if resolved.keys_folder is None:
         return {"insecure": "true"} if resolved.sections.security.insecure else None
     slots = resolved.net.slots.items()
@@ -205,13 +205,13 @@ def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mappin
 
 
 def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:
-    """Whether the scheduler maps places, as its class says."""
+    """Return whether the scheduler maps places, as its class says."""
     schedulers = resolved.with_role(Role.SCHEDULER)
     return any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers)
 
 
 def _retracts(resolved: ResolvedExperiment) -> bool:
-    """Whether a tip without feedback is to be retracted when nobody is in control any more."""
+    """Return whether a tip without feedback is to be retracted when nobody is in control any more."""
     control = resolved.sections.control
     dangerous = WatchdogSettings().dangerous if control.dangerous is None else control.dangerous
     return control.retract and FEEDBACK_OFF in dangerous
@@ -222,7 +222,7 @@ _IN_SECONDS = ("lease", "grace", "malfunction_after")
 
 
 def _for_scheduler(resolved: ResolvedExperiment) -> dict[str, Any]:
-    """The sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m."""
+    """Return the sections that the scheduler enforces, as arguments of its constructor. Times in s, lengths in m."""
     dumped = resolved.sections.control.model_dump(mode="json", exclude=_OF_OTHERS)
     control = {f"{key}_s" if key in _IN_SECONDS else key: value for key, value in dumped.items()}
     if control["roles"]["operate"] is None:

@@ -60,12 +60,12 @@ class ResolvedProcess:
         return self.part.name
 
     def says(self, attribute: str) -> bool:
-        """Whether its class has an attribute that is true."""
+        """Return whether its class has an attribute that is true."""
         return getattr(self.component, attribute, False) is True
 
     @property
     def is_microscope(self) -> bool:
-        """Whether it is a simulated microscope, as its class (a command: its table) says."""
+        """True for a simulated microscope, as its class (a command: its table) says."""
         return self.part.own.get(SIMULATED) is True if self.part.command else self.says(SIMULATED)
 
     @property
@@ -211,7 +211,7 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
 
 
 def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
-    """What the class says; a setting `problem` takes the place of its default there."""
+    """Return what the class says; a setting `problem` takes the place of its default there."""
     said = ComponentDeclaration.of_class(component)
     default, given = settings.default_of(component, "problem"), part.settings.get("problem")
     if not isinstance(given, str) or not isinstance(default, str):
@@ -277,7 +277,7 @@ def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
 
 
 def _inside(error: AfspmError) -> tuple[str | int, ...]:
-    """Where in a component's table an error says that it is: "panel[1].set" as ("panel", 1, "set")."""
+    """Return where in a component's table an error says that it is: "panel[1].set" as ("panel", 1, "set")."""
     where = error.where.removeprefix("simulation.").removeprefix("the experiment file, ")
     return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 

@@ -135,7 +135,7 @@ S = TypeVar("S", bound=Section)
 
 
 def parse(model: type[S], name: str, table: dict[str, Any], document: Document) -> S:
-    """The section `[name]`; what is wrong with it is reported, and its defaults returned."""
+    """Return the section `[name]`; what is wrong with it is reported, and its defaults returned."""
     try:
         return model.model_validate(table)
     except pydantic.ValidationError as error:
@@ -201,7 +201,7 @@ def _fields_at(model: type[pydantic.BaseModel], location: tuple[str | int, ...])
 
 
 def _sections_in(annotation: Any) -> Iterator[type[pydantic.BaseModel]]:
-    """The sections that an annotation speaks of: itself, or within a union or a tuple."""
+    """Return the sections that an annotation speaks of: itself, or within a union or a tuple."""
     if isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel):
         yield annotation
     for inner in get_args(annotation):

@@ -36,7 +36,7 @@ def check(
     given: Collection[str] = (),
     wrong: set[str] | None = None,
 ) -> dict[str, Any]:
-    """The settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
+    """Return the settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
 
     Args:
         given: parameters that are not for the table to set.
@@ -71,7 +71,7 @@ def check(
 
 
 def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
-    """What to do about a setting of a class that a later file has replaced; empty: none has."""
+    """Return what to do about a setting of a class that a later file has replaced; empty: none has."""
     of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
     if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
         return ""
@@ -79,7 +79,7 @@ def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
 
 
 def default_of(component: type, name: str) -> Any:
-    """The default of a setting; None where it has none."""
+    """Return the default of a setting; None where it has none."""
     parameter = _parameters(component).get(name)
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
 
@@ -133,7 +133,7 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
 
 
 def _object(value: dict[str, Any], path: tuple[str, ...], document: Document) -> dict[str, Any]:
-    """An intermediary class of the user's own: checked here, made by the process."""
+    """Return an intermediary class of the user's own: checked here, made by the process."""
     settings = {key: item for key, item in value.items() if key != "class"}
     try:
         wanted = class_loader.load(value["class"])
@@ -147,7 +147,7 @@ def _object(value: dict[str, Any], path: tuple[str, ...], document: Document) ->
 
 
 def _is_quantity(value: Any) -> bool:
-    """Whether a text is a number with a unit for which there is an annotation."""
+    """Return whether a text is a number with a unit for which there is an annotation."""
     if not isinstance(value, str):
         return False
     for unit in _ANNOTATED:
@@ -170,7 +170,7 @@ def _has_own_config(annotation: Any) -> bool:
 
 @cache
 def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
-    """The parameters of the constructor; where it hands **settings on to its base class, those of that as well."""
+    """Return the parameters of the constructor, and those of its base classes that it hands **settings on to."""
     found: dict[str, inspect.Parameter] = {}
     for init in _constructors(component):
         own = list(inspect.signature(init).parameters.values())[1:]  # without self

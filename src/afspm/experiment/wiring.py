@@ -1,4 +1,4 @@
-"""Who binds and who connects where: what the file says, and free addresses for what it leaves open.
+"""The sockets that each process binds or connects to; the file may leave addresses open.
 
 Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's,
 every component to the scheduler's; a component that publishes has an address of its own, to which those connect that
@@ -38,7 +38,7 @@ class BoundSocket:
 
 @dataclass
 class WiringKeys:
-    """What the wiring keys of one component say, as plain addresses."""
+    """The wiring keys of one component, as plain addresses."""
 
     publish: str | None = None
     subscribe: list[str] | None = None
@@ -70,12 +70,12 @@ class Wiring:
     links: dict[str, ProcessSockets] = field(default_factory=dict)
 
     def addresses(self, take: Callable[[], str]) -> dict[str, str]:
-        """Every slot's key with the address bound there, open ones filled by `take()`."""
+        """Return every slot's key with the address bound there, open ones filled by `take()`."""
         return {key: slot.address or take() for key, slot in self.slots.items()}
 
 
 def read_wires(part: ExperimentPart, document: Document) -> WiringKeys:
-    """What the wiring keys of a component mean; reports what doesn't fit them."""
+    """Return what the wiring keys of a component mean; reports what doesn't fit them."""
     wires = WiringKeys()
     for key, kinds in WIRE_KEYS.items():
         if key not in part.own:
@@ -187,7 +187,7 @@ def connect(processes: Mapping[str, ResolvedProcess], document: Document) -> Wir
 def _sources(
     process: ResolvedProcess, scheduler: ResolvedProcess | None, processes: Mapping[str, ResolvedProcess], net: Wiring
 ) -> tuple[str, ...]:
-    """Where a component subscribes: as said, else at the scheduler and at those who publish what it listens to."""
+    """Return where it subscribes: as said, else at the scheduler and at publishers of what it listens to."""
     own = process.wires
     published = f"{scheduler.name}/publish" if scheduler else ""
     if own.subscribe is not None:
@@ -208,5 +208,5 @@ def _sources(
 
 
 def _overlap(published: Collection[str], prefixes: Collection[str] | None) -> bool:
-    """Whether any envelope of the one is wanted by the other; no prefixes means all are."""
+    """Return whether any envelope of the one is wanted by the other; no prefixes means all are."""
     return prefixes is None or any(e.startswith(p) or p.startswith(e) for e in published for p in prefixes)

@@ -23,7 +23,7 @@ _COLOURS = np.array(
 
 
 def scan_html(scan: Scan) -> str:
-    """The scan as an image with y upwards, and a line that says what it is."""
+    """Return the scan as an image with y upwards, and a line that says what it is."""
     width, height = scan.region.size_m
     x, y = scan.region.center_m
     ny, nx = scan.shape
@@ -43,7 +43,7 @@ def scan_html(scan: Scan) -> str:
 
 
 def spectrum_html(spectrum: Spectrum) -> str:
-    """Every variable against the first one, as small SVG curves."""
+    """Return every variable against the first one, as small SVG curves."""
     swept = spectrum.values[:, 0]
     curves = []
     for column, (name, unit) in enumerate(zip(spectrum.names[1:], spectrum.units[1:], strict=True), start=1):
@@ -59,7 +59,7 @@ def spectrum_html(spectrum: Spectrum) -> str:
 
 
 def png(values: NDArray[np.float64]) -> bytes:
-    """An array [row, column], first row on top, as a PNG; contrast from the 1st to the 99th percentile, NaN grey."""
+    """Return an array [row, column], first row on top, as a PNG: the 1st to the 99th percentile, NaN grey."""
     step = max(1, -(-max(values.shape) // _LARGEST_PX))
     values = values[::step, ::step]
     finite = np.isfinite(values)
