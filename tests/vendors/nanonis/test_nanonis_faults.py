@@ -135,7 +135,7 @@ def test_a_scan_whose_file_does_not_come_is_fetched(bench: Make, kind: str) -> N
     made.strike(kind, duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
     found = scans(peer.until(FREE))
-    assert found[0].filename.endswith("nanonis-0001.npz")
+    assert found[0].filename.endswith("nanonis-0001.nc")
     # by the name that Nanonis had said, or by the folder if it had not said any in time
     made.until_said("unnamed001.sxm): it was fetched from Nanonis", "session): it was fetched from Nanonis")
 
@@ -228,7 +228,7 @@ def test_a_spectrum_that_is_not_saved_is_fetched(bench: Make) -> None:
     made.strike("autosave-off", duration_s=1e6)
     assert peer.act(names.START_SPEC).ok
     (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))
-    assert spectrum.filename.endswith(".npz")
+    assert spectrum.filename.endswith(".nc")
 
 
 def test_a_spectrum_that_somebody_takes_unsaved_is_not_that_of_before(bench: Make) -> None:
@@ -252,7 +252,7 @@ def test_a_scan_that_is_not_saved_is_fetched_at_once(bench: Make) -> None:
     assert peer.act(names.START_SCAN).ok
     made.emulator.ends_as_awaited = True
     found = scans(peer.until(FREE))
-    assert found[0].filename.endswith(".npz")
+    assert found[0].filename.endswith(".nc")
 
 
 # --- the tip, and people ---

@@ -71,7 +71,7 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: 
         for mirrored in (values[::-1], values[:, ::-1], values[::-1, ::-1]):
             assert likeness(mirrored) < likeness(values) - 0.1
     file = scans["Z Forward"].filename
-    assert file.endswith(".npz" if fetch else ".sxm")
+    assert file.endswith(".nc" if fetch else ".sxm")
     if not fetch:
         assert read(file).upwards is (direction == "up")
 
@@ -245,7 +245,7 @@ def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first:
     assert spectrum.kind == kind
     assert spectrum.names[0] == first
     assert len(spectrum.values) > 100
-    assert spectrum.filename.endswith(".npz" if fetch else ".dat")
+    assert spectrum.filename.endswith(".nc" if fetch else ".dat")
     true = made.emulator.rig.spectrum
     assert true is not None
     np.testing.assert_allclose(spectrum.values, true.values, rtol=1e-4, atol=1e-18)
@@ -392,7 +392,7 @@ def test_it_can_be_told_to_leave_saving_alone(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.software.scans.properties.__dict__.update(autosave="off"))
     peer = made.start(autosave=False)
     ready(peer)
-    assert scanned(peer)["Z Forward"].filename.endswith(".npz")
+    assert scanned(peer)["Z Forward"].filename.endswith(".nc")
     assert made.emulator.software.scans.properties.autosave == "off"
 
 
