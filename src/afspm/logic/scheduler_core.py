@@ -57,7 +57,7 @@ from afspm.model import (
     ControlResponse,
     ControlState,
     Feedback,
-    Packet,
+    LoggedPacket,
     ProbePosition,
     Problem,
     Request,
@@ -230,11 +230,11 @@ class SchedulerCore:
         if self._frame is not None and "frame" in state:
             self._frame.restore(state["frame"])
 
-    def restore_cache(self, packets: Iterable[tuple[Packet, int | None]]) -> None:
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
         """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
         self._cache.restore(packets)
 
-    def cached(self) -> Iterable[tuple[Packet, int | None]]:
+    def cached(self) -> Iterable[LoggedPacket]:
         """What is cached now (with `source_ns`), oldest first: for whoever tidies the journal."""
         return self._cache
 

@@ -33,13 +33,13 @@ class SchedulerPublisher:
 
     def control(self, state: ControlState, now_ns: int) -> Publish:
         """The control state as a packet, to be published once it is saved."""
-        packet, cached = self._cache.stamp(CONTROL_STATE, self._codec.encode(state), now_ns)
-        return Publish(packet, None, cached)
+        packet, history = self._cache.stamp(CONTROL_STATE, self._codec.encode(state), now_ns)
+        return Publish(packet, None, history)
 
     def announce(self, envelope: str, payload: bytes, time_ns: int) -> list[Effect]:
         """Whatever there is to say."""
-        packet, cached = self._cache.stamp(envelope, payload, time_ns)
-        return [self._save(), Publish(packet, None, cached)]
+        packet, history = self._cache.stamp(envelope, payload, time_ns)
+        return [self._save(), Publish(packet, None, history)]
 
     def entries(self, now_ns: int) -> list[Effect]:
         """What has happened since the last time."""

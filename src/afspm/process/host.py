@@ -83,7 +83,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: ParentWatch) -> int:
         context = ProcessContext(
             launch,
             clock,
-            open_port=lambda: _open_port(launch, clock, parent),
+            open_port=lambda heard=None: _open_port(launch, clock, parent, heard),
             log=logger,
             activity=activity,
             when_stopping=parent.when_gone,
@@ -148,10 +148,12 @@ def _telling(launch: Launch, clock: Clock) -> Iterator[None]:
         sender.close()
 
 
-def _open_port(launch: Launch, clock: Clock, parent: ParentWatch) -> Port:
+def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[str, ...] | None) -> Port:
     """The port of a component: hears, besides what it subscribed to, what `Scope` has to know."""
     envelopes = wire.messages_of_the_experiment() if launch.envelopes is None else launch.envelopes
-    if launch.sockets.control is not None:
+    if heard is not None:
+        envelopes = heard
+    elif launch.sockets.control is not None:
         envelopes = tuple(sorted({*envelopes, *STATE_MESSAGES, *MEASURED_MESSAGES}))
     launch = replace(launch, envelopes=envelopes)
     port = open_port(launch, clock)

@@ -36,6 +36,7 @@ from afspm.model import (
     HAS_ENDED,
     RELAY_REQUEST,
     ControlResponse,
+    LoggedPacket,
     Packet,
     PacketHeader,
     Request,
@@ -45,8 +46,6 @@ from afspm.model import (
 from afspm.testing.deterministic.network import ControlLine, ControlServer, Feed, Publisher, Weather
 from afspm.testing.deterministic.process import Alarm, Process
 from afspm.testing.deterministic.timeline import Timeline
-
-Entry = tuple[Packet, int | None]
 
 _BY_VALUE = 2  # the version of marshal whose bytes follow from the value alone
 
@@ -63,7 +62,7 @@ class Disk:
     """
 
     state: dict[str, bytes] | None = None
-    journal: tuple[Entry, ...] = ()
+    journal: tuple[LoggedPacket, ...] = ()
     full: bool = False
     stale: bool = False
 
@@ -75,12 +74,12 @@ class Disk:
     def _save(self, state: dict[str, Any]) -> None:
         self.state = {name: marshal.dumps(part, _BY_VALUE) for name, part in state.items()}
 
-    def keep(self, packet: Packet, source_ns: int | None) -> None:
+    def keep(self, entry: LoggedPacket) -> None:
         """A packet, before it is published."""
         if self.full:
             self.stale = True
             return
-        self.journal = (*self.journal, (packet, source_ns))
+        self.journal = (*self.journal, entry)
 
     def saved(self) -> dict[str, Any] | None:
         """As it comes out of a JSON file; None if nothing was saved."""
@@ -279,11 +278,11 @@ class SchedulerHost(Process):
         elif isinstance(effect, Forward):
             self._link.ask(effect.request, effect.number)
         elif isinstance(effect, Publish):
-            if effect.cached and (effect.source_ns is None or self.writes_ahead):
-                self.disk.keep(effect.packet, effect.source_ns)
+            if effect.history and (effect.source_ns is None or self.writes_ahead):
+                self.disk.keep(LoggedPacket(effect.packet, effect.source_ns, effect.history))
             for feed in list(self._feeds):
                 feed.publish(effect.packet)
-            if effect.cached and not self._journal_due:
+            if effect.history and not self._journal_due:
                 self._journal_due = True
                 self.later(self.journal_s * self.timeline.random.random(), self._write_journal)
         elif isinstance(effect, Replay):
