@@ -86,7 +86,7 @@ def test_on_a_full_disk_what_was_saved_before_is_still_the_last(tmp_path: Path) 
 import resource, signal, sys
 from pathlib import Path
 from afspm.errors import FileError
-from afspm.storage.atomic import CheckpointFile, load
+from afspm.storage.atomic import CheckpointFile, load_checkpoint
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 path = Path(sys.argv[1])
@@ -98,7 +98,7 @@ while failed < 3:
         saved += 1
     except FileError:
         failed += 1
-    assert load(path, int) == (10**20 + saved - 1, "")
+    assert load_checkpoint(path, int) == (10**20 + saved - 1, "")
 print(saved)
 """
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "x")], capture_output=True, text=True)
