@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 import tempfile
 from collections import deque
 from typing import IO
 
-from afspm.model import Packet
+from afspm.model import LoggedPacket, Packet
+from afspm.storage.segment import head_of, read_packet
 
 MEMORY_LIMIT_BYTES = 256 << 20
-_LENGTHS = struct.Struct("<IQq?")  # envelope, payload, time, whether there is one
 
 
 class Backlog:
@@ -55,11 +54,8 @@ class Backlog:
     def _put_on_disk(self, packet: Packet) -> None:
         if self._file is None:
             self._file = tempfile.TemporaryFile(prefix="afspm-")  # noqa: SIM115 - open for as long as it is needed
-        envelope = packet.envelope.encode()
-        time_ns = packet.time_ns
         self._file.seek(0, 2)
-        self._file.write(_LENGTHS.pack(len(envelope), len(packet.payload), time_ns or 0, time_ns is not None))
-        self._file.write(envelope)
+        self._file.write(head_of(LoggedPacket(packet, None, 0)))
         self._file.write(packet.payload)
         self._on_disk += 1
 
@@ -67,11 +63,10 @@ class Backlog:
         if self._file is None:
             return None
         self._file.seek(self._read_at)
-        envelope_len, payload_len, time_ns, has_time = _LENGTHS.unpack(self._file.read(_LENGTHS.size))
-        envelope = self._file.read(envelope_len).decode()
-        packet = Packet(envelope, self._file.read(payload_len), time_ns if has_time else None)
+        entry = read_packet(self._file)
+        assert entry is not None
         self._read_at = self._file.tell()
         self._on_disk -= 1
         if self._on_disk == 0:
             self.close()
-        return packet
+        return entry.packet

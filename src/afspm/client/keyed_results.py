@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import struct
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,12 +13,13 @@ from typing import Any
 
 from afspm import wire
 from afspm.errors import FileError, InvalidValue, WireError
+from afspm.model import LoggedPacket, Packet
 from afspm.process.memory import Memory
 from afspm.storage.atomic import OutageLog, write_atomic
+from afspm.storage.segment import head_of, read_packet
 
 _log = logging.getLogger("afspm.memory")
-_MAGIC = b"afspm-result-1\n"
-_LENGTH = struct.Struct("<Q")
+_HEAD = "result"
 LONGEST_KEY = 100
 
 
@@ -81,11 +81,11 @@ class KeyedResults:
         """Keep the result; the intent is fulfilled. Where the disk is full, another life measures it again."""
         path = self._path(key)
         if path is not None:
-            head = {"key": key, "plan": plan, "interruptions": result.interruptions}
-            parts = [_MAGIC, *_framed(json.dumps(head).encode())]
-            for thing in result.things:
-                message, payload = wire.encode(thing)
-                parts += [*_framed(message.encode()), *_framed(payload)]
+            things = [wire.encode(thing) for thing in result.things]
+            head = {"key": key, "plan": plan, "interruptions": result.interruptions, "things": len(things)}
+            parts: list[bytes | memoryview] = []
+            for name, payload in [(_HEAD, json.dumps(head).encode()), *things]:
+                parts += [head_of(LoggedPacket(Packet(name, payload), None, 0)), payload]
             with self._told.trying():
                 write_atomic(path, parts)
         self._memory.pop("pending", None)
@@ -117,23 +117,15 @@ def check_key(key: str) -> str:
     return key
 
 
-def _framed(part: bytes) -> tuple[bytes, bytes]:
-    return _LENGTH.pack(len(part)), part
-
-
 def _read(path: Path) -> tuple[dict[str, Any], list[Any]]:
     try:
-        data = memoryview(path.read_bytes())
-        if bytes(data[: len(_MAGIC)]) != _MAGIC:
+        with path.open("rb") as file:
+            packets = [entry.packet for entry in iter(lambda: read_packet(file), None)]
+        if not packets or packets[0].envelope != _HEAD:
             raise ValueError("not a result")
-        parts = []
-        at = len(_MAGIC)
-        while at < len(data):
-            (length,) = _LENGTH.unpack_from(data, at)
-            at += _LENGTH.size
-            parts.append(data[at : at + length])
-            at += length
-        head = json.loads(bytes(parts[0]))
-        return head, [wire.decode(str(n, "utf-8"), p) for n, p in zip(parts[1::2], parts[2::2], strict=True)]
-    except (OSError, ValueError, struct.error, WireError, IndexError) as error:
+        head = json.loads(bytes(packets[0].payload))
+        if len(packets) != 1 + head["things"]:
+            raise ValueError("not all of it is there")
+        return head, [wire.decode(packet.envelope, packet.payload) for packet in packets[1:]]
+    except (OSError, ValueError, WireError) as error:
         raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure anew") from error

@@ -1,8 +1,9 @@
 """One file of the packet log: packets one after the other, each with its length and a checksum.
 
-A packet is: "AFp3", the number of the file, the lengths of envelope and payload, its time, the translator's time of it
-(-1: none), how many of its envelope are cached, the checksum of all that; envelope; payload. The checksum of a large
-payload is the sum of its 64-bit words, which takes a hundredth of the time that sending them takes.
+A packet is: "AFp3", the number of the file, the lengths of envelope and payload, its time and the translator's time of
+it (-1: none), how many of its envelope are cached, the checksum of all that; envelope; payload. Backlogs and keyed
+results of components are kept in the same form, in files with the number 0. The checksum of a large payload is the sum
+of its 64-bit words, which takes a hundredth of the time that sending them takes.
 
 To write over an old file takes a fraction of the time that new room on a disk does. The number of the file, which is
 new each time, tells what is left of before from what is new; the checksum tells what a kill or power cut left half.
@@ -14,6 +15,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 from afspm.model import LoggedPacket, Packet
 from afspm.storage.disk import SYNCER
@@ -51,7 +53,7 @@ class SegmentWriter:
     def append(self, entry: LoggedPacket) -> None:
         """Write a packet behind the others. Raises OSError: the disk is full …; `take_back` it then."""
         payload = entry.packet.payload
-        head = _head(entry, self._number)
+        head = head_of(entry, self._number)
         if len(payload) <= _SMALL:
             self._write(head + payload)
         else:
@@ -103,24 +105,30 @@ def read_segment(path: Path, offset: int = 0) -> Iterator[tuple[LoggedPacket, in
     with file:
         file.seek(offset)
         number = number_of(path)
-        while len(head := file.read(_HEAD.size)) == _HEAD.size:
-            magic, said, envelope_len, payload_len, time_ns, source, history, _ = _HEAD.unpack(head)
-            if (magic, said) != (_MAGIC, number):
-                return
-            envelope, payload = file.read(envelope_len), file.read(payload_len)
-            packet = Packet(envelope.decode("utf-8", "replace"), payload, time_ns)
-            entry = LoggedPacket(packet, None if source < 0 else source, history)
-            if len(payload) < payload_len or _head(entry, number) != head + envelope:
-                return
-            offset += len(head) + envelope_len + payload_len
-            yield entry, offset
+        while (entry := read_packet(file, number)) is not None:
+            yield entry, file.tell()
 
 
-def _head(entry: LoggedPacket, number: int) -> bytes:
+def read_packet(file: IO[bytes], number: int = 0) -> LoggedPacket | None:
+    """Return the packet that begins here; None if there is none, or not all of it."""
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        return None
+    magic, said, envelope_len, payload_len, time_ns, source_ns, history, _ = _HEAD.unpack(head)
+    if (magic, said) != (_MAGIC, number):
+        return None
+    envelope, payload = file.read(envelope_len), file.read(payload_len)
+    packet = Packet(envelope.decode("utf-8", "replace"), payload, None if time_ns < 0 else time_ns)
+    entry = LoggedPacket(packet, None if source_ns < 0 else source_ns, history)
+    is_whole = len(payload) == payload_len and head_of(entry, number) == head + envelope
+    return entry if is_whole else None
+
+
+def head_of(entry: LoggedPacket, number: int = 0) -> bytes:
     """Return what comes before the payload."""
     packet, source_ns, history = entry
-    envelope, source = packet.envelope.encode(), -1 if source_ns is None else source_ns
-    about = _MAGIC, number, len(envelope), len(packet.payload), packet.time_ns or 0, source, history
+    envelope, times = packet.envelope.encode(), [-1 if one is None else one for one in (packet.time_ns, source_ns)]
+    about = _MAGIC, number, len(envelope), len(packet.payload), *times, history
     named = zlib.crc32(_HEAD.pack(*about, 0) + envelope)
     return _HEAD.pack(*about, (named + _checksum(packet.payload)) % _CHECKSUM_MODULUS) + envelope
 
