@@ -23,7 +23,7 @@ demo-drift: $(SETUP)
 ## all tests: more at a time than there are cores, since many of them wait. Tests and modules stay compiled
 TESTS_AT_A_TIME ?= 8
 COLLECTED := .venv/.tests-collected
-MUTANTS := tests/deterministic/test_mutants.py
+MUTANTS := tests/simulation/test_mutants.py
 SAMPLES := tests/system/experiment/test_samples_run.py
 test: $(COLLECTED)
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(TESTS_AT_A_TIME) --ignore $(SAMPLES) --ignore $(MUTANTS)
@@ -84,7 +84,7 @@ chaos: $(SETUP)
 HOURS ?= 20000
 SEED ?= 1
 simulate: $(SETUP)
-	@$(BIN)/python -m afspm.testing.longrun --hours $(HOURS) --seed $(SEED)
+	@$(BIN)/python -m tests.simulation.long_run --hours $(HOURS) --seed $(SEED)
 
 ## a recorded run that loses its power, with all that was not synced, and is resumed, again and again: CUTS=100 SEED=1
 CUTS ?= 100

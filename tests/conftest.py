@@ -31,7 +31,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # while tests are collected hardly anything becomes garbage
 gc.disable()
 
-COMPUTING = ("tests/deterministic/", "tests/unit/")
+COMPUTING = ("tests/simulation/", "tests/unit/")
 """How the names of tests begin that need the processor all the time; the others wait for processes of their own."""
 COMPUTERS = 2
 """So many processes do these as long as there are any, beside those that wait: no core is ever idle."""

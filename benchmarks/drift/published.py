@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from afspm.drift.estimators.matching import Descriptors, matched
+from afspm.drift.estimators.keypoints import Descriptors, matched
 from afspm.drift.estimators.ransac import FORMS, Search
 from afspm.drift.overlap import overlap_center_m
 from afspm.drift.registration import DriftScan, Prior, Registration

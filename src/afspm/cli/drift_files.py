@@ -19,10 +19,9 @@ from rich.table import Table
 from afspm.clock import NS_PER_S
 from afspm.components.simulated_truth import true_drift
 from afspm.drift.estimators import estimator
-from afspm.drift.offline import against_first, followed
+from afspm.drift.offline import against_first, corrected, followed
 from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan, Registration
-from afspm.drift.stack import corrected
 from afspm.drift.trackers import tracker
 from afspm.errors import AfspmError, FileError, InvalidValue
 from afspm.files import FORMATS, FileContent, read
@@ -181,9 +180,9 @@ def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path
     except ImportError:
         console.print('no figures without matplotlib: pip install "afspm[plot]"', markup=False)
         return
-    part = album.Part("", found.channel, 0, len(found.scans), analysis.estimates)
+    part = album.RunPart("", found.channel, 0, len(found.scans), analysis.estimates)
     matched = next(((0, k, one) for k, one in enumerate(analysis.pairs, 1) if one.accepted and one.matches), None)
-    yield from album.write(album.Run(found.scans, analysis.record, [part], matched, truth), folder)
+    yield from album.write(album.DriftRun(found.scans, analysis.record, [part], matched, truth), folder)
 
 
 def _stack(found: Series, record: DriftRecord, path: Path) -> Path:

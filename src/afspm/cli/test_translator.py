@@ -12,7 +12,7 @@ from afspm.cli.arguments import names_in
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from afspm.testing.translators import Options
+    from afspm.testing.translators import CheckOptions
 
 Files = Annotated[
     list[Path] | None,
@@ -70,7 +70,7 @@ def check_translator(
 
     from rich.console import Console
 
-    from afspm.testing.translators import Options
+    from afspm.testing.translators import CheckOptions
     from afspm.units import si
 
     if listed:
@@ -79,7 +79,7 @@ def check_translator(
     if not files:
         raise typer.BadParameter("an experiment file is wanted", param_hint="FILE")
     console = Console(file=sys.stdout, highlight=False)
-    options = Options(files, names_in(without), runs, speed, names_in(only), si(frame, "m") if frame else None)
+    options = CheckOptions(files, names_in(without), runs, speed, names_in(only), si(frame, "m") if frame else None)
     if not yes and not _is_simulated(options):
         typer.confirm(_ASK, abort=True)
     _run(options, console, report)
@@ -92,21 +92,21 @@ def _list() -> None:
         typer.echo(f"{check.name:31}{check.title}")
 
 
-def _is_simulated(options: Options) -> bool:
+def _is_simulated(options: CheckOptions) -> bool:
     from afspm.testing.translators.session import is_simulated, prepare
 
     return is_simulated(prepare(options), options)
 
 
-def _run(options: Options, console: Console, copy: Path | None) -> None:
+def _run(options: CheckOptions, console: Console, copy: Path | None) -> None:
     import signal
 
-    from afspm.testing.translators import Report, run
-    from afspm.testing.translators.showing import show_beginning, show_end, show_result
+    from afspm.testing.translators import CheckReport, run
+    from afspm.testing.translators.report import show_beginning, show_end, show_result
 
-    begun: list[Report] = []
+    begun: list[CheckReport] = []
 
-    def begin(report: Report) -> None:
+    def begin(report: CheckReport) -> None:
         begun.append(report)
         show_beginning(report, console)
 

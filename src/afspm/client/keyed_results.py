@@ -1,4 +1,4 @@
-"""What a keyed scan or spectrum needs to be there exactly once: the intent before, the result after, both on disk."""
+"""Keyed measurements happen exactly once: the intent is on disk before the request, the result after it."""
 
 from __future__ import annotations
 
@@ -25,12 +25,7 @@ LONGEST_KEY = 100
 
 @dataclass(frozen=True)
 class MeasurementResult:
-    """What came of a measurement.
-
-    Attributes:
-        things: the scans or spectra.
-        interruptions: what got in between, for a person.
-    """
+    """The scans or spectra of a measurement, and what interrupted it, for a person."""
 
     things: list[Any]
     interruptions: list[str]
@@ -46,7 +41,7 @@ class KeyedResults:
 
     def __init__(self, folder: Path | None, name: str) -> None:
         self._folder = folder / f"{name}.results" if folder else None
-        self._told = OutageLog("what is measured can't be kept", _log)
+        self._outage = OutageLog("what is measured can't be kept", _log)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
     @property
@@ -60,7 +55,7 @@ class KeyedResults:
         self._memory.save()
 
     def find(self, key: str, plan: dict[str, Any]) -> MeasurementResult | None:
-        """The result of an earlier life, or of an earlier call, with the same key.
+        """Return the result of an earlier life, or of an earlier call, with the same key.
 
         Raises:
             InvalidValue: the key was used for something else.
@@ -86,13 +81,13 @@ class KeyedResults:
             parts: list[bytes | memoryview] = []
             for name, payload in [(_HEAD, json.dumps(head).encode()), *things]:
                 parts += [head_of(LoggedPacket(Packet(name, payload), None, 0)), payload]
-            with self._told.trying():
+            with self._outage.trying():
                 write_atomic(path, parts)
         self._memory.pop("pending", None)
         self._memory.save()
 
     def forget(self, key: str) -> None:
-        """Remove what is kept of a key that nobody will ask for again; whoever does, measures again."""
+        """Remove what is kept of a key; a component that asks for it again measures again."""
         path = self._path(key)
         if path is not None:
             with suppress(OSError):  # what stays is only space
@@ -107,11 +102,7 @@ class KeyedResults:
 
 
 def check_key(key: str) -> str:
-    """A key as it may be used in request ids.
-
-    Raises:
-        InvalidValue: it may not.
-    """
+    """Return a key as it may be used in request ids. Raises InvalidValue: it may not."""
     if not key or len(key.encode()) > LONGEST_KEY or "/" in key or not key.isprintable():
         raise InvalidValue(f"{key!r} can't be a key", hint=f"1 to {LONGEST_KEY} printable characters without '/'")
     return key

@@ -17,7 +17,7 @@ from afspm.components.drift_table import DriftTable
 from afspm.errors import AfspmError, FileError
 
 if TYPE_CHECKING:
-    from afspm.drift.figures.album import Part
+    from afspm.drift.figures.album import RunPart
     from afspm.drift.record import DriftRecord
     from afspm.drift.registration import DriftScan, Registration
 
@@ -137,7 +137,7 @@ class DriftPictures(DriftTable):
         record = DriftRecord.read(folder / self.file).chosen(list(readable))
         told, frames = [told[number] for number in readable], list(readable.values())
         scans = _AsSaved(told, self._scan)
-        run = album.Run(
+        run = album.DriftRun(
             scans=scans,
             record=record,
             parts=self._parts(told, record, frames),
@@ -148,16 +148,16 @@ class DriftPictures(DriftTable):
         for path in album.write(run, folder, title=title):
             self.log.info("drawn: %s", path)
 
-    def _parts(self, told: list[TabledScan], record: DriftRecord, frames: list[DriftScan]) -> list[Part]:
+    def _parts(self, told: list[TabledScan], record: DriftRecord, frames: list[DriftScan]) -> list[RunPart]:
         """With what was estimated off-line."""
-        from afspm.drift.figures.album import Part
+        from afspm.drift.figures.album import RunPart
         from afspm.drift.offline import against_first
 
         made = []
         for name, start, stop in parts(told):
             pairs = [self._compared(told[start], one) for one in told[start + 1 : stop]]
             estimates = against_first(record[start:stop], frames[start:stop], pairs)
-            made.append(Part(name, f"correction {name}", start, stop, estimates))
+            made.append(RunPart(name, f"correction {name}", start, stop, estimates))
         return made
 
     def _matched(self, told: list[TabledScan], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:

@@ -18,8 +18,8 @@ from afspm.process.context import ProcessActivity, ProcessContext, new_session
 from afspm.process.memory import Memory
 from afspm.process.message_types import register_all
 from afspm.record.run_json import STATE_DIR
-from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
+from afspm.transport.zmq_port import open_port
 
 
 def join(folder: Path, dashboard: Dashboard, name: str) -> int:

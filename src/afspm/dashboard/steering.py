@@ -92,14 +92,7 @@ class Steering:
         name = f"{launch.name}{PERSON}{person}"
         network = Network.from_launch(launch.name, launch.keys)
         port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
-        link = ExperimentLink(
-            port,
-            name,
-            session=new_session(launch.run),
-            request_timeout_s=launch.request_timeout_s,
-            request_retries=launch.request_retries,
-            log=self._log,
-        )
+        link = ExperimentLink.of_launch(launch, port, new_session(launch.run), name=name, log=self._log)
         return port, Acts(link, self._watch)
 
     def _forget_some(self) -> None:

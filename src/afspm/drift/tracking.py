@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 
 from afspm.drift.mapping import Mapping
 from afspm.drift.registration import DriftScan, Registration
+from afspm.errors import InvalidValue
 
 Array = NDArray[np.float64]
+
+FORECAST_VERSION = 1
+"""Of all kinds of forecast as plain data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +79,17 @@ class Update:
     registrations: Table[str, Registration]
     forecast: Forecast
     quality: Table[str, float] = field(default_factory=dict)
+
+
+def require_newer(scan: DriftScan, newest_s: float | None) -> None:
+    """Refuse a scan out of its turn.
+
+    Raises:
+        InvalidValue: it is older than the newest one.
+    """
+    if newest_s is not None and scan.mid_s < newest_s:
+        late = f"the middle of scan {scan.key!r} is at {scan.mid_s:g} s, and {newest_s:g} s was reached already"
+        raise InvalidValue(late, hint="a tracker takes scans in the order of time")
 
 
 class Tracker(Protocol):

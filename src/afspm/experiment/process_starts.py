@@ -143,7 +143,6 @@ def _start(
             subscribe=tuple(met(source) for source in links.subscribe),
             serve=bound(links.serve),
             control=met(links.control) if links.control else None,
-            log=_log(resolved)[0],
         ),
         envelopes=resolved.envelopes(part),
         problems=resolved.named_problems,
@@ -225,18 +224,7 @@ def _keys(
         owner = owners.get(target) or next((o for bind, o in owners.items() if reaches(target, bind)), None)
         if owner is not None:
             keys[target] = owner
-    log, collector = _log(resolved)
-    if log is not None:
-        keys[log] = collector
     return keys
-
-
-def _log(resolved: ResolvedExperiment) -> tuple[str | None, str]:
-    """Where a component collects the log lines of all others, and its name."""
-    for name, component in resolved.classes.items():
-        if getattr(component, "collects_logs", False) is True:
-            return connectable(str(resolved.settings[name]["address"])), name
-    return None, ""
 
 
 def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:

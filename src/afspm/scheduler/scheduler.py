@@ -22,12 +22,12 @@ from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.scheduler.write_ahead import WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
-from afspm.transport.complaints import Complaints
-from afspm.transport.launching import Launched
+from afspm.transport.port import LaunchedProcess
+from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import SchedulerSockets
 
 
-class SchedulerLaunch(Launched, Protocol):
+class SchedulerLaunch(LaunchedProcess, Protocol):
     """The part of `afspm.launch.Launch` that is needed here."""
 
     @property
@@ -99,8 +99,8 @@ class Scheduler:
         core = self._core(context)
         _restore(core, state, log_folder(folder) if folder else None)
         write_ahead = WriteAhead(state, PacketLog(log_folder(folder)) if folder else None, core.cached, log)
-        complaints = Complaints(log, clock)
-        sockets = SchedulerSockets(launch, complaints, since_ns=core.newest_source_ns, epoch=_epoch(context))
+        warnings = RateLimitedLog(log, clock)
+        sockets = SchedulerSockets(launch, warnings, since_ns=core.newest_source_ns, epoch=_epoch(context))
         stopping = threading.Event()
 
         def stop() -> None:
@@ -108,7 +108,7 @@ class Scheduler:
             sockets.wake_up()
 
         context.when_stopping(stop)
-        shell = self._shell(core, sockets, clock, write_ahead, complaints, log)
+        shell = self._shell(core, sockets, clock, write_ahead, warnings, log)
         try:
             shell.start()
             while not (shell.over or stopping.is_set()):

@@ -1,9 +1,9 @@
 """One file of the packet log: packets one after the other, each with its length and a checksum.
 
 A packet is: "AFp3", the number of the file, the lengths of envelope and payload, its time and the translator's time of
-it (-1: none), how many of its envelope are cached, the checksum of all that; envelope; payload. Backlogs and keyed
-results of components are kept in the same form, in files with the number 0. The checksum of a large payload is the sum
-of its 64-bit words, which takes a hundredth of the time that sending them takes.
+it (-1: none), how many of its envelope are cached, the checksum of all that; envelope; payload. Keyed results
+of components are kept in the same form, in files with the number 0. The checksum of a large payload is the sum of its
+64-bit words, which takes a hundredth of the time that sending them takes.
 
 To write over an old file takes a fraction of the time that new room on a disk does. The number of the file, which is
 new each time, tells what is left of before from what is new; the checksum tells what a kill or power cut left half.

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.estimators import estimator
+from afspm.drift.overlap import too_far_off, too_little_shared
 from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan
-from afspm.drift.rescan import too_far_off, too_little_shared
 from afspm.drift.trackers import tracker
 from afspm.drift.tracking import Tracker, Update
 from afspm.model import Frame, Region

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from afspm.drift.estimators import DEFAULT as DEFAULT_ESTIMATOR
-from afspm.drift.rescan import F_RESCAN
+from afspm.drift.overlap import F_RESCAN
 from afspm.drift.trackers import DEFAULT as DEFAULT_TRACKER
 from afspm.errors import ConfigError, InvalidValue
 
@@ -26,7 +26,7 @@ class NightSettings:
         line_s: of trace and retrace together.
         hours: how long.
         drift_m: how far the sample goes in the end; its direction, and a random walk besides, follow from the seed.
-        rescan: when a scan is taken again, see `afspm.drift.rescan`: "tolerance", "paper" or "never".
+        rescan: when a scan is taken again, see `afspm.drift.overlap`: "tolerance", "paper" or "never".
         tolerance_m: for that rule; None: a tenth of the size.
         f_rescan: for that of the paper.
         estimator, tracker: "class" and settings.

@@ -79,8 +79,7 @@ def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
     """The keys of a process out of the folder, with those of others only where it has to know them."""
     launch = start.launch
     own = keys.from_launch(launch.name, launch.keys)
-    collects = getattr(experiment.resolved.classes.get(launch.name), "collects_logs", False) is True
-    if own is None or launch.sockets.publish or launch.sockets.serve or collects or start.command:
+    if own is None or launch.sockets.publish or launch.sockets.serve or start.command:
         return own
     known = {key: name for key, name in own.peers.items() if name in own.servers.values()}
     return replace(own, peers=known, folder=None)

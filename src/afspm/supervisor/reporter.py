@@ -30,9 +30,8 @@ from afspm.model import (
     Response,
 )
 from afspm.process.context import new_session
-from afspm.transport.launching import open_port
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
-from afspm.transport.zmq_port import ZmqPort
+from afspm.transport.zmq_port import ZmqPort, open_port
 
 STATES_S = 2.0
 """Real time between two times that all states are told, at most."""

@@ -557,7 +557,7 @@ def run_translator(microscope: Driver, context: ProcessContext, make: Callable[.
 
 def _run_alone(microscope: Driver, context: ProcessContext, make: Callable[..., Translator]) -> int:
     """The sockets, the memory and the translator itself."""
-    from afspm.transport.launching import open_server_port
+    from afspm.transport.zmq_server import open_server_port
 
     launch = context.launch
     # saved several times with each request: all of it is for a kill, after a power cut no request is waiting any more

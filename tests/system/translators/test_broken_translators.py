@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from afspm.testing.translators import Options, Report, bench, run
-from afspm.testing.translators.report import Outcome
+from afspm.testing.translators import CheckOptions, CheckReport, client, run
+from afspm.testing.translators.report import CheckOutcome, show_result
 from afspm.testing.translators.session import SPEED
-from afspm.testing.translators.showing import show_result
 
 HERE = Path(__file__).parent
 STUCK = ("NeverFreeAgain", "SuccessWithoutChange")
@@ -28,11 +27,11 @@ initial = {{ tip-bias-voltage = "200 mV", scan-angle = "3 deg" }}
 """
 
 
-def checked(folder: Path, name: str, *only: str, speed: float = SPEED) -> Report:
+def checked(folder: Path, name: str, *only: str, speed: float = SPEED) -> CheckReport:
     shutil.copy(HERE / "broken.py", folder)
     file = folder / "experiment.toml"
     file.write_text(EXPERIMENT.format(name=name), encoding="utf-8")
-    return run(Options([file], runs=folder / "runs", only=only, speed=speed))
+    return run(CheckOptions([file], runs=folder / "runs", only=only, speed=speed))
 
 
 @pytest.mark.parametrize(
@@ -71,7 +70,7 @@ def test_what_is_wrong_is_said_in_one_line(
     name: str, check: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if name in STUCK:  # it is waited for twice, in vain
-        monkeypatch.setattr(bench, "NOTICED_S", 4.0)
+        monkeypatch.setattr(client, "NOTICED_S", 4.0)
     report = checked(tmp_path, f"broken.{name}", check)
     lines = {failure.name: failure.line for failure in report.failed}
     assert list(lines) == [check], report
@@ -95,7 +94,7 @@ def test_what_a_translator_logs_is_shown_with_the_check_that_failed(tmp_path: Pa
 def test_what_a_controller_is_known_not_to_do_is_skipped_with_the_reason(tmp_path: Path) -> None:
     report = checked(tmp_path, "broken.TurnedAsIsKnown", "scan/picture")
     (result,) = report.results
-    assert result.outcome is Outcome.SKIPPED
+    assert result.outcome is CheckOutcome.SKIPPED
     assert "is known to turn: expected details" in result.line
     assert report.passed
 
@@ -103,7 +102,7 @@ def test_what_a_controller_is_known_not_to_do_is_skipped_with_the_reason(tmp_pat
 def test_a_spectrum_that_goes_on_when_it_is_stopped_is_not_one_that_was_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "NOTICED_S", 4.0)  # what is waited for in vain
+    monkeypatch.setattr(client, "NOTICED_S", 4.0)  # what is waited for in vain
     report = checked(tmp_path, "broken.SpectrumNotStopped", "spectrum/cancel", speed=1.0)
     (failure,) = report.failed
     assert re.search("expected SS_INTERRUPTED .*; came SS_SPEC, Spec1d, SS_FREE", failure.line), failure.line

@@ -16,7 +16,7 @@ import pytest
 from afspm.errors import ConfigError
 from afspm.process.memory import Memory
 from afspm.supervisor.ports import FreePorts
-from afspm.testing.translators import Options, Outcome, Report, bench, run
+from afspm.testing.translators import CheckOptions, CheckOutcome, CheckReport, client, run
 from afspm.testing.translators.registry import all_checks
 
 DEADLINE_S = 60.0
@@ -71,17 +71,17 @@ def file(tmp_path: Path) -> Path:
     return written
 
 
-def values(report: Report) -> dict[str, Any]:
+def values(report: CheckReport) -> dict[str, Any]:
     """What is in force at the simulated controller, as it keeps it."""
     found: dict[str, Any] = Memory(Path(report.folder) / "state" / "microscope.json")["microscope"]["values"]
     return found
 
 
 def test_the_simulator_does_all_that_it_should_and_is_left_as_it_was(file: Path) -> None:
-    report = run(Options([file], runs=file.parent / "runs"))
+    report = run(CheckOptions([file], runs=file.parent / "runs"))
     assert report.passed, report
     assert [result.name for result in report.results] == [check.name for check in all_checks()]
-    assert {result.outcome for result in report.results} == {Outcome.PASSED}
+    assert {result.outcome for result in report.results} == {CheckOutcome.PASSED}
     after = values(report)
     assert after["tip-bias-voltage"] == pytest.approx(0.2)
     assert after["scan-angle"] == pytest.approx(3.0)
@@ -92,7 +92,7 @@ def test_the_simulator_does_all_that_it_should_and_is_left_as_it_was(file: Path)
 
 
 def test_the_report_lists_what_is_supported_and_what_is_not(file: Path) -> None:
-    report = run(Options([file], runs=file.parent / "runs", only=["parameter/tip-bias"]))
+    report = run(CheckOptions([file], runs=file.parent / "runs", only=["parameter/tip-bias"]))
     written = json.loads((Path(report.folder) / "report.json").read_text(encoding="utf-8"))
     assert written["passed"] is True
     assert written["controller"].startswith("simulated microscope of afspm")
@@ -122,29 +122,31 @@ def test_what_is_not_supported_is_skipped_and_listed(tmp_path: Path) -> None:
     )
     file = tmp_path / "experiment.toml"
     file.write_text('[microscope]\ncomponent = true\nclass = "poor.Poor"\n', encoding="utf-8")
-    report = run(Options([file], runs=tmp_path / "runs", only=["turned", "spectrum/", "igain", "frame/set"]))
-    lines = {result.name: result.line for result in report.results if result.outcome is Outcome.SKIPPED}
+    report = run(CheckOptions([file], runs=tmp_path / "runs", only=["turned", "spectrum/", "igain", "frame/set"]))
+    lines = {result.name: result.line for result in report.results if result.outcome is CheckOutcome.SKIPPED}
     assert lines["scan/turned"] == "not supported: scan-angle"
     assert lines["spectrum/order"] == "not supported: start-spec"
     assert lines["parameter/zctrl-igain"] == "not supported: zctrl-igain"
-    assert [result.name for result in report.results if result.outcome is Outcome.PASSED] == ["frame/set"]
+    assert [result.name for result in report.results if result.outcome is CheckOutcome.PASSED] == ["frame/set"]
     assert report.passed
     assert report.support.actions["start-spec"] is False
 
 
 def test_a_spectrum_too_short_to_be_stopped_is_said_to_be(file: Path) -> None:
-    report = run(Options([file], runs=file.parent / "runs", speed=5000.0, only=["spectrum/cancel", "spectrum/order"]))
+    report = run(
+        CheckOptions([file], runs=file.parent / "runs", speed=5000.0, only=["spectrum/cancel", "spectrum/order"])
+    )
     outcomes = {result.name: (result.outcome, result.line) for result in report.results}
-    assert outcomes["spectrum/cancel"] == (Outcome.SKIPPED, "a spectrum is over sooner than it could be stopped")
-    assert outcomes["spectrum/order"] == (Outcome.PASSED, "")
+    assert outcomes["spectrum/cancel"] == (CheckOutcome.SKIPPED, "a spectrum is over sooner than it could be stopped")
+    assert outcomes["spectrum/order"] == (CheckOutcome.PASSED, "")
 
 
 def test_a_translator_of_version_1_made_without_afspm_is_checked_just_the_same(tmp_path: Path) -> None:
     file = tmp_path / "experiment.toml"
     file.write_text(PLAIN.format(script=Path(__file__).with_name("plain.py").as_posix()), encoding="utf-8")
-    report = run(Options([file], runs=tmp_path / "runs"))
+    report = run(CheckOptions([file], runs=tmp_path / "runs"))
     assert report.passed, report
-    passed = {result.name for result in report.results if result.outcome is Outcome.PASSED}
+    passed = {result.name for result in report.results if result.outcome is CheckOutcome.PASSED}
     assert {
         "scan/cancel",
         "scan/order",
@@ -186,7 +188,9 @@ def test_running_ones_are_joined_and_left_running(file: Path) -> None:
     file.write_text(addresses + EXPERIMENT, encoding="utf-8")
     with started("run", "experiment.toml", "-v", cwd=file.parent) as process:
         until(process, "scheduler  is up")
-        options = Options([file], ["scheduler", "microscope"], file.parent / "joined", only=["frame/set", "unknown"])
+        options = CheckOptions(
+            [file], ["scheduler", "microscope"], file.parent / "joined", only=["frame/set", "unknown"]
+        )
         for _ in range(2):  # who was there before is nobody's business
             report = run(options)
             assert report.passed, report
@@ -215,7 +219,7 @@ def test_ctrl_c_in_the_middle_of_a_scan_puts_everything_back(file: Path) -> None
 def test_a_translator_that_does_not_find_its_controller_is_said_to_with_what_it_said_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "STARTED_S", 8.0)
+    monkeypatch.setattr(client, "STARTED_S", 8.0)
     (tmp_path / "deaf.py").write_text(
         "from afspm.microscopes.simulator import Simulator\n\n\n"
         "class Deaf(Simulator):\n"
@@ -225,7 +229,7 @@ def test_a_translator_that_does_not_find_its_controller_is_said_to_with_what_it_
     )
     file = tmp_path / "experiment.toml"
     file.write_text('[microscope]\ncomponent = true\nclass = "deaf.Deaf"\n', encoding="utf-8")
-    report = run(Options([file], runs=tmp_path / "runs"))
+    report = run(CheckOptions([file], runs=tmp_path / "runs"))
     assert "a controller that is found" in report.lost
     assert "nobody is at home" in report.lost
     assert not report.passed
@@ -267,9 +271,9 @@ def test_what_can_not_be_checked_is_refused_before_anything_starts(text: str, sa
     file = tmp_path / "experiment.toml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=said):
-        run(Options([file], runs=tmp_path / "runs"))
+        run(CheckOptions([file], runs=tmp_path / "runs"))
     with pytest.raises(ConfigError, match="there is no check no-such-check"):
-        run(Options([file], runs=tmp_path / "runs", only=["no-such-check"]))
+        run(CheckOptions([file], runs=tmp_path / "runs", only=["no-such-check"]))
     assert not (tmp_path / "runs").exists()
 
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from registering import PIXEL_M, Waves, scanned
 
-from afspm.drift.estimators import estimator, matching
-from afspm.drift.estimators.matching import matched
+from afspm.drift.estimators import estimator, keypoints
+from afspm.drift.estimators.keypoints import matched
 from afspm.drift.registration import Prior, Registration
 from afspm.errors import ConfigError
 from afspm.model import Region
@@ -212,7 +212,7 @@ coordinates = st.integers(-20, 20).map(float)
 )
 def test_matching_piece_by_piece_finds_what_one_table_would(pair: tuple[np.ndarray, np.ndarray], cells: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(matching, "_CELLS", cells)
+        patch.setattr(keypoints, "_CELLS", cells)
         assert [tuple(row) for row in matched(*pair)] == mutual(*pair)
 
 

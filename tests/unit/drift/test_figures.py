@@ -16,7 +16,18 @@ from afspm.model import Region
 pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 
-from afspm.drift.figures import errors, estimates, features, histogram, offsets, pairs, style
+from afspm.drift.figures import style
+from afspm.drift.figures.drawings import (
+    ScanPair,
+    _in_frame,
+    draw_errors,
+    draw_estimates,
+    draw_features,
+    draw_histogram,
+    draw_offsets,
+    draw_pairs,
+    freedman_diaconis,
+)
 
 
 def scan(k: int = 0) -> DriftScan:
@@ -37,14 +48,14 @@ def labels(made: Figure) -> str:
 @pytest.mark.parametrize("n", [1, 2, 20])
 def test_offsets_are_drawn_with_units_even_of_a_single_scan(n: int, tmp_path: Path) -> None:
     run = record()[:n]
-    made = drawn(offsets.draw(run, truth_m=run.drift_m, switched_on_s=run.time_s[0]), tmp_path)
+    made = drawn(draw_offsets(run, truth_m=run.drift_m, switched_on_s=run.time_s[0]), tmp_path)
     assert len(made.axes) == 4  # the colours of time too
     assert "time / h" in labels(made)
     assert "x / nm" in labels(made) or "x / µm" in labels(made)
 
 
 def test_estimates_show_the_refused_apart(tmp_path: Path) -> None:
-    made = drawn(estimates.draw(record(), truth_m=record().misplacement_m), tmp_path)
+    made = drawn(draw_estimates(record(), truth_m=record().misplacement_m), tmp_path)
     names = made.axes[0].get_legend_handles_labels()[1]
     assert {"refused", "x ± 2 sd", "y ± 2 sd", "x, true"} <= set(names)
     (crosses,) = (line for line in made.axes[0].lines if line.get_label() == "refused")
@@ -53,17 +64,17 @@ def test_estimates_show_the_refused_apart(tmp_path: Path) -> None:
 
 def test_bins_are_as_wide_as_freedman_and_diaconis_say() -> None:
     values = np.random.default_rng(1).normal(size=1000)
-    edges = histogram.freedman_diaconis(values)
+    edges = freedman_diaconis(values)
     np.testing.assert_allclose(edges, np.histogram_bin_edges(values, bins="fd"))
-    assert len(histogram.freedman_diaconis(np.full(5, 3.0))) == 2
+    assert len(freedman_diaconis(np.full(5, 3.0))) == 2
 
 
 def test_the_histogram_counts_accepted_pairs_only_and_not_the_first_scan(tmp_path: Path) -> None:
-    made = drawn(histogram.draw(record()), tmp_path)
+    made = drawn(draw_histogram(record()), tmp_path)
     counted = [sum(patch.get_height() for patch in ax.patches) for ax in made.axes]
     assert counted == [np.count_nonzero(record().matched[1:])] * 3
     none = record()[:1]
-    assert "no pair" in made_text(histogram.draw(none))
+    assert "no pair" in made_text(draw_histogram(none))
 
 
 def made_text(made: Figure) -> str:
@@ -71,8 +82,8 @@ def made_text(made: Figure) -> str:
 
 
 def test_pairs_say_how_far_and_how_much_later(tmp_path: Path) -> None:
-    two = [pairs.Pair(scan(0), scan(8), np.array([300e-9, 400e-9]), "off"), pairs.Pair(scan(1), scan(9), np.zeros(2))]
-    made = drawn(pairs.draw(two), tmp_path)
+    two = [ScanPair(scan(0), scan(8), np.array([300e-9, 400e-9]), "off"), ScanPair(scan(1), scan(9), np.zeros(2))]
+    made = drawn(draw_pairs(two), tmp_path)
     assert made.axes[1].get_title(loc="left") == "2.00 h later: 500.0 nm"
     assert made.axes[0].get_title(loc="left") == "off"
 
@@ -80,17 +91,17 @@ def test_pairs_say_how_far_and_how_much_later(tmp_path: Path) -> None:
 def test_inliers_and_outliers_are_told_apart_and_what_has_no_features_is_refused(tmp_path: Path) -> None:
     at = np.random.default_rng(1).uniform(-0.4e-6, 0.4e-6, (30, 2))
     inlier = np.arange(30) < 21
-    made = drawn(features.draw(scan(0), scan(1), Matches(at, at, inlier)), tmp_path)
+    made = drawn(draw_features(scan(0), scan(1), Matches(at, at, inlier)), tmp_path)
     assert made.axes[3].get_title(loc="right") == "21 inliers of 30 pairs"
     assert sum(line.get_marker() == "x" for line in made.axes[2].lines) == 9
     with pytest.raises(InvalidValue, match="features"):
-        features.draw(scan(0), scan(1), None)
+        draw_features(scan(0), scan(1), None)
 
 
 def test_a_keypoint_lies_on_the_pixel_that_it_was_found_at() -> None:
     one = scan()
     x, y = one.region.pixels_m(one.values.shape)
-    corner = features._in_frame(one, np.array([[x[-1, 0], y[-1, 0]]]))[0]
+    corner = _in_frame(one, np.array([[x[-1, 0], y[-1, 0]]]))[0]
     left, low = one.region.top_left_m
     np.testing.assert_allclose(corner, [1e6 * left, 1e6 * (low + one.region.size_m[1])])
 
@@ -98,7 +109,7 @@ def test_a_keypoint_lies_on_the_pixel_that_it_was_found_at() -> None:
 def test_true_errors_are_those_of_place_and_of_knowledge(tmp_path: Path) -> None:
     run = record()
     truth = run.drift_m + 7e-6  # from another zero on
-    made = drawn(errors.draw(run, truth, switched_on_s=float(run.time_s[8])), tmp_path)
+    made = drawn(draw_errors(run, truth, switched_on_s=float(run.time_s[8])), tmp_path)
     shown = np.asarray(made.axes[0].lines[0].get_ydata(), dtype=float)
     np.testing.assert_allclose(shown[1:], 1e9 * np.hypot(*run.misplacement_m[1:].T))
     assert np.isnan(shown[0])
@@ -126,4 +137,4 @@ def test_a_record_of_nothing_refused_has_no_such_mark() -> None:
     all_good = DriftRecord(
         run.keys, run.time_s, run.center_m, run.drift_m, run.covariance_m2, run.rate_m_s, np.ones(20, bool), run.reasons
     )
-    assert "refused" not in estimates.draw(all_good).axes[0].get_legend_handles_labels()[1]
+    assert "refused" not in draw_estimates(all_good).axes[0].get_legend_handles_labels()[1]

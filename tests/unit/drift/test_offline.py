@@ -85,14 +85,15 @@ def test_an_album_holds_every_figure_that_there_is_something_for(
     scans = [DriftScan(np.random.default_rng(k).normal(size=(16, 16)), REGION, t, t) for k, t in enumerate(run.time_s)]
     at = np.random.default_rng(1).uniform(0.5e-6, 1.5e-6, (9, 2))
     matched = replace(found((0.0, 0.0)), matches=Matches(at, at, np.arange(9) > 2))
-    parts = [album.Part("off", "correction off", 0, 4, run[:4]), album.Part("on", "correction on", 4, 12, run[4:])]
-    whole = album.Run(scans, run, parts, (0, 1, matched), run.drift_m)
+    spans = {"off": (0, 4), "on": (4, 12)}
+    parts = [album.RunPart(name, f"correction {name}", a, b, run[a:b]) for name, (a, b) in spans.items()]
+    whole = album.DriftRun(scans, run, parts, (0, 1, matched), run.drift_m)
     assert whole.switched_on_s == run.time_s[4]
     names = {path.stem for path in album.write(whole, tmp_path)}
     assert names == {
         "drift_offset", "drift_pairs", "drift_estimates_off", "drift_histogram_off", "drift_estimates_on",
         "drift_histogram_on", "drift_features", "drift_errors",
     }  # fmt: skip
-    plain = album.Run(scans, run, [album.Part("", "Height", 0, 12)])
+    plain = album.DriftRun(scans, run, [album.RunPart("", "Height", 0, 12)])
     assert plain.switched_on_s is None
     assert [path.stem for path in album.write(plain, tmp_path)] == ["drift_offset", "drift_pairs"]

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from afspm.drift.rescan import too_far_off, too_little_shared
+from afspm.drift.overlap import too_far_off, too_little_shared
 from afspm.errors import InvalidValue
 from afspm.model import Frame, Region
 

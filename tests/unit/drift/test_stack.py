@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from afspm.drift.offline import corrected
 from afspm.drift.registration import DriftScan
-from afspm.drift.stack import corrected
 from afspm.errors import InvalidValue
 from afspm.model import Frame, Region
 

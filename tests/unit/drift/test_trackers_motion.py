@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
-from afspm.drift.trackers.compensation import Compensation
-from afspm.drift.trackers.motion import Models
+from afspm.drift.trackers.filters import Models
+from afspm.drift.trackers.forecast import Compensation
+from afspm.model.snapshot import from_plain, to_plain
 
 MODELS = Models(np.full(4, 2e-24), np.array([0.0, 1 / 10800.0, 1 / 2700.0, 1 / 30.0]), 5e-22)
 
@@ -51,7 +54,7 @@ def test_a_controller_follows_in_steps() -> None:
     assert second.followed_m(50.0, 250.0).tolist() == [100.0, 100.0]
     assert second.followed_m(250.0, 50.0).tolist() == [-100.0, -100.0]
     assert second.velocity_m_s(150.0).tolist() == [1.0, 0.0]
-    assert Compensation.from_list([list(one) for one in second.changes]) == second
+    assert from_plain(Compensation, json.loads(json.dumps(to_plain(second)))) == second
 
 
 def test_changes_that_nobody_asks_for_any_more_are_forgotten() -> None:

@@ -128,8 +128,8 @@ def test_translations_are_the_default_and_are_not_touched() -> None:
     tracker = BankTracker(LeastSquares(), compared=2)
     update = followed(Sample(TURN / INTERVAL_S), tracker, 3).updates[-1]
     assert np.array_equal(update.after.mapping.linear, np.eye(2))
-    assert "similarity" not in tracker.state()
-    assert "straight" not in update.forecast.to_dict()
+    assert tracker.state()["similarity"] is None
+    assert update.forecast.to_dict()["straight"] is None
     assert list(update.quality) == ["references"]
 
 

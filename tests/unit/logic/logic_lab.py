@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from tests.simulation.codec import TableCodec
+
 from afspm.logic.event_log import PERIOD_S
 from afspm.logic.events import (
     Connected,
@@ -42,7 +44,6 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.testing.deterministic.codec import TableCodec
 
 NS = 10**9
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from afspm import wire
 from afspm.drift.mapping import Mapping
+from afspm.drift.trackers import forecast_from_dict
 from afspm.drift.trackers.paper import PaperForecast
 from afspm.logic.events import (
     Connected,
@@ -94,7 +95,7 @@ def forecast(
 def registered(job: ScanJob, plain: dict[str, Any], *, lost: bool = False, rescan: str = "") -> Registered:
     """What a worker says that knows this forecast."""
     middle_s = (job.start_s + job.end_s) / 2
-    there = PaperForecast.from_dict(plain).at(middle_s)
+    there = forecast_from_dict(plain).at(middle_s)
     zero = [[0.0, 0.0], [0.0, 0.0]]
     return Registered(
         key=job.key,

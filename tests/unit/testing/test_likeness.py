@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from afspm.model import Region
-from afspm.testing.translators.frames import Frames
-from afspm.testing.translators.likeness import CLEARLY, LIKE, Idea, Picture, best_of, ideas, likenesses
+from afspm.testing.translators.checks.picture import CLEARLY, LIKE, Idea, ScanPicture, best_of, ideas, likenesses
+from afspm.testing.translators.measuring import FrameSettings
 
 WHOLE = Region((2e-6, -1e-6), (1e-6, 1e-6), math.radians(10.0))
 TOLD = "as told"
@@ -29,13 +29,13 @@ def surface_m(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.
     return np.asarray(sum(bumps))
 
 
-def picture_of(region: Region, shape: tuple[int, int], noise: float = 0.02, seed: int = 0) -> Picture:
+def picture_of(region: Region, shape: tuple[int, int], noise: float = 0.02, seed: int = 0) -> ScanPicture:
     values = surface_m(*region.pixels_m(shape))
-    return Picture(region, values + np.random.default_rng(seed).normal(0.0, noise, shape))
+    return ScanPicture(region, values + np.random.default_rng(seed).normal(0.0, noise, shape))
 
 
-def all_pictures(noise: float = 0.02) -> tuple[Picture, list[Picture]]:
-    frames = Frames(WHOLE)
+def all_pictures(noise: float = 0.02) -> tuple[ScanPicture, list[ScanPicture]]:
+    frames = FrameSettings(WHOLE)
     details = [frames.plain, frames.wide, frames.turned]
     return (
         picture_of(WHOLE, (96, 96), noise),
@@ -62,7 +62,7 @@ def test_wrong_axes_are_found_out(name: str) -> None:
 def test_swapped_axes_are_found_out() -> None:
     larger, details = all_pictures()
 
-    def swapped(picture: Picture) -> Picture:
+    def swapped(picture: ScanPicture) -> ScanPicture:
         return replace(picture, values=picture.values.T.copy())
 
     square = [detail for detail in details if detail.values.shape[0] == detail.values.shape[1]]
@@ -74,7 +74,7 @@ def test_half_a_frame_is_found_out() -> None:
     """Told by its centre where its corner is meant."""
     larger, details = all_pictures()
 
-    def moved(picture: Picture) -> Picture:
+    def moved(picture: ScanPicture) -> ScanPicture:
         return ideas(WHOLE.angle_rad)["half a frame away (+0.5, +0.5)"](picture)
 
     found = likenesses(moved(larger), list(map(moved, details)))

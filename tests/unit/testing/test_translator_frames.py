@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.model import Region
-from afspm.testing.translators.frames import Frames, difference
+from afspm.testing.translators.measuring import FrameSettings, difference
 
 REGION = Region((1e-6, -2e-6), (4e-7, 2e-7), 0.3)
 
@@ -15,7 +15,7 @@ REGION = Region((1e-6, -2e-6), (4e-7, 2e-7), 0.3)
 @given(st.floats(-3.1, 3.1), st.floats(1e-8, 1e-4), st.floats(0.2, 5.0), st.floats(-1e-4, 1e-4))
 def test_no_frame_reaches_beyond_the_one_that_is_set(angle: float, side_m: float, ratio: float, x_m: float) -> None:
     whole = Region((x_m, -x_m), (side_m, side_m * ratio), angle)
-    frames = Frames(whole)
+    frames = FrameSettings(whole)
     grown = Region(whole.center_m, tuple(1.0001 * size for size in whole.size_m), angle)  # type: ignore[arg-type]
     for frame in (frames.plain, frames.other, frames.wide, frames.turned):
         assert all(grown.contains((float(x), float(y))) for x, y in frame.region.corners_m())
@@ -23,7 +23,7 @@ def test_no_frame_reaches_beyond_the_one_that_is_set(angle: float, side_m: float
 
 
 def test_frames_differ_from_each_other_in_place() -> None:
-    frames = Frames(REGION)
+    frames = FrameSettings(REGION)
     centers = [frame.region.center_m for frame in (frames.plain, frames.other, frames.wide, frames.turned)]
     apart = [math.dist(a, b) for i, a in enumerate(centers) for b in centers[:i]]
     assert min(apart) > 0.05 * min(REGION.size_m)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.least_squares.grid import Grid, onto_common_grid
-from afspm.drift.estimators.least_squares.prepare import Image, Unusable, prepare
-from afspm.drift.estimators.least_squares.search import Correlation as Coefficients
+from afspm.drift.estimators.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
+from afspm.drift.estimators.search import MaskedCorrelation
 from afspm.drift.overlap import overlap_center_m
 from afspm.drift.registration import DriftScan, Prior, Registration
 from afspm.errors import ConfigError
@@ -78,8 +77,8 @@ class Correlation:
             quality=found.quality,
         )
 
-    def _peak(self, first: Image, second: Image, grid: Grid, prior: Prior | None) -> _Peak | None:
-        coefficients = Coefficients(first.known, second.known)
+    def _peak(self, first: Image, second: Image, grid: CommonGrid, prior: Prior | None) -> _Peak | None:
+        coefficients = MaskedCorrelation(first.known, second.known)
         c = coefficients.of(_smooth(first), _smooth(second))
         index = np.moveaxis(np.indices(c.shape), 0, -1).astype(np.float64)
         shifts = coefficients.shifts_px(index)
@@ -132,7 +131,7 @@ def _smooth(image: Image) -> Array:
     return smooth
 
 
-def _deviations(shifts_px: Array, grid: Grid, prior: Prior) -> Array:
+def _deviations(shifts_px: Array, grid: CommonGrid, prior: Prior) -> Array:
     """Squared standard deviations of shifts (…, 2) from the expected one; half a pixel is what the grid is off."""
     back = np.linalg.inv(grid.to_m)
     inverse = np.linalg.inv(back @ prior.covariance_m2 @ back.T + 0.25 * np.eye(2))

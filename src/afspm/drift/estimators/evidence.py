@@ -37,7 +37,7 @@ _DEVIATIONS_MAX = 25.0  # squared, from what was expected
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class ConsensusEvidence:
     """All matches, `a` and `b` (n, 2) in tip coordinates, m; which of them agree on what; the common pixel."""
 
     a: Array
@@ -64,7 +64,7 @@ class Standards:
 
 
 def weighed(
-    evidence: Evidence,
+    evidence: ConsensusEvidence,
     reference: Region,
     scan: Region,
     prior: Prior | None,
@@ -91,7 +91,7 @@ def weighed(
     return figures, _objection(figures, len(evidence.a), standards, prior is not None, covariance, deviations)
 
 
-def covariance_m2(evidence: Evidence, reference: Region, scan: Region, center: Array) -> Array:
+def covariance_m2(evidence: ConsensusEvidence, reference: Region, scan: Region, center: Array) -> Array:
     """Covariance (2, 2) of the displacement at `center`; NaN where the inliers are too few places to tell."""
     inlier = evidence.consensus.inlier
     a, b = evidence.a[inlier], evidence.b[inlier]
@@ -119,7 +119,7 @@ def _objection(
     return ""
 
 
-def _log10_false_alarms(evidence: Evidence, reference: Region, prior: Prior | None) -> float:
+def _log10_false_alarms(evidence: ConsensusEvidence, reference: Region, prior: Prior | None) -> float:
     """Of matches that see the same feature one counts: they are no independent witnesses."""
     radius_m = evidence.radius_m
     # Two places thrown into the scans lie a given displacement apart with at most this density.
@@ -133,7 +133,7 @@ def _log10_false_alarms(evidence: Evidence, reference: Region, prior: Prior | No
     return log10_false_alarms(agree + others, agree, evidence.form.pairs, chance)
 
 
-def _second(evidence: Evidence, standards: Standards) -> float:
+def _second(evidence: ConsensusEvidence, standards: Standards) -> float:
     """How many of the others agree on one other displacement, for each that agrees on the best."""
     transform, radius_m = evidence.consensus.transform, evidence.radius_m
     far = ((transform(evidence.a) - evidence.b) ** 2).sum(axis=1) > (2.0 * radius_m) ** 2

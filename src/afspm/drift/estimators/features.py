@@ -14,11 +14,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.drift.estimators.evidence import Evidence, Standards, covariance_m2, weighed
-from afspm.drift.estimators.keypoints import KINDS, Keypoints
-from afspm.drift.estimators.least_squares.grid import Grid, onto_common_grid
-from afspm.drift.estimators.least_squares.prepare import Image, Unusable, prepare
-from afspm.drift.estimators.matching import matched
+from afspm.drift.estimators.evidence import ConsensusEvidence, Standards, covariance_m2, weighed
+from afspm.drift.estimators.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
+from afspm.drift.estimators.keypoints import KINDS, Keypoints, matched
 from afspm.drift.estimators.ransac import FORMS, Consensus, Form, Search, tightened
 from afspm.drift.overlap import overlap_center_m
 from afspm.drift.registration import DriftScan, Matches, Prior, Registration
@@ -91,7 +89,7 @@ class Features:
         found = self._consensus(a, b, self._limit_m(reference, scan), FINE_PX * pixel_m)
         if found is None:
             return Registration.refused(f"no transform agrees with any of {len(a)} matches", quality)
-        return self._judged(reference, scan, Evidence(a, b, found, self._form, pixel_m), prior, quality)
+        return self._judged(reference, scan, ConsensusEvidence(a, b, found, self._form, pixel_m), prior, quality)
 
     @property
     def _form(self) -> Form:
@@ -111,7 +109,12 @@ class Features:
         return tightened(a, b, best, self._form, least=least, most=limit_m, bend_max=self.bend_max)
 
     def _judged(
-        self, reference: DriftScan, scan: DriftScan, evidence: Evidence, prior: Prior | None, quality: dict[str, float]
+        self,
+        reference: DriftScan,
+        scan: DriftScan,
+        evidence: ConsensusEvidence,
+        prior: Prior | None,
+        quality: dict[str, float],
     ) -> Registration:
         transform = evidence.consensus.transform
         center = overlap_center_m(reference.region, scan.region, transform.shift)
@@ -152,7 +155,7 @@ class Sift(Features):
 
 
 def _matched(
-    grid: Grid, first: Keypoints, second: Keypoints, prior: Prior | None, *, slack_m: float
+    grid: CommonGrid, first: Keypoints, second: Keypoints, prior: Prior | None, *, slack_m: float
 ) -> tuple[Array, Array]:
     """Positions (n, 2) of the pairs in tip coordinates. With a prior only those that it allows are looked at, and
     `slack_m` more: what a keypoint may be off, and a small turn moves it."""

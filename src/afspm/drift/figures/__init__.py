@@ -1,7 +1,6 @@
-"""What drift looks like: one module a figure, each with a function `draw` that returns a matplotlib Figure.
+"""The figures of drift, drawn from plain data, so that runs, recorded files and studies share them.
 
-They take plain data (a `DriftRecord`, scans, matches), so that runs, recorded files and studies share them. They need
-matplotlib (`pip install "afspm[plot]"`), which is loaded with the modules, not with this package.
+They need matplotlib (`pip install "afspm[plot]"`), which is loaded with the modules, not with this package.
 """
 
 from __future__ import annotations

@@ -10,7 +10,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from afspm.drift.figures import errors, estimates, features, histogram, offsets, pairs, style
+from afspm.drift.figures import style
+from afspm.drift.figures.drawings import (
+    ScanPair,
+    draw_errors,
+    draw_estimates,
+    draw_features,
+    draw_histogram,
+    draw_offsets,
+    draw_pairs,
+)
 from afspm.drift.offline import spread_pairs
 from afspm.drift.record import DriftRecord
 from afspm.drift.registration import DriftScan, Registration
@@ -22,7 +31,7 @@ _PAIRS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class RunPart:
     """Some scans of a run, one after the other: those before or after drift correction was switched on.
 
     Attributes:
@@ -40,7 +49,7 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class DriftRun:
     """What there is to draw of a run of n scans.
 
     Attributes:
@@ -53,7 +62,7 @@ class Run:
 
     scans: Sequence[DriftScan]
     record: DriftRecord
-    parts: Sequence[Part]
+    parts: Sequence[RunPart]
     matched: tuple[int, int, Registration] | None = None
     truth_m: Array | None = None
 
@@ -63,7 +72,7 @@ class Run:
         return float(self.record.time_s[self.parts[1].start]) if len(self.parts) > 1 else None
 
 
-def write(run: Run, folder: Path, *, title: str = "") -> list[Path]:
+def write(run: DriftRun, folder: Path, *, title: str = "") -> list[Path]:
     """Write what can be drawn of it; returns the files."""
     written = []
     for name, made in _figures(run, title):
@@ -73,29 +82,29 @@ def write(run: Run, folder: Path, *, title: str = "") -> list[Path]:
     return written
 
 
-def _figures(run: Run, title: str) -> Iterator[tuple[str, Figure]]:
+def _figures(run: DriftRun, title: str) -> Iterator[tuple[str, Figure]]:
     record, switched = run.record, run.switched_on_s
-    yield "offset", offsets.draw(record, truth_m=run.truth_m, switched_on_s=switched, title=title)
+    yield "offset", draw_offsets(record, truth_m=run.truth_m, switched_on_s=switched, title=title)
     if chosen := [pair for part in run.parts for pair in _pairs(run, part)]:
-        yield "pairs", pairs.draw(chosen)
+        yield "pairs", draw_pairs(chosen)
     for part in run.parts:
         if part.estimates is None or len(part.estimates) < 2:
             continue
         told = f"{part.title}: first scan against each later one"
-        yield _named("estimates", part), estimates.draw(part.estimates, title=told, truth_m=_left_over(run, part))
-        yield _named("histogram", part), histogram.draw(part.estimates, title=told)
+        yield _named("estimates", part), draw_estimates(part.estimates, title=told, truth_m=_left_over(run, part))
+        yield _named("histogram", part), draw_histogram(part.estimates, title=told)
     if run.matched is not None and run.matched[2].matches is not None:
         first, second, found = run.matched
-        yield "features", features.draw(run.scans[first], run.scans[second], found.matches)
+        yield "features", draw_features(run.scans[first], run.scans[second], found.matches)
     if run.truth_m is not None:
-        yield "errors", errors.draw(record, run.truth_m, switched_on_s=switched)
+        yield "errors", draw_errors(record, run.truth_m, switched_on_s=switched)
 
 
-def _named(name: str, part: Part) -> str:
+def _named(name: str, part: RunPart) -> str:
     return f"{name}_{part.name}" if part.name else name
 
 
-def _left_over(run: Run, part: Part) -> Array | None:
+def _left_over(run: DriftRun, part: RunPart) -> Array | None:
     """What the displacements of a part truly were."""
     if run.truth_m is None:
         return None
@@ -104,11 +113,11 @@ def _left_over(run: Run, part: Part) -> Array | None:
     return left
 
 
-def _pairs(run: Run, part: Part) -> list[pairs.Pair]:
+def _pairs(run: DriftRun, part: RunPart) -> list[ScanPair]:
     """Some of a part, about two hours apart."""
     record, scans = run.record[part.start : part.stop], run.scans[part.start : part.stop]
     moved = record.misplacement_m
     return [
-        pairs.Pair(scans[first], scans[second], moved[second] - moved[first], part.title)
+        ScanPair(scans[first], scans[second], moved[second] - moved[first], part.title)
         for first, second in spread_pairs(record, PAIRS_APART_S, _PAIRS)
     ]

@@ -16,8 +16,9 @@ from afspm.drift.registration import Estimator
 from afspm.drift.trackers.bank import BankTracker
 from afspm.drift.trackers.forecast import BankForecast
 from afspm.drift.trackers.paper import PaperForecast, PaperTracker
-from afspm.drift.tracking import Forecast, Tracker
+from afspm.drift.tracking import FORECAST_VERSION, Forecast, Tracker
 from afspm.errors import ConfigError, InvalidValue
+from afspm.model.snapshot import restored
 
 __all__ = ["DEFAULT", "READY_MADE", "BankTracker", "PaperTracker", "forecast_from_dict", "tracker"]
 
@@ -27,7 +28,9 @@ READY_MADE: Table[str, ReadyMade] = {
     DEFAULT: ReadyMade("afspm.drift.trackers.bank.BankTracker", "numpy"),
     "paper": ReadyMade("afspm.drift.trackers.paper.PaperTracker", "numpy"),
 }
-_FORECASTS: Table[str, type[BankForecast] | type[PaperForecast]] = {"bank": BankForecast, "paper": PaperForecast}
+_FORECASTS: Table[str, type[BankForecast] | type[PaperForecast]] = {
+    kind.KIND: kind for kind in (BankForecast, PaperForecast)
+}
 
 
 def tracker(spec: str | Table[str, Any] = DEFAULT, estimator: Estimator | None = None) -> Tracker:
@@ -55,7 +58,4 @@ def forecast_from_dict(table: Table[str, Any]) -> Forecast:
     kind = str(table.get("kind"))
     if kind not in _FORECASTS:
         raise InvalidValue(f"a forecast of kind {kind!r}", hint=f"one of {', '.join(_FORECASTS)}")
-    try:
-        return _FORECASTS[kind].from_dict(table)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InvalidValue(f"a damaged forecast: {error}") from error
+    return restored(_FORECASTS[kind], table, kind, FORECAST_VERSION)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping as Table
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,21 +11,51 @@ from numpy.typing import ArrayLike, NDArray
 
 from afspm.drift.registration import DriftScan, Estimator, Registration
 from afspm.drift.shear import velocity_from_up_down
-from afspm.drift.trackers import saving
-from afspm.drift.trackers.compensation import Compensation
 from afspm.drift.trackers.filters import Filters
-from afspm.drift.trackers.forecast import BankForecast
-from afspm.drift.trackers.pairs import AGREEMENT, Comparison, Measured, Newest, agreeing
-from afspm.drift.trackers.references import Reference, References
+from afspm.drift.trackers.forecast import BankForecast, Compensation
+from afspm.drift.trackers.pairs import AGREEMENT, Comparison, NewestScan, PairMeasurement, agreeing
+from afspm.drift.trackers.references import ReferenceScan, ReferenceScans
 from afspm.drift.trackers.settings import BankSettings
-from afspm.drift.trackers.similarity import Measurement, Similarity
-from afspm.drift.tracking import Forecast, Prediction, Update
+from afspm.drift.trackers.similarity import Similarity, SimilarityMeasurement
+from afspm.drift.tracking import Forecast, Prediction, Update, require_newer
 from afspm.errors import InvalidValue
+from afspm.model.snapshot import restored, snapshot
 
 Array = NDArray[np.float64]
 
-VERSION = 2
+VERSION = 3
 _LIKE = 1.2  # a second surprise may differ from the first by so much of it: a new velocity doubles it
+
+
+@dataclass(eq=False)
+class BankState:
+    """What a tracker knows from scan to scan: all that is saved.
+
+    Attributes:
+        filters: None before the first scan.
+        similarity: rotation and scale; None: only translations are followed.
+        references: the scans that are kept, in the order of time, as in the filters' state.
+        compensation: with which tip coordinates follow the sample.
+        newest_s: the middle of the newest scan, which may have been dropped.
+        scans: how many there were.
+        unmatched: scans in a row that should have matched.
+        proven: whether any two scans have matched; before, the first may be the unusable one.
+        doubted_m: (2,) where the newest scan was found, from where it was expected; None: not in doubt.
+        matched_s: the middle of the newest scan that has a place.
+        lost: see `Update`.
+    """
+
+    filters: Filters | None = None
+    similarity: Similarity | None = None
+    references: list[ReferenceScan] = field(default_factory=list)
+    compensation: Compensation = field(default_factory=Compensation)
+    newest_s: float | None = None
+    scans: int = 0
+    unmatched: int = 0
+    proven: bool = False
+    doubted_m: Array | None = None
+    matched_s: float = 0.0
+    lost: bool = False
 
 
 class BankTracker:
@@ -58,62 +88,55 @@ class BankTracker:
     def __init__(self, estimator: Estimator, **settings: Any) -> None:
         self._settings, choice = BankSettings.split(settings)
         self._estimator = estimator
-        self._references = References(choice)
-        self._filters: Filters | None = None
-        self._similarity: Similarity | None = None
-        self._newest_s: float | None = None
-        self._compensation = Compensation()
-        self._scans = 0
-        self._unmatched = 0  # scans in a row that should have matched
-        self._proven = False  # whether any two scans have matched; before, the first may be the unusable one
-        self._doubted_m: Array | None = None  # where the newest scan was found, from where it was expected
-        self._matched_s = 0.0
-        self._lost = False
-        self._forecast = BankForecast.at_start()
+        self._references = ReferenceScans(choice)
+        self._state = BankState(references=self._references.kept)
 
     @property
     def forecast(self) -> Forecast:
         """See `Tracker`."""
-        return self._forecast
+        if (filters := self._state.filters) is None:
+            return replace(BankForecast.at_start(), compensation=self._state.compensation)
+        return self._forecast_of(filters)
 
     def add(self, scan: DriftScan) -> Update:
         """See `Tracker`."""
-        saving.must_be_newer(scan, self._newest_s)
-        self._newest_s = scan.mid_s
-        self._scans += 1
-        if self._filters is None:
+        state = self._state
+        require_newer(scan, state.newest_s)
+        state.newest_s = scan.mid_s
+        state.scans += 1
+        if state.filters is None:
             return self._first(scan)
-        if self._similarity is not None:
-            since_s = scan.mid_s - self._filters.time_s
-            self._similarity = self._similarity.moved(self._settings.linear_walk_per_s * since_s)
-            scan = self._similarity.straightened(scan)
-        followed_m = self._compensation.followed_m(self._filters.time_s, scan.mid_s)
-        filters = self._filters.moved(scan.mid_s, followed_m)
+        if state.similarity is not None:
+            since_s = scan.mid_s - state.filters.time_s
+            state.similarity = state.similarity.moved(self._settings.linear_walk_per_s * since_s)
+            scan = state.similarity.straightened(scan)
+        followed_m = state.compensation.followed_m(state.filters.time_s, scan.mid_s)
+        filters = state.filters.moved(scan.mid_s, followed_m)
         before = self._known(filters)
-        compensated_m_s = self._compensation.velocity_m_s(scan.mid_s)
-        newest = Newest(scan, self._turned(filters, scan), compensated_m_s, self._similarity)
-        anywhere = self._lost or self._is_blind(newest)
+        compensated_m_s = state.compensation.velocity_m_s(scan.mid_s)
+        newest = NewestScan(scan, self._turned(filters, scan), compensated_m_s, state.similarity)
+        anywhere = state.lost or self._is_blind(newest)
         tried = self._tried(newest, anywhere=anywhere)
         registrations = {self._references.kept[number].scan.key: found for number, found in tried.items()}
         found = self._compared(newest, tried)
         used = self._believed(newest, found, anywhere=anywhere)
         placed = used is not None and any(self._proves(one.link.number) for one in used.measured)
-        self._unmatched = 0 if placed else self._unmatched + bool(tried)
+        state.unmatched = 0 if placed else state.unmatched + bool(tried)
         self._learn(newest, used, tried, placed=placed)
-        after = self._known(self._filters)
+        after = self._known(state.filters)
         # a scan that could be compared with none begins a row of its own, which is as far from the others as it is
         if tried:
-            self._lost = not placed and after.sd_m > self._limit_m(scan)
-        self._lost |= self._unmatched >= self._settings.lost_after
+            state.lost = not placed and after.sd_m > self._limit_m(scan)
+        state.lost |= state.unmatched >= self._settings.lost_after
         return Update(
             key=scan.key,
             before=before,
             after=after,
             matched=placed,
             reason="" if placed else self._why_not(tried, found, adrift=used is not None),
-            lost=self._lost,
+            lost=state.lost,
             registrations=registrations,
-            forecast=self._forecast,
+            forecast=self.forecast,
             quality={"references": float(len(used.measured) if used else 0), **self._linear_quality()},
         )
 
@@ -123,12 +146,12 @@ class BankTracker:
         Raises:
             InvalidValue: before the first scan.
         """
-        if self._filters is None:
+        state = self._state
+        if state.filters is None:
             raise InvalidValue("a velocity was given before the first scan", hint="positions are counted from that")
-        velocity = np.asarray(velocity_m_s, dtype=np.float64) + self._compensation.velocity_m_s(time_s)
+        velocity = np.asarray(velocity_m_s, dtype=np.float64) + state.compensation.velocity_m_s(time_s)
         noise = np.asarray(covariance, dtype=np.float64)
-        self._filters = self._with_velocity(self._filters, time_s, velocity, noise)
-        self._forecast = self._forecast_of(self._filters)
+        state.filters = self._with_velocity(state.filters, time_s, velocity, noise)
 
     def compensated(self, time_s: float, velocity_m_s: ArrayLike) -> None:
         """From a time on, the controller moves tip coordinates along with a velocity (2,) by itself.
@@ -136,31 +159,31 @@ class BankTracker:
         Raises:
             InvalidValue: before the middle of the newest scan: its position has been told already.
         """
-        if self._newest_s is not None and time_s < self._newest_s:
+        state = self._state
+        if state.newest_s is not None and time_s < state.newest_s:
             raise InvalidValue(
-                f"compensation since {time_s:g} s is told after a scan of {self._newest_s:g} s",
+                f"compensation since {time_s:g} s is told after a scan of {state.newest_s:g} s",
                 hint="tell it before the next scan",
             )
         velocity = np.asarray(velocity_m_s, dtype=np.float64)
-        needed_s = time_s if self._newest_s is None else self._newest_s
-        self._compensation = self._compensation.changed(time_s, velocity, needed_s=needed_s)
-        self._forecast = replace(self._forecast, compensation=self._compensation)
+        needed_s = time_s if state.newest_s is None else state.newest_s
+        state.compensation = state.compensation.changed(time_s, velocity, needed_s=needed_s)
 
     # -- one scan
 
     def _first(self, scan: DriftScan) -> Update:
-        before, settings = self._forecast.at(scan.mid_s), self._settings
+        state = self._state
+        before, settings = self.forecast.at(scan.mid_s), self._settings
         position_sd_m = settings.start_px * min(scan.pixel_m)
-        self._filters = Filters.start(settings.models(), scan.mid_s, position_sd_m, settings.start_velocity_sd_m_s)
-        self._matched_s = scan.mid_s
+        state.filters = Filters.start(settings.models(), scan.mid_s, position_sd_m, settings.start_velocity_sd_m_s)
+        state.matched_s = scan.mid_s
         if settings.transform == "similarity":
-            self._similarity = Similarity.at_start(scan)
-        now = self._known(self._filters)
-        compensated_m_s = self._compensation.velocity_m_s(scan.mid_s)
-        self._references.kept.append(Reference(scan, compensated_m_s, anchor=True, used=self._scans))
-        self._forecast = self._forecast_of(self._filters)
+            state.similarity = Similarity.at_start(scan)
+        now = self._known(state.filters)
+        compensated_m_s = state.compensation.velocity_m_s(scan.mid_s)
+        self._references.kept.append(ReferenceScan(scan, compensated_m_s, anchor=True, used=state.scans))
         return Update(
-            scan.key, before, now, matched=True, reason="", lost=False, registrations={}, forecast=self._forecast
+            scan.key, before, now, matched=True, reason="", lost=False, registrations={}, forecast=self.forecast
         )
 
     def _turned(self, filters: Filters, scan: DriftScan) -> Filters:
@@ -174,20 +197,20 @@ class BankTracker:
         if not found.accepted:
             return filters
         # The displacement between them will be compared like any other.
-        velocity = found.by_shear_m_s + self._compensation.velocity_m_s(found.time_s)
+        velocity = found.by_shear_m_s + self._state.compensation.velocity_m_s(found.time_s)
         return self._with_velocity(filters, found.time_s, velocity, found.by_shear_covariance)
 
-    def _is_blind(self, newest: Newest) -> bool:
+    def _is_blind(self, newest: NewestScan) -> bool:
         """Whether it is too uncertain where to look, against each of the scans that it can be compared with."""
         kept = self._references.kept
         comparable = self._references.candidates(newest.scan, *_drifts(newest.filters), anywhere=True)
         spreads = (newest.expected(number, kept[number])[1] for number in comparable)
         return min((np.linalg.eigvalsh(one)[-1] for one in spreads), default=0.0) > self._limit_m(newest.scan) ** 2
 
-    def _tried(self, newest: Newest, *, anywhere: bool) -> dict[int, Registration]:
+    def _tried(self, newest: NewestScan, *, anywhere: bool) -> dict[int, Registration]:
         """What the estimator says of the scan and each reference, by its number, the best first."""
         kept, filters = self._references.kept, newest.filters
-        widening = self._settings.widening * 4.0 ** min(self._unmatched, self._settings.lost_after)
+        widening = self._settings.widening * 4.0 ** min(self._state.unmatched, self._settings.lost_after)
         tried = {}
         for number in self._references.candidates(newest.scan, *_drifts(filters), anywhere=anywhere):
             prior = None if anywhere else newest.prior(number, kept[number], widening)
@@ -199,62 +222,65 @@ class BankTracker:
                 tried[number] = self._estimator.register(kept[number].scan, newest.scan)
         return tried
 
-    def _compared(self, newest: Newest, tried: Table[int, Registration]) -> Comparison | None:
+    def _compared(self, newest: NewestScan, tried: Table[int, Registration]) -> Comparison | None:
         """What was found, by the references that agree; those adrift count only where there is no other."""
         kept, inflation = self._references.kept, self._settings.inflation
         measured = [
-            Measured.of(newest, number, kept[number], found, inflation)
+            PairMeasurement.of(newest, number, kept[number], found, inflation)
             for number, found in tried.items()
             if found.accepted
         ]
         firm = [one for one in measured if self._proves(one.link.number)]
         return Comparison(agreeing(firm or measured, newest.filters), newest.filters) if measured else None
 
-    def _believed(self, newest: Newest, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
+    def _believed(self, newest: NewestScan, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
         """What is taken in of that: a surprise only where everything is possible, or after another one like it."""
-        before, self._doubted_m = self._doubted_m, None
+        state = self._state
+        before, state.doubted_m = state.doubted_m, None
         if found is None or found.surprise <= self._settings.doubt:
             return found
         again = before is not None and np.linalg.norm(found.apart_m - before) <= _LIKE * np.linalg.norm(before)
         if not (anywhere or again):
-            self._doubted_m = found.apart_m
+            state.doubted_m = found.apart_m
             return None
         # Either it jumped, or it is faster than was thought: the next scan will tell.
-        far_m, since_s = float(np.linalg.norm(found.apart_m)), newest.scan.mid_s - self._matched_s
+        far_m, since_s = float(np.linalg.norm(found.apart_m)), newest.scan.mid_s - state.matched_s
         return replace(found, filters=found.filters.widened(far_m, far_m / max(since_s, 1.0)))
 
-    def _learn(self, newest: Newest, used: Comparison | None, tried: Table[int, Registration], *, placed: bool) -> None:
+    def _learn(
+        self, newest: NewestScan, used: Comparison | None, tried: Table[int, Registration], *, placed: bool
+    ) -> None:
         """Take in what is believed; keep the scan, unless it is in doubt, and let go of what there is too much of."""
+        state = self._state
         settings, references, scan = self._settings, self._references, newest.scan
         filters = newest.filters if used is None else used.filters
-        if self._unmatched == settings.lost_after and self._proven and not placed:
+        if state.unmatched == settings.lost_after and state.proven and not placed:
             filters = self._cut_off(filters, scan)
         noise = np.eye(2) * settings.jitter_m**2
         if used is None:
-            self._filters = filters.with_scan(noise)
+            state.filters = filters.with_scan(noise)
         else:
             filters = filters.with_scan(noise + used.scan_noise_m2)
             rows, values, pair_noise = used.rows(filters.mean.shape[1])
-            self._filters = filters.updated(rows, values, pair_noise, forget=settings.forget, rarest=settings.rarest)
+            state.filters = filters.updated(rows, values, pair_noise, forget=settings.forget, rarest=settings.rarest)
         if placed:
-            self._matched_s = scan.mid_s
+            state.matched_s = scan.mid_s
             numbers = {one.link.number for one in used.measured} if used else set()
-            if not self._proven:
+            if not state.proven:
                 references.known(numbers)
-            self._proven = True
-            references.judged({number: number in numbers for number in tried}, self._scans)
+            state.proven = True
+            references.judged({number: number in numbers for number in tried}, state.scans)
             self._vouch(newest, {number: tried[number] for number in tried if tried[number].accepted})
-        if self._similarity is not None:
-            self._similarity = self._straightened(self._similarity, scan, used if placed else None)
-        drift_m, drifts_m = _drifts(self._filters)
+        if state.similarity is not None:
+            state.similarity = self._straightened(state.similarity, scan, used if placed else None)
+        drift_m, drifts_m = _drifts(state.filters)
         adrift = bool(tried) and not placed
         anchor = not adrift and references.needs_anchor(scan, drift_m, drifts_m[:-1])
-        references.kept.append(Reference(scan, newest.compensated_m_s, anchor, adrift, used=self._scans))
-        if self._doubted_m is not None:
+        references.kept.append(ReferenceScan(scan, newest.compensated_m_s, anchor, adrift, used=state.scans))
+        if state.doubted_m is not None:
             self._drop(len(references) - 1)
         while (number := references.superfluous()) is not None:
             self._drop(number)
-        self._forecast = self._forecast_of(self._filters)
 
     def _straightened(self, similarity: Similarity, scan: DriftScan, used: Comparison | None) -> Similarity:
         """With a scan, and with what its registration with the best reference tells of rotation and scale."""
@@ -262,7 +288,7 @@ class BankTracker:
         if best is None or best.found.linear_seen is None:
             return similarity.with_scan()
         pair = self._references.kept[best.link.number].scan, scan
-        seen = Measurement.of(best.found.linear_seen, pair, self._settings.inflation)
+        seen = SimilarityMeasurement.of(best.found.linear_seen, pair, self._settings.inflation)
         learned = similarity.learned(best.link.number, seen).with_scan()
         return learned.straight_about(best.found.center_m + best.found.displacement_m)
 
@@ -273,25 +299,27 @@ class BankTracker:
 
     def _proves(self, number: int) -> bool:
         """Whether what is registered with a reference has a place by that."""
-        return not (self._proven and self._references.kept[number].adrift)
+        return not (self._state.proven and self._references.kept[number].adrift)
 
-    def _vouch(self, newest: Newest, found: Table[int, Registration]) -> None:
+    def _vouch(self, newest: NewestScan, found: Table[int, Registration]) -> None:
         """Those adrift that the newest scan, the last in the state, finds where they are thought to be are known."""
-        assert self._filters is not None
-        kept, states = self._references.kept, self._filters.mean.shape[1]
+        state = self._state
+        assert state.filters is not None
+        kept, states = self._references.kept, state.filters.mean.shape[1]
         for number in [number for number in found if kept[number].adrift]:
-            one = Measured.of(newest, number, kept[number], found[number], self._settings.inflation)
-            expected, covariance = self._filters.mixed(one.link.rows(states, states - 4))
+            one = PairMeasurement.of(newest, number, kept[number], found[number], self._settings.inflation)
+            expected, covariance = state.filters.mixed(one.link.rows(states, states - 4))
             apart = one.value_m - expected
             if apart @ np.linalg.solve(covariance + one.pair_noise_m2, apart) <= AGREEMENT:
                 self._references.known([number])
 
     def _drop(self, number: int) -> None:
-        assert self._filters is not None
+        state = self._state
+        assert state.filters is not None
         del self._references.kept[number]
-        self._filters = self._filters.without_scan(number)
-        if self._similarity is not None:
-            self._similarity = self._similarity.without_scan(number)
+        state.filters = state.filters.without_scan(number)
+        if state.similarity is not None:
+            state.similarity = state.similarity.without_scan(number)
 
     def _why_not(self, tried: Table[int, Registration], found: Comparison | None, *, adrift: bool) -> str:
         if adrift:
@@ -310,11 +338,12 @@ class BankTracker:
         return filters.updated(filters.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
 
     def _linear_quality(self) -> dict[str, float]:
-        return {} if self._similarity is None else {"linear_sd": self._similarity.sd}
+        return {} if self._state.similarity is None else {"linear_sd": self._state.similarity.sd}
 
     def _forecast_of(self, filters: Filters) -> BankForecast:
-        straight = None if self._similarity is None else self._similarity.straight
-        return BankForecast.of(filters, self._compensation, straight)
+        state = self._state
+        straight = None if state.similarity is None else state.similarity.straight
+        return BankForecast.of(filters, state.compensation, straight)
 
     def _known(self, filters: Filters) -> Prediction:
         return self._forecast_of(filters).at(filters.time_s)
@@ -327,44 +356,19 @@ class BankTracker:
 
     def state(self) -> dict[str, Any]:
         """See `Tracker`."""
-        filters = self._filters
-        similarity = {} if self._similarity is None else {"similarity": self._similarity.to_dict()}
-        return {
-            "kind": "bank",
-            "version": VERSION,
-            "newest_s": self._newest_s,
-            "compensation": [list(change) for change in self._compensation.changes],
-            "scans": self._scans,
-            "unmatched": self._unmatched,
-            "proven": self._proven,
-            "doubted_m": self._doubted_m,
-            "matched_s": self._matched_s,
-            "lost": self._lost,
-            "filters": None if filters is None else filters.to_dict(),
-            "references": [one.to_dict() for one in self._references.kept],
-            **similarity,
-        }
+        return snapshot(self._state, "bank", VERSION)
 
     def restore(self, state: Table[str, Any]) -> None:
         """See `Tracker`. Raises InvalidValue for the state of another tracker, or of one with other filters."""
-        saving.must_be(state, "bank", VERSION)
-        models, filters, similarity = self._settings.models(), None, None
-        if state["filters"] is not None and (self._settings.transform == "similarity") != ("similarity" in state):
-            raise InvalidValue(f"a saved tracker of another transform than {self._settings.transform!r}")
-        if "similarity" in state:
-            similarity = Similarity.from_dict(state["similarity"], len(state["references"]))
-        if state["filters"] is not None:
-            filters = Filters.from_dict(models, state["filters"])
-        self._filters, self._newest_s, self._similarity = filters, state["newest_s"], similarity
-        self._compensation = Compensation.from_list(state["compensation"])
-        self._scans, self._unmatched = int(state["scans"]), int(state["unmatched"])
-        self._doubted_m = None if state["doubted_m"] is None else np.asarray(state["doubted_m"], dtype=np.float64)
-        self._proven = bool(state["proven"])
-        self._matched_s, self._lost = float(state["matched_s"]), bool(state["lost"])
-        self._references.kept = [Reference.from_dict(one) for one in state["references"]]
-        self._forecast = BankForecast.at_start()
-        if filters is not None:
-            self._forecast = self._forecast_of(filters)
+        found = restored(BankState, state, "bank", VERSION)
+        if (filters := found.filters) is not None:
+            if (self._settings.transform == "similarity") != (found.similarity is not None):
+                raise InvalidValue(f"a saved tracker of another transform than {self._settings.transform!r}")
+            models, count = self._settings.models(), len(filters.log_weight)
+            if count != len(models.density_m2_s3):
+                raise InvalidValue(f"a saved bank of {count} filters instead of {len(models.density_m2_s3)}")
+            found.filters = replace(filters, models=models)
+        self._state, self._references.kept = found, found.references
 
 
 def _drifts(filters: Filters) -> tuple[Array, Array]:

@@ -2,20 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping as Table
+import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.mapping import Mapping
-from afspm.drift.trackers.compensation import Compensation
-from afspm.drift.trackers.filters import Filters, mixed
-from afspm.drift.trackers.motion import Models
-from afspm.drift.tracking import Prediction
+from afspm.drift.trackers.filters import Filters, Models, mixed
+from afspm.drift.tracking import FORECAST_VERSION, Prediction
+from afspm.model.snapshot import snapshot
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """A velocity that changes in steps; none at all to begin with.
+
+    Attributes:
+        changes: (since when in s, v_x, v_y in m/s), in the order of time.
+    """
+
+    changes: tuple[tuple[float, float, float], ...] = ()
+
+    def velocity_m_s(self, time_s: float) -> Array:
+        """(2,) at a time."""
+        velocity = (0.0, 0.0)
+        for since_s, x, y in self.changes:
+            if since_s <= time_s:
+                velocity = (x, y)
+        return np.array(velocity)
+
+    def followed_m(self, from_s: float, to_s: float) -> Array:
+        """(2,) by how much tip coordinates have moved between two times, negative if they are exchanged."""
+        start_s, end_s = min(from_s, to_s), max(from_s, to_s)
+        edges = [start_s, *(since_s for since_s, _, _ in self.changes if start_s < since_s < end_s), end_s]
+        parts = [self.velocity_m_s(a) * (b - a) for a, b in itertools.pairwise(edges)]
+        followed: Array = np.sum(parts, axis=0) * (1.0 if to_s >= from_s else -1.0)
+        return followed
+
+    def changed(self, since_s: float, velocity_m_s: Array, *, needed_s: float) -> Compensation:
+        """With another velocity from a time on, and without what nobody asks for who asks about `needed_s` or later."""
+        before = [change for change in self.changes if change[0] < since_s]
+        while len(before) > 1 and before[1][0] <= needed_s:
+            del before[0]
+        return Compensation((*before, (float(since_s), float(velocity_m_s[0]), float(velocity_m_s[1]))))
+
 
 _LEAST_WEIGHT = 1e-4  # filters that are less likely are left out
 
@@ -33,6 +67,8 @@ class BankForecast:
         compensation: with which tip coordinates follow the sample.
         straight: from tip coordinates to those in which the sample is only displaced; None: they are the same.
     """
+
+    KIND: ClassVar = "bank forecast"
 
     time_s: float
     models: Models
@@ -79,28 +115,4 @@ class BankForecast:
 
     def to_dict(self) -> dict[str, Any]:
         """See `Forecast`."""
-        straight = {} if self.straight is None else {"straight": self.straight.matrix.tolist()}
-        return {
-            "kind": "bank",
-            "time_s": self.time_s,
-            "density_m2_s3": self.models.density_m2_s3.tolist(),
-            "fading_per_s": self.models.fading_per_s.tolist(),
-            "walk_m2_s": self.models.walk_m2_s,
-            "weight": self.weight.tolist(),
-            "mean": self.mean.tolist(),
-            "covariance": self.covariance.tolist(),
-            "compensation": [list(change) for change in self.compensation.changes],
-            **straight,
-        }
-
-    @classmethod
-    def from_dict(cls, table: Table[str, Any]) -> BankForecast:
-        """What `to_dict` made."""
-        arrays = {name: np.array(table[name], dtype=np.float64) for name in _ARRAYS}
-        models = Models(arrays.pop("density_m2_s3"), arrays.pop("fading_per_s"), float(table["walk_m2_s"]))
-        compensation = Compensation.from_list(table["compensation"])
-        straight = Mapping(table["straight"]) if "straight" in table else None
-        return cls(float(table["time_s"]), models, **arrays, compensation=compensation, straight=straight)
-
-
-_ARRAYS = ("density_m2_s3", "fading_per_s", "weight", "mean", "covariance")
+        return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)

@@ -17,7 +17,7 @@ from afspm.drift.overlap import overlap_center_m
 from afspm.drift.registration import DriftScan, Prior, Registration
 from afspm.drift.shear import delay_per_length_s_m, row_delay_s, slow_axis
 from afspm.drift.trackers.filters import Filters
-from afspm.drift.trackers.references import Reference
+from afspm.drift.trackers.references import ReferenceScan
 from afspm.drift.trackers.similarity import Similarity
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ _ALIKE = 0.05  # by which part the courses of two scans may differ if drift is t
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class ObservationModel:
     """How d depends on the state.
 
     Attributes:
@@ -55,7 +55,7 @@ class Link:
 
 
 @dataclass(frozen=True, eq=False)
-class Newest:
+class NewestScan:
     """The scan that is being compared, and what is known when it is.
 
     Attributes:
@@ -68,7 +68,7 @@ class Newest:
     compensated_m_s: Array
     similarity: Similarity | None = None
 
-    def link(self, number: int, reference: Reference, center_m: Array, displacement_m: Array) -> Link:
+    def link(self, number: int, reference: ReferenceScan, center_m: Array, displacement_m: Array) -> ObservationModel:
         """For an overlap about a position of the reference."""
         ours_s, theirs_s = row_delay_s(self.scan, center_m + displacement_m), row_delay_s(reference.scan, center_m)
         offset, noise = np.zeros(2), np.zeros((2, 2))
@@ -82,7 +82,7 @@ class Newest:
             offset += theirs_s * reference.compensated_m_s
         if self.similarity is not None:
             noise += self.similarity.lever_m2(number, center_m + displacement_m)
-        return Link(number, ours_s or 0.0, theirs_s or 0.0, offset, noise)
+        return ObservationModel(number, ours_s or 0.0, theirs_s or 0.0, offset, noise)
 
     def _either_way(self, scan: DriftScan, position_m: Array, number: int | None, compensated_m_s: Array) -> Array:
         """(2, 2) of the displacement between a scan's middle and a position, with its direction not known."""
@@ -91,10 +91,10 @@ class Newest:
         velocity = velocity - compensated_m_s
         return np.asarray(delay_s**2 * (np.outer(velocity, velocity) + covariance))
 
-    def expected(self, number: int, reference: Reference) -> tuple[Array, Array]:
+    def expected(self, number: int, reference: ReferenceScan) -> tuple[Array, Array]:
         """d (2,) as it is expected, and its covariance (2, 2)."""
         states = self.filters.mean.shape[1]
-        middle = Link(number, 0.0, 0.0, np.zeros(2), np.zeros((2, 2)))
+        middle = ObservationModel(number, 0.0, 0.0, np.zeros(2), np.zeros((2, 2)))
         displacement_m, _ = self.filters.mixed(middle.rows(states, 0))
         center_m = overlap_center_m(reference.scan.region, self.scan.region, displacement_m)
         if center_m is None:
@@ -103,7 +103,7 @@ class Newest:
         mean, covariance = self.filters.mixed(link.rows(states, 0))
         return mean + link.offset_m, covariance + link.noise_m2
 
-    def prior(self, number: int, reference: Reference, widening: float) -> Prior:
+    def prior(self, number: int, reference: ReferenceScan, widening: float) -> Prior:
         """What an estimator is told to expect: half a pixel wider, so that it looks around."""
         mean, covariance = self.expected(number, reference)
         half_px_m = max(*self.scan.pixel_m, *reference.scan.pixel_m) / 2
@@ -126,20 +126,22 @@ def _sheared_alike(first: DriftScan, second: DriftScan) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class PairMeasurement:
     """What an estimator found.
 
     Attributes:
         pair_noise_m2, scan_noise_m2: (2, 2) what of its error is the pair's, and what the location error of the scan.
     """
 
-    link: Link
+    link: ObservationModel
     found: Registration
     pair_noise_m2: Array
     scan_noise_m2: Array
 
     @classmethod
-    def of(cls, newest: Newest, number: int, reference: Reference, found: Registration, inflation: float) -> Measured:
+    def of(
+        cls, newest: NewestScan, number: int, reference: ReferenceScan, found: Registration, inflation: float
+    ) -> PairMeasurement:
         """An efficient estimator's error is one location error for each of the scans; inflation is the pair's."""
         link = newest.link(number, reference, found.center_m, found.displacement_m)
         pair_noise = (inflation - 1.0) * found.covariance_m2 + link.noise_m2
@@ -152,7 +154,7 @@ class Measured:
         return value
 
 
-def agreeing(measured: list[Measured], filters: Filters) -> list[Measured]:
+def agreeing(measured: list[PairMeasurement], filters: Filters) -> list[PairMeasurement]:
     """The largest group of results that fit together; of equally large ones that with the best reference."""
     if len(measured) < 2:
         return measured
@@ -176,7 +178,7 @@ def agreeing(measured: list[Measured], filters: Filters) -> list[Measured]:
 class Comparison:
     """Several results for one scan as one measurement, and the filters that are to learn from it."""
 
-    measured: list[Measured]
+    measured: list[PairMeasurement]
     filters: Filters
 
     @property

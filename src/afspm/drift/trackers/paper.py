@@ -6,10 +6,11 @@ information, "Drift Correction Algorithm".
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping as Table
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +18,57 @@ from numpy.typing import NDArray
 from afspm.drift.mapping import Mapping, unlike_drift
 from afspm.drift.overlap import intersection_ratio, sr_norm
 from afspm.drift.registration import DriftScan, Estimator, Registration
-from afspm.drift.trackers import saving
-from afspm.drift.trackers.transforms import TRANSFORMS, exponential, logarithm, transform_between
-from afspm.drift.tracking import Forecast, Prediction, Update
+from afspm.drift.tracking import FORECAST_VERSION, Forecast, Prediction, Update, require_newer
 from afspm.errors import ConfigError
+from afspm.model.snapshot import restored, snapshot
 
 Array = NDArray[np.float64]
 
-VERSION = 1
+TRANSFORMS = ("translation", "euclidean", "similarity", "affine")
+
+
+def transform_between(found: Registration, form: str) -> Mapping:
+    """From tip coordinates during the reference to those during the scan, in the nearest transform of a form."""
+    linear = _of_form(np.eye(2) + found.linear, form)
+    center = found.center_m if form != "translation" else np.zeros(2)
+    return Mapping.of(linear, center + found.displacement_m - linear @ center)
+
+
+def _of_form(linear: Array, form: str) -> Array:
+    """The 2 x 2 matrix of a form that is nearest (least squares of its elements)."""
+    if form == "translation":
+        return np.eye(2)
+    if form == "affine":
+        return linear
+    (a, b), (c, d) = linear
+    cos, sin = (a + d) / 2, (c - b) / 2
+    if form == "euclidean":
+        length = math.hypot(cos, sin)
+        cos, sin = cos / length, sin / length
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+def logarithm(matrix: Array) -> Array:
+    """The real X with exp X = matrix, 3 x 3; of a translation exactly."""
+    if np.array_equal(matrix[:2, :2], np.eye(2)):
+        return np.asarray(matrix - np.eye(3))
+    from scipy.linalg import logm
+
+    return np.asarray(logm(matrix)).real
+
+
+def exponential(matrix: Array) -> Array:
+    """exp X with the last row 0 0 1, 3 x 3; of a translation's logarithm exactly."""
+    if not matrix[:2, :2].any():
+        return np.asarray(np.eye(3) + matrix)
+    from scipy.linalg import expm
+
+    made = np.asarray(expm(matrix))
+    made[2] = (0.0, 0.0, 1.0)  # rounding
+    return made
+
+
+VERSION = 2
 _MEMORY = 0.7  # of the mean square of the residuals from one scan to the next
 
 
@@ -39,6 +83,8 @@ class PaperForecast:
         covariance_m2: (2, 2) of the newest scan's position.
         rate_covariance: (2, 2), (m/s)².
     """
+
+    KIND: ClassVar = "paper forecast"
 
     time_s: float
     matrix: Array
@@ -62,24 +108,34 @@ class PaperForecast:
 
     def to_dict(self) -> dict[str, Any]:
         """See `Forecast`."""
-        arrays = {name: getattr(self, name).tolist() for name in _ARRAYS}
-        return {"kind": "paper", "time_s": self.time_s, **arrays}
-
-    @classmethod
-    def from_dict(cls, table: Table[str, Any]) -> PaperForecast:
-        """What `to_dict` made."""
-        return cls(float(table["time_s"]), **{name: np.array(table[name], dtype=np.float64) for name in _ARRAYS})
-
-
-_ARRAYS = ("matrix", "rate", "covariance_m2", "rate_covariance")
+        return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
+class PlacedScan:
     """A scan of the queue C and the mapping M_j that it was found to have."""
 
     scan: DriftScan
     mapping: Mapping
+
+
+@dataclass(eq=False)
+class PaperState:
+    """What a tracker knows from scan to scan.
+
+    Attributes:
+        forecast: with the newest scan.
+        newest_s: the middle of that; None: there is none yet.
+        residual_m2: mean square of the last residuals.
+        unmatched: scans in a row that should have matched.
+        queue: C, the oldest first.
+    """
+
+    forecast: PaperForecast = PaperForecast(0.0, np.eye(3), np.zeros((3, 3)), np.zeros((2, 2)), np.zeros((2, 2)))
+    newest_s: float | None = None
+    residual_m2: float | None = None
+    unmatched: int = 0
+    queue: deque[PlacedScan] = field(default_factory=deque)
 
 
 class PaperTracker:
@@ -127,37 +183,37 @@ class PaperTracker:
         self._estimator = estimator
         self._transform, self._w_update, self._lost_after = transform, w_update, lost_after
         self._f_min, self._sr_norm_min = f_min, sr_norm_min
-        self._queue: deque[_Placed] = deque(maxlen=queue)
-        self._now = PaperForecast(0.0, np.eye(3), np.zeros((3, 3)), np.zeros((2, 2)), np.zeros((2, 2)))
-        self._newest_s: float | None = None
-        self._residual_m2: float | None = None
-        self._unmatched = 0
+        self._length = queue
+        self._state = PaperState()
 
     @property
     def forecast(self) -> Forecast:
         """See `Tracker`."""
-        return self._now
+        return self._state.forecast
 
     def add(self, scan: DriftScan) -> Update:
         """See `Tracker`."""
-        saving.must_be_newer(scan, self._newest_s)
-        first = self._newest_s is None
-        before = self._now.at(scan.mid_s)
+        state = self._state
+        require_newer(scan, state.newest_s)
+        first = state.newest_s is None
+        before = state.forecast.at(scan.mid_s)
         placed, tried, reason = (None, {}, "") if first else self._match(scan, before.mapping)
         matched = first or placed is not None
         mapping = before.mapping if placed is None else self._averaged(before.mapping, placed)
-        self._unmatched = 0 if matched else self._unmatched + bool(tried)  # elsewhere there is nothing to be found
+        state.unmatched = 0 if matched else state.unmatched + bool(tried)  # elsewhere there is nothing to be found
         self._step(scan, before, mapping, [one for one in tried.values() if one.accepted])
-        self._queue.append(_Placed(scan, mapping))
+        state.queue.append(PlacedScan(scan, mapping))
+        while len(state.queue) > self._length:
+            state.queue.popleft()
         return Update(
             key=scan.key,
             before=before,
-            after=self._now.at(scan.mid_s),
+            after=state.forecast.at(scan.mid_s),
             matched=matched,
             reason=reason,
-            lost=self._unmatched >= self._lost_after,
+            lost=state.unmatched >= self._lost_after,
             registrations=tried,
-            forecast=self._now,
+            forecast=state.forecast,
             quality={"candidates": float(len(tried))},
         )
 
@@ -165,7 +221,7 @@ class PaperTracker:
         """M_k from the oldest scan of D for which estimation succeeds; what was tried; why there is none."""
         region = predicted.to_sample(scan.region)
         tried: dict[str, Registration] = {}
-        for old in self._queue:
+        for old in self._state.queue:
             ratio = intersection_ratio(old.mapping.to_sample(old.scan.region), region)
             alike = sr_norm(old.scan.region, old.scan.values.shape, scan.region, scan.values.shape)
             if ratio < self._f_min or alike < self._sr_norm_min:
@@ -187,45 +243,30 @@ class PaperTracker:
 
     def _step(self, scan: DriftScan, before: Prediction, mapping: Mapping, used: list[Registration]) -> None:
         """dM_k = dM^_k dM~_k makes the next rate."""
-        since_s = 0.0 if self._newest_s is None else scan.mid_s - self._newest_s
-        rate, covariance = self._now.rate, before.covariance_m2
+        state = self._state
+        since_s = 0.0 if state.newest_s is None else scan.mid_s - state.newest_s
+        rate, covariance = state.forecast.rate, before.covariance_m2
         if used:
             covariance = used[-1].covariance_m2
             center = scan.region.center_m
             residual_m2 = float(np.sum((mapping.apply(center) - before.mapping.apply(center)) ** 2) / 2)
-            kept = self._residual_m2
-            self._residual_m2 = residual_m2 if kept is None else _MEMORY * kept + (1 - _MEMORY) * residual_m2
+            kept = state.residual_m2
+            state.residual_m2 = residual_m2 if kept is None else _MEMORY * kept + (1 - _MEMORY) * residual_m2
             if since_s > 0.0:
-                step = Mapping(self._now.matrix).inverse @ mapping
+                step = Mapping(state.forecast.matrix).inverse @ mapping
                 rate = logarithm(step.matrix) / since_s
-        spread_m2 = self._residual_m2
+        spread_m2 = state.residual_m2
         if spread_m2 is None:  # nothing has been compared yet
             spread_m2 = (min(scan.region.size_m) / 4) ** 2
         usual_s = since_s if since_s > 0.0 else max(scan.duration_s, 1.0)
         rate_covariance = np.eye(2) * (spread_m2 / usual_s**2)
-        self._now = PaperForecast(scan.mid_s, mapping.matrix, rate, covariance, rate_covariance)
-        self._newest_s = scan.mid_s
+        state.forecast = PaperForecast(scan.mid_s, mapping.matrix, rate, covariance, rate_covariance)
+        state.newest_s = scan.mid_s
 
     def state(self) -> dict[str, Any]:
         """See `Tracker`."""
-        return {
-            "kind": "paper",
-            "version": VERSION,
-            "forecast": self._now.to_dict(),
-            "newest_s": self._newest_s,
-            "residual_m2": self._residual_m2,
-            "unmatched": self._unmatched,
-            "queue": [
-                {"scan": saving.scan_to_dict(one.scan), "matrix": one.mapping.matrix.tolist()} for one in self._queue
-            ],
-        }
+        return snapshot(self._state, "paper", VERSION)
 
     def restore(self, state: Table[str, Any]) -> None:
         """See `Tracker`. Raises InvalidValue for the state of another tracker."""
-        saving.must_be(state, "paper", VERSION)
-        self._now = PaperForecast.from_dict(state["forecast"])
-        self._newest_s, self._residual_m2 = state["newest_s"], state["residual_m2"]
-        self._unmatched = int(state["unmatched"])
-        self._queue.clear()
-        for one in state["queue"]:
-            self._queue.append(_Placed(saving.scan_from_dict(one["scan"]), Mapping(one["matrix"])))
+        self._state = restored(PaperState, state, "paper", VERSION)

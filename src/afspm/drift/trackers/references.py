@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.overlap import overlap_ratio, sr_norm
 from afspm.drift.registration import DriftScan
-from afspm.drift.trackers import saving
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceScan:
     """A scan that is kept.
 
     Attributes:
@@ -35,27 +33,6 @@ class Reference:
     adrift: bool = False
     refusals: int = 0
     used: int = 0
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "scan": saving.scan_to_dict(self.scan),
-            "compensated_m_s": self.compensated_m_s,
-            "anchor": self.anchor,
-            "adrift": self.adrift,
-            "refusals": self.refusals,
-            "used": self.used,
-        }
-
-    @classmethod
-    def from_dict(cls, table: Table[str, Any]) -> Reference:
-        return cls(
-            saving.scan_from_dict(table["scan"]),
-            np.asarray(table["compensated_m_s"], dtype=np.float64),
-            bool(table["anchor"]),
-            bool(table["adrift"]),
-            int(table["refusals"]),
-            int(table["used"]),
-        )
 
 
 @dataclass(frozen=True)
@@ -83,17 +60,17 @@ class Choice:
     alike: float = 0.6
 
 
-class References:
+class ReferenceScans:
     """The scans that are kept, in the order of time. All displacements (…, 2) are those of the sample, in m."""
 
     def __init__(self, choice: Choice) -> None:
         self.choice = choice
-        self.kept: list[Reference] = []
+        self.kept: list[ReferenceScan] = []
 
     def __len__(self) -> int:
         return len(self.kept)
 
-    def __iter__(self) -> Iterator[Reference]:
+    def __iter__(self) -> Iterator[ReferenceScan]:
         return iter(self.kept)
 
     def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from afspm.drift.trackers.motion import Models
+from afspm.drift.trackers.filters import Models
 from afspm.drift.trackers.references import Choice
 from afspm.errors import ConfigError
 

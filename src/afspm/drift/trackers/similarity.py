@@ -8,16 +8,13 @@ present, the state holds each reference that is kept, as the bank of filters doe
 from __future__ import annotations
 
 import cmath
-from collections.abc import Mapping as Table
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.drift.mapping import Mapping
 from afspm.drift.registration import DriftScan, LinearSeen
-from afspm.errors import InvalidValue
 from afspm.model import Frame
 
 Array = NDArray[np.float64]
@@ -75,7 +72,7 @@ class Similarity:
         far_m = position_m - self.pivot_m
         return np.asarray(np.eye(2) * (row @ self.covariance @ row) * (far_m @ far_m))
 
-    def learned(self, number: int, seen: Measurement) -> Similarity:
+    def learned(self, number: int, seen: SimilarityMeasurement) -> Similarity:
         """After a registration with a reference."""
         row = self._row(number)
         crossed = self.covariance @ row
@@ -112,33 +109,9 @@ class Similarity:
         row[0], row[1 + number] = 1.0, -1.0
         return row
 
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON and numpy arrays."""
-        return {
-            "straight": self.straight.matrix,
-            "pivot_m": self.pivot_m,
-            "error": np.stack([self.error.real, self.error.imag]),
-            "covariance": self.covariance,
-            "doubted": self.doubted,
-        }
-
-    @classmethod
-    def from_dict(cls, table: Table[str, Any], references: int) -> Similarity:
-        """What `to_dict` made.
-
-        Raises:
-            InvalidValue: of another number of references.
-        """
-        pivot_m, parts, covariance = (
-            np.asarray(table[name], dtype=np.float64) for name in ("pivot_m", "error", "covariance")
-        )
-        if parts.shape != (2, 1 + references):
-            raise InvalidValue(f"a saved rotation of {parts.shape[-1] - 1} references instead of {references}")
-        return cls(Mapping(table["straight"]), pivot_m, parts[0] + 1j * parts[1], covariance, bool(table["doubted"]))
-
 
 @dataclass(frozen=True)
-class Measurement:
+class SimilarityMeasurement:
     """Rotation and scale between two scans.
 
     Attributes:
@@ -150,7 +123,7 @@ class Measurement:
     variance: float
 
     @classmethod
-    def of(cls, seen: LinearSeen, scans: tuple[DriftScan, DriftScan], inflation: float) -> Measurement:
+    def of(cls, seen: LinearSeen, scans: tuple[DriftScan, DriftScan], inflation: float) -> SimilarityMeasurement:
         """The generalised least squares fit to what was seen, beside a shear by drift during either scan.
 
         Such a shear displaces rows as a whole, so what depends on the position along a row tells the most.

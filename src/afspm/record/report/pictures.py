@@ -88,10 +88,11 @@ def draw(run: Run, story: RunStory, shown: Sequence[Small]) -> None:
         numbers = {number: story.overview.problems.name(number) for number in record.problems}
         night_figure.draw(record, run.folder / OWN_NIGHT, numbers, title=story.name, simulated=story.simulated)
     if _is_ours(run.folder, OWN_OFFSET, OFFSET) and len(story.overview.drift) > 1:
-        from afspm.drift.figures import offsets, style
+        from afspm.drift.figures import style
+        from afspm.drift.figures.drawings import draw_offsets
 
         title = f"{story.name} (simulated)" if story.simulated else story.name
-        style.save(offsets.draw(drift_of(run), title=title), run.folder / OWN_OFFSET)
+        style.save(draw_offsets(drift_of(run), title=title), run.folder / OWN_OFFSET)
 
 
 def _is_ours(folder: Path, own: str, components: str) -> bool:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from afspm.drift.overlap import too_far_off, too_little_shared
 from afspm.drift.registration import DriftScan
-from afspm.drift.rescan import too_far_off, too_little_shared
 from afspm.drift.tracking import Tracker, Update
 from afspm.errors import ConfigError
 from afspm.model import Region

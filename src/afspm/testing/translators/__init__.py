@@ -7,8 +7,8 @@ asks for everything that a component could ask for. The same as pytest items, on
 
 from __future__ import annotations
 
-from afspm.testing.translators.report import Outcome, Report, Result
+from afspm.testing.translators.report import CheckOutcome, CheckReport, CheckResult
 from afspm.testing.translators.runner import run
-from afspm.testing.translators.session import Options
+from afspm.testing.translators.session import CheckOptions
 
-__all__ = ["Options", "Outcome", "Report", "Result", "run"]
+__all__ = ["CheckOptions", "CheckOutcome", "CheckReport", "CheckResult", "run"]

@@ -17,12 +17,11 @@ from typing import Any
 import pytest
 
 from afspm.testing.translators import runner, session
-from afspm.testing.translators.registry import Check, all_checks
-from afspm.testing.translators.report import Outcome, Report, Result
-from afspm.testing.translators.taking import Taking
-from afspm.testing.translators.verdicts import Lost
+from afspm.testing.translators.measuring import CheckMeasurements
+from afspm.testing.translators.registry import Check, Lost, all_checks
+from afspm.testing.translators.report import CheckOutcome, CheckReport, CheckResult
 
-_REPORTS = pytest.StashKey[list[Report]]()
+_REPORTS = pytest.StashKey[list[CheckReport]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -35,11 +34,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     """An experiment file that was named, and not any that lies about."""
     if file_path.suffix == ".toml" and parent.session.isinitpath(file_path):
-        return Experiment.from_parent(parent, path=file_path)
+        return ExperimentFile.from_parent(parent, path=file_path)
     return None
 
 
-class Experiment(pytest.File):
+class ExperimentFile(pytest.File):
     """The checks of one experiment file; they share one pass of its processes."""
 
     def collect(self) -> Iterable[pytest.Item]:
@@ -49,16 +48,18 @@ class Experiment(pytest.File):
     def setup(self) -> None:
         option = self.config.option
         self._stack = ExitStack()
-        self.report = Report()
+        self.report = CheckReport()
         self.config.stash.setdefault(_REPORTS, []).append(self.report)
-        options = session.Options((self.path, *map(Path, option.overlay)), option.without_process, Path(option.runs))
+        options = session.CheckOptions(
+            (self.path, *map(Path, option.overlay)), option.without_process, Path(option.runs)
+        )
         try:
             opened = self._stack.enter_context(session.opened(options))
         except Lost as lost:
             self.report.lost = str(lost)
             pytest.fail(str(lost), pytrace=False)
         vars(self.report).update(vars(runner.begin_report(opened)))
-        self.kit: Taking = self._stack.enter_context(runner.restored(opened, self.report))
+        self.kit: CheckMeasurements = self._stack.enter_context(runner.restored(opened, self.report))
 
     def teardown(self) -> None:
         self._stack.close()
@@ -77,19 +78,19 @@ class CheckItem(pytest.Item):
         self._check = check
 
     def runtest(self) -> None:
-        assert isinstance(self.parent, Experiment)
+        assert isinstance(self.parent, ExperimentFile)
         report = self.parent.report
         if report.lost:
             pytest.fail(report.lost, pytrace=False)
         try:
-            result: Result = runner.do(self._check, self.parent.kit)
+            result: CheckResult = runner.do(self._check, self.parent.kit)
         except Lost as lost:
             report.lost = str(lost)
             pytest.fail(report.lost, pytrace=False)
         report.results.append(result)
-        if result.outcome is Outcome.SKIPPED:
+        if result.outcome is CheckOutcome.SKIPPED:
             pytest.skip(result.line)
-        if result.outcome is Outcome.FAILED:
+        if result.outcome is CheckOutcome.FAILED:
             pytest.fail("\n".join((result.line, *result.complaints)), pytrace=False)
 
     def reportinfo(self) -> tuple[Path, None, str]:
@@ -100,7 +101,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     """What is supported and what is not."""
     from rich.console import Console
 
-    from afspm.testing.translators.showing import show_end
+    from afspm.testing.translators.report import show_end
 
     for report in config.stash.get(_REPORTS, []):
         console = Console(width=120, highlight=False)

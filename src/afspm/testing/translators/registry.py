@@ -1,13 +1,44 @@
-"""The checks there are, in the order in which they are done."""
+"""What a check says: nothing if all is well, else what was expected and what came, in one line."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from afspm.testing.translators.taking import Taking
+    from afspm.testing.translators.measuring import CheckMeasurements
+
+
+class Failed(AssertionError):
+    """The translator does not do what the wire format says.
+
+    Args:
+        expected, came: in words of a physicist, without a full stop.
+    """
+
+    def __init__(self, expected: str, came: str) -> None:
+        super().__init__(f"expected {expected}; came {came}")
+
+
+class Skipped(Exception):
+    """It can't be checked here; the text says why."""
+
+
+class Lost(Exception):
+    """Nothing more can be checked: a process has ended, or control was taken away."""
+
+
+def expect(holds: object, expected: str, came: str) -> None:
+    """Raises Failed unless it holds."""
+    if not holds:
+        raise Failed(expected, came)
+
+
+def near(a: float, b: float, relative: float = 1e-3, absolute: float = 0.0) -> bool:
+    """Whether two numbers are the same to a controller's precision."""
+    return math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
 
 
 @dataclass(frozen=True)
@@ -23,7 +54,7 @@ class Check:
 
     name: str
     title: str
-    do: Callable[[Taking], None]
+    do: Callable[[CheckMeasurements], None]
     needs: tuple[str, ...] = ()
 
 
@@ -32,10 +63,10 @@ _CHECKS: list[Check] = []
 
 def check(
     name: str, title: str, needs: tuple[str, ...] = ()
-) -> Callable[[Callable[[Taking], None]], Callable[[Taking], None]]:
+) -> Callable[[Callable[[CheckMeasurements], None]], Callable[[CheckMeasurements], None]]:
     """Marks a function as a check; they are done in the order in which they are marked."""
 
-    def marked(do: Callable[[Taking], None]) -> Callable[[Taking], None]:
+    def marked(do: Callable[[CheckMeasurements], None]) -> Callable[[CheckMeasurements], None]:
         _CHECKS.append(Check(name, title, do, needs))
         return do
 

@@ -4,17 +4,117 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 
 from afspm.clock import Clock, ExperimentClock
 from afspm.errors import ConfigError
-from afspm.testing.translators.registry import Check, all_checks
-from afspm.testing.translators.report import Outcome, Report, Result
-from afspm.testing.translators.restoring import Before
-from afspm.testing.translators.session import Options, Session, opened
-from afspm.testing.translators.taking import Taking
-from afspm.testing.translators.verdicts import Failed, Lost, Skipped
+from afspm.model import ControlRequest, Feedback, Parameter, ProbePosition, Region, ScanParameters, names
+from afspm.testing.translators.client import CheckClient, answer_in_words
+from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, number
+from afspm.testing.translators.registry import Check, Failed, Lost, Skipped, all_checks, near
+from afspm.testing.translators.report import CheckOutcome, CheckReport, CheckResult
+from afspm.testing.translators.session import CheckOptions, CheckSession, opened
+from afspm.testing.translators.support import Support
+
+_LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
+"""A frame may change them."""
+
+
+@dataclass(frozen=True)
+class SettingsBefore:
+    """What was in force."""
+
+    frame: ScanParameters | None
+    feedback: Feedback | None
+    probe: ProbePosition | None
+    parameters: dict[str, Parameter]
+    support: Support
+
+    @classmethod
+    def of(cls, client: CheckClient, support: Support) -> SettingsBefore:
+        """As it was told when the checks began."""
+        return cls(
+            client.observations.newest(ScanParameters),
+            client.observations.newest(Feedback),
+            client.observations.newest(ProbePosition),
+            {name: value for name, value in support.parameters.items() if value and name != names.CONTROLLER},
+            support,
+        )
+
+    def restore(self, client: CheckClient) -> list[str]:
+        """Stop what runs, and put everything back.
+
+        Returns:
+            what could not be, a line each.
+        """
+        wrong: list[str] = []
+        try:
+            client.quiet()
+            client.come_to_rest()
+            self._put_back_together(client, wrong)
+            ordered = sorted(self.parameters, key=lambda name: name in _LAST)
+            for name in ordered:
+                self._put_back(client, name, wrong)
+        except (Lost, Failed) as error:
+            wrong.append(str(error))
+        return wrong
+
+    def _put_back_together(self, client: CheckClient, wrong: list[str]) -> None:
+        """What is told together is set together, lest it passes through what can't be."""
+        observations = client.observations
+        settings = (
+            (ControlRequest.SET_SCAN_PARAMS, observations.newest(ScanParameters), self.frame, self._frame()),
+            (
+                ControlRequest.SET_ZCTRL_PARAMS,
+                observations.newest(Feedback),
+                self.feedback,
+                _changed(self.feedback, observations.newest(Feedback)),
+            ),
+            (ControlRequest.SET_PROBE_POS, observations.newest(ProbePosition), self.probe, self.probe),
+        )
+        for kind, now, before, subject in settings:
+            if before is not None and now != before:
+                mark = client.observations.mark()
+                response = client.ask(kind, subject)
+                if not response.ok:
+                    wrong.append(f"REQ_{kind.name}: {answer_in_words(response)}")
+                client.settled(mark)
+
+    def _frame(self) -> ScanParameters | None:
+        """What to ask for to have it again: of the angle nothing, where there is none."""
+        before = self.frame
+        if before is not None and isinstance(before.region, Region) and isinstance(before.shape, tuple):
+            return FrameSetting(before.region, before.shape).request(self.support)
+        return before
+
+    def _put_back(self, client: CheckClient, name: str, wrong: list[str]) -> None:
+        before, now = self.parameters[name], client.get(name)
+        if _same(before, now):
+            return
+        mark = client.observations.mark()
+        response = client.set(name, str(before.value), before.unit)
+        client.settled(mark)
+        if not (response.ok and _same(before, client.get(name))):
+            was = f"{before.value} {before.unit or ''}".strip()
+            wrong.append(f"{name} was {was}, and is {now.value}: {answer_in_words(response)}")
+
+
+def _changed(before: Feedback | None, now: Feedback | None) -> Feedback:
+    """What is to be put back of it: some may only be read."""
+    fields = {} if before is None else vars(before)
+    return Feedback(**{name: value for name, value in fields.items() if now is None or value != getattr(now, name)})
+
+
+def _same(before: Parameter, now: Parameter) -> bool:
+    if before.value == now.value and before.unit == now.unit:
+        return True
+    try:
+        return near(number(before, before.unit or ""), number(now, before.unit or ""), 1e-6)
+    except Failed:
+        return False
+
 
 REPORT_FILE = "report.json"
 
@@ -31,49 +131,49 @@ def chosen(only: Collection[str] = ()) -> list[Check]:
     return found
 
 
-def do(check: Check, kit: Taking) -> Result:
+def do(check: Check, kit: CheckMeasurements) -> CheckResult:
     """Do one.
 
     Raises:
         Lost: nothing more can be checked.
     """
-    clock: Clock = kit.bench.clock
+    clock: Clock = kit.client.clock
     began_s, heard = clock.monotonic_s(), len(kit.complaints)
 
-    def result(outcome: Outcome, line: str = "") -> Result:
-        meanwhile = tuple(kit.complaints[heard:]) if outcome is Outcome.FAILED else ()
-        return Result(check.name, check.title, outcome, line, clock.monotonic_s() - began_s, meanwhile)
+    def result(outcome: CheckOutcome, line: str = "") -> CheckResult:
+        meanwhile = tuple(kit.complaints[heard:]) if outcome is CheckOutcome.FAILED else ()
+        return CheckResult(check.name, check.title, outcome, line, clock.monotonic_s() - began_s, meanwhile)
 
     missing = kit.support.missing(check.needs)
     if missing:
-        return result(Outcome.SKIPPED, f"not supported: {', '.join(missing)}")
+        return result(CheckOutcome.SKIPPED, f"not supported: {', '.join(missing)}")
     try:
         check.do(kit)
-        return result(Outcome.PASSED)
+        return result(CheckOutcome.PASSED)
     except Failed as failure:
         if check.name in kit.excused:
-            return result(Outcome.SKIPPED, f"{kit.excused[check.name]}: {failure}")
-        return result(Outcome.FAILED, str(failure))
+            return result(CheckOutcome.SKIPPED, f"{kit.excused[check.name]}: {failure}")
+        return result(CheckOutcome.FAILED, str(failure))
     except Skipped as skipped:
-        return result(Outcome.SKIPPED, str(skipped))
+        return result(CheckOutcome.SKIPPED, str(skipped))
 
 
 @contextmanager
-def restored(session: Session, report: Report) -> Iterator[Taking]:
+def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasurements]:
     """What is in force when the block begins is so again at its end, however that comes."""
-    kit = Taking(
-        session.bench, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
+    kit = CheckMeasurements(
+        session.client, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
     )
-    before = Before.of(session.bench, session.support)
+    before = SettingsBefore.of(session.client, session.support)
     try:
         yield kit
     finally:
-        report.unrestored = before.restore(session.bench)
+        report.unrestored = before.restore(session.client)
 
 
-def begin_report(session: Session) -> Report:
+def begin_report(session: CheckSession) -> CheckReport:
     """A report with nothing checked yet."""
-    return Report(
+    return CheckReport(
         translator=session.translator,
         simulated=session.simulated,
         afspm=version("afspm"),
@@ -84,11 +184,11 @@ def begin_report(session: Session) -> Report:
 
 
 def run(
-    options: Options,
-    begun: Callable[[Report], None] = lambda report: None,
+    options: CheckOptions,
+    begun: Callable[[CheckReport], None] = lambda report: None,
     doing: Callable[[Check], None] = lambda check: None,
-    done: Callable[[Result], None] = lambda result: None,
-) -> Report:
+    done: Callable[[CheckResult], None] = lambda result: None,
+) -> CheckReport:
     """Do all checks that are chosen, restore, and write `report.json` into the run's folder.
 
     Args:
@@ -99,7 +199,7 @@ def run(
         KeyboardInterrupt: after everything was put back, and the report of what was done was written.
     """
     wanted = chosen(options.only)
-    report = Report()
+    report = CheckReport()
     try:
         with opened(options) as session:
             report = begin_report(session)
@@ -111,7 +211,7 @@ def run(
                         result = do(check, kit)
                         report.results.append(result)
                         done(result)
-                    session.support.ask_again(session.bench)
+                    session.support.ask_again(session.client)
             except KeyboardInterrupt:
                 report.lost = "interrupted"
                 raise

@@ -28,13 +28,13 @@ from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, require_free
 from afspm.supervisor.run import addresses_of
 from afspm.supervisor.run_identity import RunIdentity
-from afspm.testing.translators.bench import Bench
+from afspm.testing.translators.client import CheckClient
 from afspm.testing.translators.processes import Processes
+from afspm.testing.translators.registry import Lost
 from afspm.testing.translators.support import Support, find_out
-from afspm.testing.translators.verdicts import Lost
 from afspm.translator import Driver
-from afspm.transport.launching import open_port
 from afspm.transport.port import ParentGone, Port
+from afspm.transport.zmq_port import open_port
 
 NAME = "translator_test"
 SPEED = 20.0
@@ -56,7 +56,7 @@ class Tester(Component):
 
 
 @dataclass(frozen=True)
-class Options:
+class CheckOptions:
     """How to check.
 
     Attributes:
@@ -78,7 +78,7 @@ class Options:
 
 
 @dataclass
-class Session:
+class CheckSession:
     """What is there to check.
 
     Attributes:
@@ -89,17 +89,17 @@ class Session:
         complaints: the warnings and errors that were logged; it grows.
     """
 
-    bench: Bench
+    client: CheckClient
     support: Support
     translator: str
     simulated: bool
     folder: Path
-    options: Options
+    options: CheckOptions
     excused: Mapping[str, str]
     complaints: Sequence[str]
 
 
-def prepare(options: Options) -> Experiment:
+def prepare(options: CheckOptions) -> Experiment:
     """The experiment with the tester in it, and a scheduler if it had none.
 
     Raises:
@@ -123,8 +123,8 @@ def prepare(options: Options) -> Experiment:
 
 
 @contextmanager
-def opened(options: Options) -> Iterator[Session]:
-    """Start, or join, what is to be checked; in control of the microscope while in the block.
+def opened(options: CheckOptions) -> Iterator[CheckSession]:
+    """ProcessStart, or join, what is to be checked; in control of the microscope while in the block.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
@@ -135,36 +135,36 @@ def opened(options: Options) -> Iterator[Session]:
     (translator,) = resolved.with_role(Role.TRANSLATOR)
     with ExitStack() as stack:
         complaints: list[str] = []
-        bench, folder, simulated = _bench(experiment, options, stack, complaints)
-        stack.callback(bench.end)
-        stack.enter_context(_interrupting(bench))
+        client, folder, simulated = _client(experiment, options, stack, complaints)
+        stack.callback(client.end)
+        stack.enter_context(_interrupting(client))
         abilities = resolved.abilities(translator)
         actions, parameters = (abilities.actions, abilities.parameters) if abilities else ((), ())
-        support = find_out(bench, sorted(actions), sorted(parameters))
+        support = find_out(client, sorted(actions), sorted(parameters))
         named = resolved.class_paths.get(translator.name) or " ".join(translator.command)
         class_ = resolved.classes.get(translator.name)
         excused: Mapping[str, str] = {}
         if isinstance(class_, type) and issubclass(class_, Driver):
             excused = class_.excused(support.controller)
-        yield Session(bench, support, named, simulated, folder, options, excused, complaints)
+        yield CheckSession(client, support, named, simulated, folder, options, excused, complaints)
 
 
 @contextmanager
-def _interrupting(bench: Bench) -> Iterator[None]:
-    """Ctrl-C interrupts the bench, where signals come to this thread at all."""
+def _interrupting(client: CheckClient) -> Iterator[None]:
+    """Ctrl-C interrupts the client, where signals come to this thread at all."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, lambda number, frame: bench.interrupt())
+    before = signal.signal(signal.SIGINT, lambda number, frame: client.interrupt())
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def _bench(
-    experiment: Experiment, options: Options, stack: ExitStack, complaints: list[str]
-) -> tuple[Bench, Path, bool]:
+def _client(
+    experiment: Experiment, options: CheckOptions, stack: ExitStack, complaints: list[str]
+) -> tuple[CheckClient, Path, bool]:
     """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
     common = _common(experiment, options)
     clock = common.clock
@@ -190,19 +190,19 @@ def _bench(
         stack.callback(port.close)
     processes.start(starts)
     links = [_link(port, own, _logger(log)) for port in ports]
-    bench = Bench(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
+    client = CheckClient(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
     try:
-        bench.begin()
+        client.begin()
     except Lost as lost:
         raise Lost("; ".join(filter(None, (str(lost), processes.errors)))) from lost
-    return bench, folder, common.simulated
+    return client, folder, common.simulated
 
 
 _NOTHING = logging.CRITICAL + 1
 
 
 def _starts(
-    experiment: Experiment, options: Options, common: RunIdentity, folder: Path
+    experiment: Experiment, options: CheckOptions, common: RunIdentity, folder: Path
 ) -> tuple[Launch, list[ProcessStart]]:
     """The tester's own launch line, and what is to be started."""
     starts = experiment.launches(
@@ -219,7 +219,7 @@ def _starts(
     return own, [start for start in starts if start.launch.name != NAME]
 
 
-def _left_out(experiment: Experiment, options: Options) -> list[str]:
+def _left_out(experiment: Experiment, options: CheckOptions) -> list[str]:
     """What is not started: all but translator, scheduler and emulated controller, and what runs already."""
     resolved = experiment.resolved
     wanted = {part.name for role in (Role.TRANSLATOR, Role.SCHEDULER) for part in resolved.with_role(role)}
@@ -255,12 +255,12 @@ def _link(port: Port, own: Launch, log: logging.Logger) -> ExperimentLink:
     )
 
 
-def is_simulated(experiment: Experiment, options: Options) -> bool:
+def is_simulated(experiment: Experiment, options: CheckOptions) -> bool:
     """True if what is started here is simulated for certain."""
     return experiment.simulated(without=_left_out(experiment, options))
 
 
-def _common(experiment: Experiment, options: Options) -> RunIdentity:
+def _common(experiment: Experiment, options: CheckOptions) -> RunIdentity:
     """The scheduler's, where that runs already; else our own."""
     simulated = is_simulated(experiment, options)
     schedulers = {part.name for part in experiment.resolved.with_role(Role.SCHEDULER)}

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from afspm.model import ControlRequest, ControlResponse, Parameter, names
-from afspm.testing.translators.bench import Bench, answer_in_words, value_in
-from afspm.testing.translators.verdicts import Failed
+from afspm.testing.translators.client import CheckClient, answer_in_words, value_in
+from afspm.testing.translators.registry import Failed
 
 ACTIONS = names.BASE_ACTIONS + names.EXTENSION_ACTIONS
 PARAMETERS = (*names.BASE_PARAMETERS, *names.EXTENSION_PARAMETERS, names.DRIFT_RATE_X, names.DRIFT_RATE_Y)
@@ -29,10 +29,10 @@ class Support:
     errors: list[str] = field(default_factory=list)
     settable: dict[str, bool | None] = field(default_factory=dict)
 
-    def ask_again(self, bench: Bench) -> None:
+    def ask_again(self, client: CheckClient) -> None:
         """For the controller's version: some tell it by their files alone."""
         if self.parameters.get(names.CONTROLLER) is not None:
-            self.parameters[names.CONTROLLER] = _value(bench, names.CONTROLLER, self.errors)
+            self.parameters[names.CONTROLLER] = _value(client, names.CONTROLLER, self.errors)
 
     def missing(self, needs: Iterable[str]) -> list[str]:
         """Those of `needs` that the microscope does not have."""
@@ -50,19 +50,19 @@ class Support:
         return "" if told is None else str(told.value)
 
 
-def find_out(bench: Bench, actions: Iterable[str] = (), parameters: Iterable[str] = ()) -> Support:
+def find_out(client: CheckClient, actions: Iterable[str] = (), parameters: Iterable[str] = ()) -> Support:
     """Ask for all generic names, and those of the microscope's own."""
     found = Support()
     for name in dict.fromkeys((*ACTIONS, *actions)):
-        found.actions[name] = _has_action(bench, name, found.errors)
+        found.actions[name] = _has_action(client, name, found.errors)
     for name in dict.fromkeys((*PARAMETERS, *parameters)):
-        found.parameters[name] = _value(bench, name, found.errors)
+        found.parameters[name] = _value(client, name, found.errors)
         found.settable[name] = None
     return found
 
 
-def _has_action(bench: Bench, name: str, errors: list[str]) -> bool | None:
-    response = bench.ask(ControlRequest.ACTION_SUPPORT, name)
+def _has_action(client: CheckClient, name: str, errors: list[str]) -> bool | None:
+    response = client.ask(ControlRequest.ACTION_SUPPORT, name)
     if response.code == ControlResponse.CMD_NOT_SUPPORTED:
         return None
     if not response.ok and response.code != ControlResponse.ACTION_NOT_SUPPORTED:
@@ -71,8 +71,8 @@ def _has_action(bench: Bench, name: str, errors: list[str]) -> bool | None:
     return response.ok
 
 
-def _value(bench: Bench, name: str, errors: list[str]) -> Parameter | None:
-    response = bench.ask(ControlRequest.PARAM, Parameter(name))
+def _value(client: CheckClient, name: str, errors: list[str]) -> Parameter | None:
+    response = client.ask(ControlRequest.PARAM, Parameter(name))
     if response.code in (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED):
         return None
     try:

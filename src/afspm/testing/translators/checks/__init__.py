@@ -1,22 +1,8 @@
-"""The checks: importing this marks them, in this order."""
+"""The checks: importing this registers them, in this order."""
 
 from __future__ import annotations
 
 from importlib import import_module
 
-ORDER = (
-    "published",
-    "cancelling",
-    "scans",
-    "frames",
-    "picture",
-    "feedback",
-    "probe",
-    "spectra",
-    "parameters",
-    "refusals",
-    "busy",
-)
-
-for _name in ORDER:
+for _name in ("frames", "scans", "picture", "feedback", "spectra", "parameters", "refusals"):
     import_module(f"{__name__}.{_name}")

@@ -6,11 +6,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from afspm.model import ControlRequest, ControlResponse, Feedback, names
-from afspm.testing.translators.bench import answer_in_words
-from afspm.testing.translators.registry import check
-from afspm.testing.translators.story import told
-from afspm.testing.translators.taking import Taking, number
-from afspm.testing.translators.verdicts import Failed, Skipped, expect, near
+from afspm.testing.translators.client import answer_in_words, told
+from afspm.testing.translators.measuring import CheckMeasurements, number
+from afspm.testing.translators.registry import Failed, Skipped, check, expect, near
 
 _NUMBERS = {
     "proportional_gain": names.ZCTRL_PGAIN,
@@ -21,23 +19,23 @@ _STEP = 1.02
 """A tip that is not engaged does not mind, and neither would one that is."""
 
 
-def in_force(kit: Taking) -> Feedback:
+def in_force(kit: CheckMeasurements) -> Feedback:
     """What was published last."""
-    feedback = kit.bench.story.newest(Feedback)
+    feedback = kit.client.observations.newest(Feedback)
     if feedback is None and not any(map(kit.support.has, _NUMBERS.values())):
         raise Skipped("the microscope tells nothing of a feedback")
     if feedback is None:
-        raise Failed("ZCtrlParameters at the start", told(kit.bench.story.all[:10]))
+        raise Failed("ZCtrlParameters at the start", told(kit.client.observations.all[:10]))
     return feedback
 
 
-def set_and_require(kit: Taking, wanted: Feedback) -> None:
+def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
     """Set what is given of it; the rest must stay as it is."""
-    kit.bench.come_to_rest()
-    before, mark = in_force(kit), kit.bench.story.mark()
+    kit.client.come_to_rest()
+    before, mark = in_force(kit), kit.client.observations.mark()
     given = {name: value for name, value in vars(wanted).items() if value is not None}
-    response = kit.bench.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted)
-    heard = kit.bench.settled(mark)
+    response = kit.client.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted)
+    heard = kit.client.settled(mark)
     if response.code in (ControlResponse.PARAM_ERROR, ControlResponse.PARAM_NOT_SUPPORTED):
         require_same(before, in_force(kit))
         raise Skipped(f"it can't be set here: {answer_in_words(response)}")
@@ -58,7 +56,7 @@ def require_same(wanted: Feedback, came: Feedback) -> None:
             expect(near(value, other), f"ZCtrlParameters with {name} = {value:.6g}", f"{other:.6g}")
 
 
-def _stepped(kit: Taking, fields: Iterable[str]) -> Feedback:
+def _stepped(kit: CheckMeasurements, fields: Iterable[str]) -> Feedback:
     now = in_force(kit)
     values = {name: getattr(now, name) for name in fields if kit.support.has(_NUMBERS[name])}
     values = {name: value * _STEP for name, value in values.items() if value}
@@ -68,28 +66,28 @@ def _stepped(kit: Taking, fields: Iterable[str]) -> Feedback:
 
 
 @check("feedback/numbers", "gains and setpoint are set and published")
-def numbers(kit: Taking) -> None:
+def numbers(kit: CheckMeasurements) -> None:
     set_and_require(kit, _stepped(kit, _NUMBERS))
 
 
 @check("feedback/one", "only the fields that are present are set: the integral gain", needs=(names.ZCTRL_IGAIN,))
-def one(kit: Taking) -> None:
+def one(kit: CheckMeasurements) -> None:
     set_and_require(kit, _stepped(kit, ["integral_gain"]))
 
 
 @check("feedback/as-parameters", "what is set of the feedback is what its parameters then say")
-def as_parameters(kit: Taking) -> None:
+def as_parameters(kit: CheckMeasurements) -> None:
     wanted = _stepped(kit, _NUMBERS)
     set_and_require(kit, wanted)
     for field, name in _NUMBERS.items():
         value = getattr(wanted, field)
         if value is not None:
-            came = number(kit.bench.get(name))
+            came = number(kit.client.get(name))
             expect(near(came, value), f"{name} = {value:.6g}", f"{came:.6g}")
 
 
 @check("feedback/on-off", "the feedback is switched off and on, and published")
-def on_off(kit: Taking) -> None:
+def on_off(kit: CheckMeasurements) -> None:
     before = in_force(kit).on
     kit.support.settable[names.FEEDBACK_ON] = False
     if before is None:
@@ -97,6 +95,6 @@ def on_off(kit: Taking) -> None:
     for on in (not before, before):
         set_and_require(kit, Feedback(on=on))
         if kit.support.has(names.FEEDBACK_ON):
-            value = str(kit.bench.get(names.FEEDBACK_ON).value).lower()
+            value = str(kit.client.get(names.FEEDBACK_ON).value).lower()
             expect(value == str(on).lower(), f"{names.FEEDBACK_ON} = {str(on).lower()}", value)
             kit.support.settable[names.FEEDBACK_ON] = True

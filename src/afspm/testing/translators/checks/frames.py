@@ -6,6 +6,8 @@ import math
 
 from afspm.model import (
     ControlRequest,
+    Feedback,
+    ProbePosition,
     Region,
     RegionChange,
     ScanParameters,
@@ -13,42 +15,85 @@ from afspm.model import (
     ShapeChange,
     names,
 )
-from afspm.testing.translators.checks.cancelling import states
-from afspm.testing.translators.frames import Frame, difference
-from afspm.testing.translators.registry import check
-from afspm.testing.translators.story import Heard, told
-from afspm.testing.translators.taking import Taking, number
-from afspm.testing.translators.verdicts import Failed, Skipped, expect, near
+from afspm.testing.translators.client import Observation, states, told
+from afspm.testing.translators.measuring import NEAR, CheckMeasurements, FrameSetting, difference, in_words, number
+from afspm.testing.translators.registry import Failed, Skipped, check, expect, near
+from afspm.wire.generated import spectroscopy_pb2
+
+
+@check("published/in-force", "what is in force is published at the start, the state last")
+def published_in_force(kit: CheckMeasurements) -> None:
+    heard = kit.client.at_start
+    wanted: list[tuple[type, tuple[str, ...]]] = [
+        (ScanParameters, (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)),
+        (Feedback, (names.ZCTRL_SETPOINT,)),
+        (ProbePosition, (names.PROBE_POS_X, names.PROBE_POS_Y)),
+    ]
+    state_at = max(i for i, one in enumerate(heard) if one.state is not None)
+    for kind, needs in wanted:
+        at = max((i for i, one in enumerate(heard) if isinstance(one.thing, kind)), default=None)
+        if kit.support.has(*needs):
+            expect(at is not None, f"a {kind.__name__} at the start", told(heard))
+        if at is not None:
+            expect(at < state_at, f"ScopeStateMsg after {kind.__name__}", told(heard))
+
+
+@check("published/free", "the microscope is free before anything is asked of it")
+def free(kit: CheckMeasurements) -> None:
+    states = [one.state for one in kit.client.at_start if one.state is not None]
+    expect(states[-1] is ScopeState.FREE, "SS_FREE", told(kit.client.at_start))
+
+
+@check("published/frame", "the ScanParameters2d are what the parameters say", needs=(names.SCAN_SIZE_X,))
+def frame(kit: CheckMeasurements) -> None:
+    parameters = next(
+        (one.thing for one in reversed(kit.client.at_start) if isinstance(one.thing, ScanParameters)), None
+    )
+    if parameters is None or not isinstance(parameters.region, Region):
+        raise Failed("ScanParameters2d with a region", told(kit.client.at_start))
+    (left, low), (width, height) = parameters.region.top_left_m, parameters.region.size_m
+    told_m = {
+        names.SCAN_TOP_LEFT_X: left,
+        names.SCAN_TOP_LEFT_Y: low,
+        names.SCAN_SIZE_X: width,
+        names.SCAN_SIZE_Y: height,
+    }
+    for name, in_message_m in told_m.items():
+        if kit.support.has(name):
+            value_m = number(kit.client.get(name), "m")
+            alike = near(value_m, in_message_m, absolute=1e-3 * width)
+            expect(alike, f"{name} as in ScanParameters2d, {in_message_m:.6g} m", f"{value_m:.6g} m")
+
 
 _SIZES = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
-def ask_for(kit: Taking, wanted: ScanParameters) -> list[Heard]:
+def ask_for(kit: CheckMeasurements, wanted: ScanParameters) -> list[Observation]:
     """Set what is wanted; what is published of it."""
-    kit.bench.come_to_rest()
-    mark = kit.bench.story.mark()
-    kit.bench.asked(ControlRequest.SET_SCAN_PARAMS, wanted, "setting a frame")
-    return kit.bench.settled(mark)
+    kit.client.come_to_rest()
+    mark = kit.client.observations.mark()
+    kit.client.asked(ControlRequest.SET_SCAN_PARAMS, wanted, "setting a frame")
+    return kit.client.settled(mark)
 
 
-def in_force(kit: Taking) -> Frame:
+def current_frame(kit: CheckMeasurements) -> FrameSetting:
     """The frame that was published last."""
-    newest = kit.bench.story.newest(ScanParameters)
+    newest = kit.client.observations.newest(ScanParameters)
     if newest is None or not isinstance(newest.region, Region) or not isinstance(newest.shape, tuple):
         raise Failed("ScanParameters2d with region and shape", str(newest))
-    return Frame(newest.region, newest.shape)
+    return FrameSetting(newest.region, newest.shape)
 
 
-def require_in_force(kit: Taking, frame: Frame) -> None:
+def require_in_force(kit: CheckMeasurements, frame: FrameSetting) -> None:
     """The frame that was published last is this."""
-    published = in_force(kit)
+    published = current_frame(kit)
     wrong = difference(frame.region, published.region)
     if wrong:
         raise Failed("ScanParameters2d of the frame that was set", wrong)
     expect(published.shape == frame.shape, f"ScanParameters2d of {frame.shape} pixels", f"{published.shape}")
 
 
-def require_told_once(heard: list[Heard], kind: type, named: str) -> None:
+def require_told_once(heard: list[Observation], kind: type, named: str) -> None:
     """SS_MOVING, the new setting once, SS_FREE."""
     right = f"SS_MOVING, {named} once, SS_FREE"
     expect(states(heard) == ["SS_MOVING", "SS_FREE"], right, told(heard))
@@ -58,7 +103,7 @@ def require_told_once(heard: list[Heard], kind: type, named: str) -> None:
 
 
 @check("frame/set", "a frame that is set: SS_MOVING, ScanParameters2d as set, once, SS_FREE", needs=_SIZES)
-def set_whole(kit: Taking) -> None:
+def set_whole(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.plain.request(kit.support))
     heard = ask_for(kit, kit.frames.wide.request(kit.support))
     require_told_once(heard, ScanParameters, "ScanParameters2d")
@@ -66,34 +111,34 @@ def set_whole(kit: Taking) -> None:
 
 
 @check("frame/position-only", "only the fields that are present are set: the corner", needs=(names.SCAN_TOP_LEFT_X,))
-def position_only(kit: Taking) -> None:
+def position_only(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.wide.request(kit.support))
     left, low = kit.frames.wide.region.top_left_m
     moved_m = 0.05 * kit.frames.wide.region.size_m[0]
     ask_for(kit, ScanParameters(RegionChange(left_m=left - moved_m, low_m=low + moved_m)))
     center = kit.frames.wide.region.center_m
     wanted = kit.frames.wide.region.moved_to((center[0] - moved_m, center[1] + moved_m))
-    require_in_force(kit, Frame(wanted, kit.frames.wide.shape))
+    require_in_force(kit, FrameSetting(wanted, kit.frames.wide.shape))
 
 
 @check("frame/shape-only", "only the fields that are present are set: the pixels", needs=(names.SCAN_RESOLUTION_X,))
-def shape_only(kit: Taking) -> None:
+def shape_only(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.wide.request(kit.support))
     ask_for(kit, ScanParameters(shape=ShapeChange(rows=48)))
-    require_in_force(kit, Frame(kit.frames.wide.region, (48, kit.frames.wide.shape[1])))
+    require_in_force(kit, FrameSetting(kit.frames.wide.region, (48, kit.frames.wide.shape[1])))
 
 
 @check("frame/turned", "an angle is set as it was asked for, about the centre", needs=(names.SCAN_ANGLE,))
-def turned(kit: Taking) -> None:
+def turned(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.turned.request(kit.support))
     require_in_force(kit, kit.frames.turned)
     straight = Region(kit.frames.turned.region.center_m, kit.frames.turned.region.size_m, 0.0)
     ask_for(kit, ScanParameters(RegionChange(angle_rad=0.0)))
-    require_in_force(kit, Frame(straight, kit.frames.turned.shape))
+    require_in_force(kit, FrameSetting(straight, kit.frames.turned.shape))
 
 
 @check("frame/parameters", "a frame that is set is what its parameters then say", needs=_SIZES)
-def parameters(kit: Taking) -> None:
+def parameters(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.turned.request(kit.support))
     region, (rows, columns) = kit.frames.turned.region, kit.frames.turned.shape
     (left, low), (width, height) = region.top_left_m, region.size_m
@@ -110,6 +155,41 @@ def parameters(kit: Taking) -> None:
     if not known:
         raise Skipped("the microscope has none of the frame's parameters")
     for name, (value, unit) in known.items():
-        came = number(kit.bench.get(name), unit)
+        came = number(kit.client.get(name), unit)
         alike = near(came, value, absolute=1e-3 * width if unit == "m" else 0.1 if unit == "deg" else 0.0)
         expect(alike, f"{name} = {value:.6g} {unit}".rstrip(), f"{came:.6g} {unit}".rstrip())
+
+
+_NEEDS = (names.PROBE_POS_X, names.PROBE_POS_Y)
+
+
+def require_place(kit: CheckMeasurements, xy_m: tuple[float, float]) -> None:
+    """The probe is said to be there: as published, and by its parameters."""
+    newest = kit.client.observations.newest(ProbePosition)
+    if newest is None:
+        raise Failed("a ProbePosition", "none")
+    within_m = NEAR * min(kit.frames.whole.size_m)
+    expect(math.dist(newest.xy_m, xy_m) <= within_m, f"ProbePosition {in_words(xy_m)}", in_words(newest.xy_m))
+    x_m, y_m = (number(kit.client.get(name), "m") for name in _NEEDS)
+    expect(math.dist((x_m, y_m), xy_m) <= within_m, f"probe-pos-x, -y {in_words(xy_m)}", in_words((x_m, y_m)))
+
+
+@check("probe/move", "the probe is moved: SS_MOVING, ProbePosition as set, once, SS_FREE", needs=_NEEDS)
+def move(kit: CheckMeasurements) -> None:
+    kit.move_probe(kit.frames.plain.region.center_m)
+    heard = kit.move_probe(kit.frames.other.region.center_m)
+    require_told_once(heard, ProbePosition, "ProbePosition")
+    require_place(kit, kit.frames.other.region.center_m)
+
+
+@check("probe/one-axis", "only the coordinate that is present is set", needs=_NEEDS)
+def one_axis(kit: CheckMeasurements) -> None:
+    kit.move_probe(kit.frames.other.region.center_m)
+    x_m, y_m = kit.frames.other.region.center_m
+    y_m += 0.1 * min(kit.frames.whole.size_m)
+    message = spectroscopy_pb2.ProbePosition(units="nm")
+    message.point.y = y_m * 1e9
+    mark = kit.client.observations.mark()
+    kit.client.asked(ControlRequest.SET_PROBE_POS, message, "moving the probe in y, given in nm")
+    kit.client.settled(mark)
+    require_place(kit, (x_m, y_m))

@@ -5,12 +5,57 @@ from __future__ import annotations
 import numpy as np
 
 from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
-from afspm.testing.translators.checks.cancelling import states
-from afspm.testing.translators.frames import difference
-from afspm.testing.translators.registry import check
-from afspm.testing.translators.story import told
-from afspm.testing.translators.taking import SCAN_S, Taken, Taking
-from afspm.testing.translators.verdicts import Failed, Skipped, expect
+from afspm.testing.translators.client import Observation, scans, states, told
+from afspm.testing.translators.measuring import SCAN_S, CheckMeasurements, Taken, difference
+from afspm.testing.translators.registry import Failed, Skipped, check, expect
+
+
+def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
+    """Stop what runs; what is published from its beginning on, once its states have been found right."""
+    asked_to_stop(kit, mark, stop, begun)
+    return require_broken_off(kit, mark, stop, begun)
+
+
+def asked_to_stop(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> float:
+    """Stop what runs; when that was answered, experiment time in s."""
+    client = kit.client
+    expect(client.state is begun, f"SS_{begun.name} until it is stopped", told(client.observations.since(mark)))
+    kit.act(stop)
+    return client.clock.now_s()
+
+
+def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
+    """What is published from the beginning on of what was stopped, once its states have been found right."""
+    client = kit.client
+    client.wait_state(ScopeState.INTERRUPTED, mark)
+    client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
+    heard = client.settled(mark)
+    expect(
+        states(heard) == [f"SS_{begun.name}", "SS_INTERRUPTED", "SS_FREE"],
+        f"SS_{begun.name}, SS_INTERRUPTED, SS_FREE after {stop}",
+        told(heard),
+    )
+    return heard
+
+
+@check(
+    "scan/cancel",
+    "stop-scan breaks a scan off: SS_INTERRUPTED, SS_FREE, and no scan",
+    needs=(names.START_SCAN, names.STOP_SCAN),
+)
+def cancel(kit: CheckMeasurements) -> None:
+    heard = broken_off(kit, kit.begin_long_scan(kit.frames.other), names.STOP_SCAN, ScopeState.SCANNING)
+    expect(not scans(heard), "no Scan2d of a scan that was stopped", told(heard))
+
+
+@check("scan/stop-nothing", "stop-scan while nothing runs is a success, and changes nothing", needs=(names.STOP_SCAN,))
+def stop_nothing(kit: CheckMeasurements) -> None:
+    kit.client.come_to_rest()
+    mark = kit.client.observations.mark()
+    kit.act(names.STOP_SCAN)
+    heard = kit.client.settled(mark)
+    expect(not states(heard), "no state after stopping nothing", told(heard))
+
 
 _NEEDS = (names.START_SCAN,)
 CLOCK_S = 2.0
@@ -20,7 +65,7 @@ _FASTER, _SLOWER, _EDGES_S = 2.5, 5.0, 30.0
 
 
 @check("scan/order", "start-scan: SS_SCANNING, the Scan2d of every channel once, and only then SS_FREE", needs=_NEEDS)
-def order(kit: Taking) -> None:
+def order(kit: CheckMeasurements) -> None:
     require_order(kit.scan("plain").heard, ScopeState.SCANNING, Scan)
 
 
@@ -38,7 +83,7 @@ def require_order(heard: list, begun: ScopeState, kind: type) -> None:  # type: 
 
 
 @check("scan/channels", "every channel has a name of its own, and values everywhere", needs=_NEEDS)
-def channels(kit: Taking) -> None:
+def channels(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     found = [scan.channel for scan in taken.scans]
     expect(len(set(found)) == len(found), "each channel once", ", ".join(found))
@@ -49,7 +94,7 @@ def channels(kit: Taking) -> None:
 
 
 @check("scan/frame", "a scan says the frame that was set, and is of that many pixels", needs=_NEEDS)
-def frame(kit: Taking) -> None:
+def frame(kit: CheckMeasurements) -> None:
     require_frame(kit.scan("plain"))
 
 
@@ -65,9 +110,9 @@ def require_frame(taken: Taken) -> None:
 
 
 @check("scan/in-force", "a scan's parameters are the ScanParameters2d that were in force", needs=_NEEDS)
-def as_published(kit: Taking) -> None:
+def as_published(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
-    before = [one for one in kit.bench.story.all if isinstance(one.thing, ScanParameters)]
+    before = [one for one in kit.client.observations.all if isinstance(one.thing, ScanParameters)]
     begun = taken.time_s(ScopeState.SCANNING)
     in_force = [one.thing for one in before if one.time_ns is not None and one.time_ns <= begun * 1e9]
     if not in_force:
@@ -78,7 +123,7 @@ def as_published(kit: Taking) -> None:
 
 
 @check("scan/time", "a scan says when it was finished", needs=_NEEDS)
-def time(kit: Taking) -> None:
+def time(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     for scan in taken.scans:
         require_time(scan.time_ns, taken, ScopeState.SCANNING, f"scan {scan.channel!r}")
@@ -105,7 +150,7 @@ def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str
     "a scan lasts about as long as its frame and scan-speed say",
     needs=(names.START_SCAN, names.SCAN_SPEED),
 )
-def duration(kit: Taking) -> None:
+def duration(kit: CheckMeasurements) -> None:
     taken = kit.scan("plain")
     if taken.expected_s is None or taken.expected_s < SCAN_S / 2:
         raise Skipped("the speed could not be set so low that it would be seen")
@@ -119,7 +164,7 @@ def duration(kit: Taking) -> None:
 
 
 @check("scan/again", "the same frame again is another scan, later than the first", needs=_NEEDS)
-def again(kit: Taking) -> None:
+def again(kit: CheckMeasurements) -> None:
     first = kit.scan("plain")
     second = kit.take_scan(kit.frames.plain)
     require_order(second.heard, ScopeState.SCANNING, Scan)
@@ -139,7 +184,7 @@ def again(kit: Taking) -> None:
 
 
 @check("scan/not-square", "a frame wider than high, of other pixels, comes out as it was set", needs=_NEEDS)
-def not_square(kit: Taking) -> None:
+def not_square(kit: CheckMeasurements) -> None:
     require_frame(kit.scan("wide"))
 
 
@@ -148,5 +193,5 @@ def not_square(kit: Taking) -> None:
     "a frame that is turned comes out as it was set, counter-clockwise",
     needs=(names.START_SCAN, names.SCAN_ANGLE),
 )
-def turned(kit: Taking) -> None:
+def turned(kit: CheckMeasurements) -> None:
     require_frame(kit.scan("turned"))

@@ -7,13 +7,10 @@ import math
 import numpy as np
 
 from afspm.model import ProbePosition, ScopeState, Spectrum, names
-from afspm.testing.translators.checks.cancelling import asked_to_stop, require_broken_off, states
-from afspm.testing.translators.checks.scans import CLOCK_S, require_order
-from afspm.testing.translators.frames import NEAR, in_words
-from afspm.testing.translators.registry import check
-from afspm.testing.translators.story import spectra, told
-from afspm.testing.translators.taking import Taking
-from afspm.testing.translators.verdicts import Failed, Skipped, expect
+from afspm.testing.translators.checks.scans import CLOCK_S, asked_to_stop, require_broken_off, require_order
+from afspm.testing.translators.client import spectra, states, told
+from afspm.testing.translators.measuring import NEAR, CheckMeasurements, in_words
+from afspm.testing.translators.registry import Failed, Skipped, check, expect
 
 _NEEDS = (names.START_SPEC,)
 
@@ -23,7 +20,7 @@ _NEEDS = (names.START_SPEC,)
     "stop-spec breaks a spectrum off: SS_INTERRUPTED, SS_FREE, and no spectrum",
     needs=(names.START_SPEC, names.STOP_SPEC),
 )
-def cancel(kit: Taking) -> None:
+def cancel(kit: CheckMeasurements) -> None:
     mark, answered_s = kit.begin_spectrum(), math.inf
     try:
         answered_s = asked_to_stop(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
@@ -35,11 +32,11 @@ def cancel(kit: Taking) -> None:
     expect(not spectra(heard), "no Spec1d of a spectrum that was stopped", told(heard))
 
 
-def _was_over(kit: Taking, mark: int, answered_s: float) -> bool:
+def _was_over(kit: CheckMeasurements, mark: int, answered_s: float) -> bool:
     """Whether a spectrum came to its end by itself, all in order, before anybody had stopped it."""
-    bench = kit.bench
-    heard = bench.settled(mark)
-    ended_s = bench.story.at_s(ScopeState.FREE, mark)
+    client = kit.client
+    heard = client.settled(mark)
+    ended_s = client.observations.at_s(ScopeState.FREE, mark)
     if ended_s is None or ended_s > answered_s:
         return False
     first, *between, last = [str(one) for one in heard if one.state is not None or isinstance(one.thing, Spectrum)]
@@ -47,22 +44,22 @@ def _was_over(kit: Taking, mark: int, answered_s: float) -> bool:
 
 
 @check("spectrum/stop-nothing", "stop-spec while nothing runs is a success, and changes nothing", (names.STOP_SPEC,))
-def stop_nothing(kit: Taking) -> None:
-    kit.bench.come_to_rest()
-    mark = kit.bench.story.mark()
+def stop_nothing(kit: CheckMeasurements) -> None:
+    kit.client.come_to_rest()
+    mark = kit.client.observations.mark()
     kit.act(names.STOP_SPEC)
-    heard = kit.bench.settled(mark)
+    heard = kit.client.settled(mark)
     expect(not states(heard), "no state after stopping nothing", told(heard))
 
 
 @check("spectrum/order", "start-spec: SS_SPEC, the Spec1d, and only then SS_FREE", needs=_NEEDS)
-def order(kit: Taking) -> None:
+def order(kit: CheckMeasurements) -> None:
     taken = kit.spectrum()
     require_order(taken.heard, ScopeState.SPEC, Spectrum)
 
 
 @check("spectrum/values", "a spectrum has a kind, variables of different names, and values", needs=_NEEDS)
-def values(kit: Taking) -> None:
+def values(kit: CheckMeasurements) -> None:
     for spectrum in kit.spectrum().spectra:
         expect(spectrum.kind.strip(), "a spectrum that says its type", "an empty type")
         expect(len(set(spectrum.names)) == len(spectrum.names) >= 2, "two variables or more, of different names",
@@ -73,7 +70,7 @@ def values(kit: Taking) -> None:
 
 
 @check("spectrum/position", "a spectrum says where the probe was", needs=(*_NEEDS, names.PROBE_POS_X))
-def position(kit: Taking) -> None:
+def position(kit: CheckMeasurements) -> None:
     wanted = kit.frames.other.region.center_m
     for spectrum in kit.spectrum().spectra:
         if spectrum.position_m is None:
@@ -81,12 +78,12 @@ def position(kit: Taking) -> None:
         apart_m = math.dist(spectrum.position_m, wanted)
         within_m = NEAR * min(kit.frames.whole.size_m)
         expect(apart_m <= within_m, f"a spectrum at {in_words(wanted)}", in_words(spectrum.position_m))
-    where = kit.bench.story.newest(ProbePosition)
+    where = kit.client.observations.newest(ProbePosition)
     expect(where is not None, "a ProbePosition", "none")
 
 
 @check("spectrum/time", "a spectrum says when it was taken", needs=_NEEDS)
-def time(kit: Taking) -> None:
+def time(kit: CheckMeasurements) -> None:
     taken = kit.spectrum()
     begin_s, end_s = taken.time_s(ScopeState.SPEC), taken.time_s(ScopeState.FREE)
     for spectrum in taken.spectra:

@@ -1,0 +1,218 @@
+"""Gauss-Newton on the sum of squares of what is left of the difference of two images."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.estimators.images import flatten_rows
+from afspm.drift.estimators.noise import LEAST_NOISE, FineFilter, denoised, noise_metric, products, seen, without_lines
+from afspm.drift.estimators.warp import COUNT, LINEAR, SLOPES, WarpedPair, derivative
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Both = tuple[Array, Array]
+
+SHIFT: Index = np.array([0, 1, 6], dtype=np.intp)  # of theta: the shift and the gain
+ALL: Index = np.arange(COUNT, dtype=np.intp)
+ROUNDS = 4
+SETTLED_PX = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """What is known of theta before: its mean and inverse covariance, (8,) and (8, 8)."""
+
+    mean: Array
+    precision: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where it has come to, and the equations there, per block of the image and over the variance of the noise.
+
+    Attributes:
+        theta: (8,), see `WarpedPair`.
+        curvature: (n, 8, 8), H'QJ with J the gradient without noise and H what of it is known.
+        spread: (n, 8, 8), H'QH, the covariance of `slope`.
+        slope: (n, 8), H'Qr.
+    """
+
+    theta: Array
+    curvature: Array
+    spread: Array
+    slope: Array
+
+
+def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
+    """theta after some steps with plain weights, for the coarse stages."""
+    theta = theta.copy()
+    for _ in range(steps):
+        one, two, known = pair.warped(theta)
+        mean = (one + two) / 2
+        columns = pair.columns(derivative(mean, 1), derivative(mean, 0), mean, two - one, free)
+        columns_q = seen(columns, known.astype(np.float64), None)
+        normal = np.tensordot(columns_q, columns, ((0, 2), (0, 2)))
+        normal *= max(known.sum(), 1) / max(normal[-1, -1], LEAST_NOISE * known.sum(), LEAST_NOISE)
+        theta, moved = _stepped(theta, normal[:-1, :-1], normal[:-1, -1], believed, free)
+        if moved < 0.01:
+            break
+    return theta
+
+
+def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
+    """theta by rows (see `rows`), where scars count less. The gradient, the noise and the weights are estimated anew in
+    each round, from what the one before has left."""
+    for _ in range(ROUNDS):
+        fit = _round(pair, theta, believed, seen_through)
+        moved = np.hypot(*(fit.theta - theta)[:2])
+        theta = fit.theta
+        if moved < SETTLED_PX:
+            break
+    return fit
+
+
+def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
+    """Newton's step to H'Q r + P (theta - mean) = 0; H is the gradient J without most of its noise (see `shrink`).
+
+    Noise moves with theta as the surface does, but so does what of it has been left in H, and both cancel: what the
+    slope changes by is H'QJ with a J without noise. The noise in both is taken from their product.
+    """
+    one, two, known = pair.warped(theta)
+    mean, residual = (one + two) / 2, two - one
+    left = without_lines(residual, known)
+    gradient = derivative(mean, 1), derivative(mean, 0)
+    signal, noise_through, noise = _signal(gradient, left / 2, known)
+    weight = known * _row_weights(left, known)[:, None]
+    metric = noise_metric(left, known, seen_through)
+    columns = pair.columns(*signal, mean, residual)
+    columns_q = seen(columns, weight, metric)
+    left_over = float(np.vdot(columns_q[:, -1], residual))
+    scale = max(weight.sum(), 1.0) / max(left_over, LEAST_NOISE * weight.sum(), LEAST_NOISE)
+    columns_q, columns = scale * columns_q[:, :-1], columns[:, :-1]
+    spread = products(columns_q, columns)
+    curvature = products(columns_q, pair.columns(*gradient, mean, residual)[:, :-1])
+    through_q = seen(pair.slopes(*noise_through), weight, metric)
+    curvature[:, :SLOPES, :SLOPES] -= scale * products(through_q, pair.slopes(*noise))
+    curvature = _no_less(curvature, spread)
+    slope = products(columns_q, residual[:, None])[:, :, 0]
+    after, _ = _stepped(theta, curvature.sum(axis=0), slope.sum(axis=0), believed, ALL)
+    return Fit(after, curvature, spread, slope + curvature @ (after - theta))
+
+
+def _signal(gradient: Both, noise: Array, known: NDArray[np.bool_]) -> tuple[Both, Both, Both]:
+    """What of a gradient is signal, what of noise would come through with it, and that noise. Its rows are flattened
+    first: the step from one row to the next holds the offsets of both, and a patch can't tell them from a feature."""
+    nx, ny = (without_lines(derivative(noise, axis), known) for axis in (1, 0))
+    x, through_x = denoised(flatten_rows(gradient[0], known), nx)
+    y, through_y = denoised(flatten_rows(gradient[1], known), ny)
+    return (x, y), (through_x, through_y), (nx, ny)
+
+
+def _no_less(curvature: Array, spread: Array) -> Array:
+    """H'QJ, but in no direction less than H'QH. They are about the same; where a direction is hardly seen, nothing but
+    noise may be left of the difference that the curvature is."""
+    from scipy.linalg import eigh
+
+    total, whole = curvature.sum(axis=0), spread.sum(axis=0)
+    if not (np.isfinite(total).all() and np.isfinite(whole).all()):
+        return curvature
+    values, vectors = eigh((total + total.T) / 2, whole + 1e-12 * (1.0 + np.trace(whole)) * np.eye(len(whole)))
+    missing = np.maximum(1.0 - values, 0.0)
+    raised: Array = curvature + spread @ (vectors * missing) @ vectors.T @ whole
+    return raised
+
+
+def _stepped(theta: Array, curvature: Array, slope: Array, believed: Believed, free: Index) -> tuple[Array, float]:
+    """One step of what is free, and how far the shift moved, px."""
+    precision = believed.precision[np.ix_(free, free)]
+    pull = (believed.precision @ (theta - believed.mean))[free]
+    step = -np.linalg.solve(curvature + precision + 1e-9 * np.eye(free.size), slope + pull)
+    theta = theta.copy()
+    theta[free] += step
+    return theta, float(np.hypot(*step[:2]))
+
+
+def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
+    """1 / (1 + 4 (e - 1.3)²) of rows whose root mean square e, over the median of rows, exceeds 1.3: scars."""
+    count = known.sum(axis=1)
+    rms = np.sqrt((residual**2 * known).sum(axis=1) / np.maximum(count, 1))
+    typical = float(np.median(rms[count > 0])) if count.any() else 1.0
+    weight: Array = 1.0 / (1.0 + 4.0 * np.maximum(rms / max(typical, 1e-12) - 1.3, 0.0) ** 2)
+    return weight
+
+
+FLOOR_PX = 1e-3
+
+
+def covariance(fit: Fit, believed: Believed) -> Array:
+    """(8, 8) of theta: (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982),
+    scaled by what the shift really varies with the blocks of the image left out.
+
+    The variation is that of the cluster jackknife (CV3; MacKinnon, Nielsen and Webb, J. Appl. Econom. 38, 671, 2023),
+    which allows for noise that is correlated within a block. Of 8 x 8 numbers it would know little, as few blocks hold
+    most of the features: only its size is taken, and only where it is larger.
+    """
+    used = np.abs(fit.curvature).max(axis=(1, 2)) > 0.0
+    n = int(used.sum())
+    whole = fit.curvature.sum(axis=0) + believed.precision
+    inverse = np.linalg.inv(whole)
+    model = inverse @ (fit.spread.sum(axis=0) + believed.precision) @ inverse.T
+    change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
+    varied = change.T @ change * (n - 1) / n + inverse @ believed.precision @ inverse.T
+    size = float(np.trace(np.linalg.solve(model[:2, :2], varied[:2, :2]))) / 2
+    total: Array = max(size, 1.0) * (model + model.T) / 2
+    total[:2, :2] += FLOOR_PX**2 * np.eye(2)
+    return total
+
+
+DRIFTS = (2e-4, 0.001, 0.002, 0.004, 0.008, 0.016, 0.03)  # displacement per length along y
+BESIDES = (2e-4, 0.01)  # of each element: next to nothing; or creep, a sample that turns, another calibration
+
+
+def of_drift(sd: float) -> Array:
+    """Covariance of (axx, axy, ayx, ayy) when drift during the scans shears them: each row is displaced against the one
+    before, so what depends on y varies alone."""
+    return sd**2 * np.diag([0.0, 1.0, 0.0, 1.0])
+
+
+def shear_models(drift: float | None, aspect: float) -> list[Array]:
+    """What the linear map of pixel coordinates may be: covariances of it.
+
+    Args:
+        drift: displacement per length along y; None: not known, so all are tried.
+        aspect: height of a pixel over its width.
+    """
+    to_px = np.diag([1.0, aspect, 1.0 / aspect, 1.0])
+    drifts = DRIFTS if drift is None else (drift,)
+    return [to_px @ (of_drift(d) + b**2 * np.eye(4)) @ to_px for d, b in itertools.product(drifts, BESIDES)]
+
+
+def averaged(theta: Array, covariance: Array, covariances: Iterable[Array], mean: Array) -> tuple[Array, Array]:
+    """Bayesian model averaging over what the linear map may be (Hoeting, Stat. Sci. 14, 382, 1999).
+
+    Where features are few, shift and shear are nearly the same thing, and what shear is plausible decides the shift.
+    Each model says that the map is normal about `mean` with its covariance; it conditions the shift on that, and weighs
+    by how likely the map found is in it.
+
+    Returns:
+        theta and its covariance, the moments of the mixture.
+    """
+    weights, thetas, totals = [], [], []
+    off = theta[LINEAR] - mean
+    for model in covariances:
+        spread = covariance[LINEAR, LINEAR] + model
+        gain = covariance[:, LINEAR] @ np.linalg.inv(spread)
+        weights.append(-0.5 * off @ np.linalg.solve(spread, off) - 0.5 * np.linalg.slogdet(spread)[1])
+        thetas.append(theta - gain @ off)
+        totals.append(covariance - gain @ covariance[LINEAR])
+    weight = np.exp(np.array(weights) - max(weights))
+    weight /= weight.sum()
+    best: Array = weight @ np.array(thetas)
+    apart = np.array(thetas) - best
+    total: Array = np.tensordot(weight, np.array(totals), 1) + np.einsum("k,ki,kj->ij", weight, apart, apart)
+    return best, total

@@ -1,0 +1,190 @@
+"""Registration by generalised least squares over all pixels (an outline is in `LeastSquares`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.drift.estimators.acceptance import (
+    AcceptanceLimits,
+    MatchEvidence,
+    above_repeats,
+    above_surrogates,
+    agreement,
+    outliers,
+)
+from afspm.drift.estimators.alignment import (
+    ALL,
+    SHIFT,
+    Believed,
+    averaged,
+    covariance,
+    generalised_least_squares,
+    least_squares,
+    shear_models,
+)
+from afspm.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
+from afspm.drift.estimators.noise import FineFilter, shared_information, without_lines
+from afspm.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
+from afspm.drift.estimators.warp import COUNT, LINEAR, OverlapBox, Scene, WarpedPair
+from afspm.drift.registration import DriftScan, LinearSeen, Prior, Registration
+
+Array = NDArray[np.float64]
+
+WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
+GAIN_SD = 1.0  # of the logarithm
+BEND_SD = 0.15
+BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
+FARTHEST_PX = 8.0  # from where the search has found it
+SURROGATES_PX = 32  # the farthest shift that a match is compared with
+
+
+class LeastSquares:
+    """Registers two scans as I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise with d = u + A q.
+
+    1. `prepare`: rows flattened, outliers cut; scans that hold nothing refused. `grid`: a common pixel.
+    2. `search` and `score`: candidates by normalised cross-correlation, the likeliest of them.
+    3. `align`: Gauss-Newton, coarse to fine; the fine stage through the filter of `spectra`, weighted by `rows`.
+    4. `covariance`: by the jackknife; `shear`: the shift, given what shear is plausible.
+    5. `acceptance`: is it a match at all?
+
+    Args:
+        limits: what a match must reach; as a table, some of the values of `AcceptanceLimits`.
+
+    Raises:
+        ConfigError: a limit that there is not, or that is no number.
+    """
+
+    def __init__(self, limits: AcceptanceLimits | Mapping[str, float] | None = None):
+        self._limits = limits if isinstance(limits, AcceptanceLimits) else AcceptanceLimits.of(limits or {})
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        """See `afspm.drift.registration.Estimator`."""
+        images = []
+        for name, each in (("reference", reference), ("scan", scan)):
+            try:
+                images.append(prepare(each.values))
+            except Unusable as reason:
+                return Registration.refused(f"the {name} can't be registered: {reason}")
+        grid, *on_grid = onto_common_grid(reference, images[0], scan, images[1])
+        scene, expected = Scene(on_grid[0], on_grid[1]), None if prior is None else ExpectedShift.of(prior, grid)
+        start = _coarse(scene, expected)
+        box = None if start is None else scene.box(start[0][:2])
+        if start is None or box is None:
+            return Registration.refused("the scans overlap too little")
+        theta, total, seen = _fine(scene, box, start[0], expected, _shear_models(prior, reference, scan, grid))
+        if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
+            return Registration.refused("no displacement fits: the scans hold nothing in common")
+        found = _evidence(scene, box, theta, total, start[1:], expected)
+        registration = self._registration(theta, total, box, grid, found, expected=prior is not None)
+        return replace(registration, linear_seen=_in_m(seen, grid))
+
+    def _registration(
+        self, theta: Array, total: Array, box: OverlapBox, grid: CommonGrid, found: MatchEvidence, *, expected: bool
+    ) -> Registration:
+        reason = self._limits.reason(found, expected=expected)
+        return Registration(
+            accepted=not reason,
+            reason=reason,
+            displacement_m=grid.displacement_m(theta[:2]),
+            covariance_m2=grid.to_m @ total[:2, :2] @ grid.to_m.T,
+            linear=grid.linear_m(_from_reference(theta[LINEAR].reshape(2, 2))),
+            center_m=grid.position_m(box.center - theta[:2] / 2),
+            quality=asdict(found),
+        )
+
+
+def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float, float] | None:
+    """theta within a fraction of a pixel, its log-likelihood and that of the best other; on smaller images where they
+    are large."""
+    small, factor, offset = scene.smaller()
+    scaled = None if expected is None else expected.on_smaller(factor, offset)
+    best = Scorer(small, scaled).best(candidates(small, scaled))
+    box = None if best is None else small.box(best[0].shift_px)
+    if best is None or box is None:
+        return None
+    pair = WarpedPair(*small.smooth_splines, box)
+    theta = np.concatenate([best[0].shift_px, np.zeros(COUNT - 2)])
+    theta = least_squares(pair, theta, _believed(scaled), SHIFT, steps=4)
+    theta = least_squares(pair, theta, _believed(scaled), ALL, steps=4)
+    theta[:2] = theta[:2] * factor + offset
+    return theta, best[0].likelihood, best[1]
+
+
+def _fine(
+    scene: Scene, box: OverlapBox, theta: Array, expected: ExpectedShift | None, shears: tuple[Array, list[Array]]
+) -> tuple[Array, Array, LinearSeen]:
+    """theta and its covariance, and its linear map before what shear is plausible was reckoned with."""
+    fine = FineFilter.of(scene.first.values, scene.second.values)
+    values = fine.applied(scene.first.values), fine.applied(scene.second.values)
+    pair = WarpedPair(*scene.splines(values, order=5), box.without_border(BORDER_PX))
+    believed = _believed(expected)
+    fit = generalised_least_squares(pair, theta, believed, fine)
+    spread = covariance(fit, believed)
+    seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
+    return *averaged(fit.theta, spread, shears[1], shears[0]), seen
+
+
+def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
+    """The same in tip coordinates, by where a feature is in the reference."""
+    to_m = np.kron(grid.to_m, np.linalg.inv(grid.to_m).T)
+    return LinearSeen(grid.linear_m(_from_reference(seen.linear)), to_m @ seen.covariance @ to_m.T)
+
+
+def _from_reference(linear: Array) -> Array:
+    """A displacement d = A q is given half-way between both scans; here by where a feature is in the reference."""
+    whole: Array = linear @ np.linalg.inv(np.eye(2) - linear / 2)
+    return whole
+
+
+def _believed(expected: ExpectedShift | None) -> Believed:
+    mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
+    precision[2:, 2:] = np.diag(1.0 / np.square([*WIDEST, *WIDEST, GAIN_SD, BEND_SD]))
+    if expected is not None:
+        mean[:2], precision[:2, :2] = expected.mean, np.linalg.inv(expected.covariance)
+    return Believed(mean, precision)
+
+
+def _shear_models(
+    prior: Prior | None, reference: DriftScan, scan: DriftScan, grid: CommonGrid
+) -> tuple[Array, list[Array]]:
+    """Mean and covariances of the linear map of pixels, (axx, axy, ayx, ayy)."""
+    mean_m, sd = shear_by_drift(prior, reference, scan)
+    angle = reference.region.angle_rad
+    slow = np.array([-np.sin(angle), np.cos(angle)])
+    width, height = np.hypot(*grid.to_m)
+    mean: Array = np.linalg.inv(grid.to_m) @ np.outer(mean_m, slow) @ grid.to_m
+    return mean.ravel(), shear_models(sd, float(height / width))
+
+
+def _evidence(
+    scene: Scene,
+    box: OverlapBox,
+    theta: Array,
+    total: Array,
+    likelihoods: tuple[float, float],
+    expected: ExpectedShift | None,
+) -> MatchEvidence:
+    one, two, known = WarpedPair(*scene.smooth_splines, box).warped(theta)
+    one, two = without_lines(one, known), without_lines(two, known)
+    edges = WarpedPair(*scene.band_splines, box).warped(theta)
+    share, correlation = agreement(one, two, known)
+    elsewhere = MaskedCorrelation(known, known, SURROGATES_PX)
+    by_shift, edges_by_shift = elsewhere.of(one, two), elsewhere.of(edges[0], edges[1])
+    return MatchEvidence(
+        overlap=float(known.sum() / scene.least_known),
+        sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
+        gap=likelihoods[0] - likelihoods[1],
+        rival=likelihoods[1] / max(likelihoods[0], 1e-300),
+        information=shared_information(one, two),
+        agreement=share,
+        correlation=correlation,
+        correlation_gap=above_surrogates(by_shift, elsewhere.origin),
+        edges_gap=above_surrogates(edges_by_shift, elsewhere.origin),
+        above_repeats=above_repeats(by_shift, elsewhere.overlap, elsewhere.origin),
+        outliers=outliers((two - one)[known]),
+        surprise=0.0 if expected is None else expected.surprise(theta[:2], total[:2, :2]),
+    )

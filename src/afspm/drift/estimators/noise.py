@@ -1,0 +1,260 @@
+"""Power spectra of images, and the filter that the fine alignment sees them through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance
+BLUR_PX = 0.45  # takes what interpolation would alias
+
+
+def cosine_frequencies(shape: tuple[int, ...]) -> Array:
+    """Length of the frequency of each coefficient of a cosine transform, cycles per pixel."""
+    fy, fx = (np.arange(n) / (2.0 * n) for n in shape)
+    length: Array = np.hypot(fy[:, None], fx[None, :])
+    return length
+
+
+@dataclass(frozen=True, eq=False)
+class FineFilter:
+    """The radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.45²) through which the fine alignment sees both.
+
+    Applied to both of two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and
+    Thomson, Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S and N come from the radial
+    mean of both spectra: N is its floor in the top octave, and S, the rest, is taken flat below its peak: a filter
+    that whitens low frequencies would have a long impulse response, and the borders would leak across the image.
+
+    Attributes:
+        frequency: per pixel, ascending.
+        gain: sqrt(2 S / (2 S + N)) there.
+    """
+
+    frequency: Array
+    gain: Array
+
+    @classmethod
+    def of(cls, first: Array, second: Array) -> FineFilter:
+        """For two images."""
+        from scipy.fft import dctn
+
+        shapes = [first.shape, second.shape]
+        squares = np.concatenate([dctn(values, norm="ortho").ravel() ** 2 for values in (first, second)])
+        length = np.concatenate([cosine_frequencies(shape).ravel() for shape in shapes])
+        width = max(1.0 / min(*first.shape, *second.shape), 1.0 / 64)
+        index = (length / width).astype(np.intp)
+        power = np.bincount(index, squares) / np.maximum(np.bincount(index), 1)
+        floor = float(np.median(squares[length > 0.35])) / MEDIAN_POWER
+        signal = np.maximum(power - floor, 0.0)
+        signal[: np.argmax(signal)] = signal.max()
+        gain = np.sqrt(2.0 * signal / (2.0 * signal + floor + 1e-300))
+        return cls((np.arange(power.size) + 0.5) * width, gain)
+
+    def at(self, frequency: Array) -> Array:
+        """H"""
+        h: Array = np.interp(frequency, self.frequency, self.gain) * np.exp(-2.0 * (np.pi * frequency * BLUR_PX) ** 2)
+        return h
+
+    def applied(self, values: Array) -> Array:
+        """An image, filtered."""
+        from scipy.fft import dctn, idctn
+
+        filtered: Array = idctn(dctn(values, norm="ortho") * self.at(cosine_frequencies(values.shape)), norm="ortho")
+        return filtered
+
+    def along_rows(self, frequency: Array) -> Array:
+        """What it makes of the power of noise that each row has by itself, at frequencies along the rows."""
+        across = (np.arange(64) + 0.5) / 128
+        power: Array = np.mean(self.at(np.hypot(frequency[:, None], across)) ** 2, axis=1)
+        return power
+
+
+def independent_values(first: Array, second: Array) -> float:
+    """How many independent values each pixel brings to the correlation of two images: S(P1) S(P2) / S(P1 P2) / n, with
+    the sums S over all n frequencies of their power spectra (Bartlett, J. R. Stat. Soc. Suppl. 8, 27, 1946)."""
+    from scipy.fft import fft2
+
+    shape = tuple(np.maximum(first.shape, second.shape).tolist())
+    p1, p2 = (np.abs(fft2(v - v.mean(), shape)) ** 2 for v in (first, second))
+    return float(p1.mean() * p2.mean() / max(float(np.mean(p1 * p2)), 1e-300))
+
+
+def shared_information(one: Array, two: Array) -> float:
+    """Mutual information of two aligned images of the same box, nats: -1/2 sum of n ln(1 - coherence²) over rings of
+    frequencies, less what noise alone would give."""
+    from scipy.fft import dctn
+
+    a, b = dctn(one, norm="ortho"), dctn(two, norm="ortho")
+    index = np.minimum((cosine_frequencies(a.shape) * 48).astype(int), 24).ravel()
+    aa, bb, ab, n = (
+        np.bincount(index, v, 25) for v in ((a * a).ravel(), (b * b).ravel(), (a * b).ravel(), np.ones(a.size))
+    )
+    coherence2 = ab**2 / np.maximum(aa * bb, 1e-300)
+    return float(np.sum(-0.5 * n * np.log1p(-np.minimum(coherence2, 1.0 - 1e-12)) - 0.5 * (n > 0)))
+
+
+BLOCK_ROWS = 8
+CACHED = 1 << 15  # numbers
+LEAST_NOISE = 1e-8
+"""Variance, where that of the scan is 1: digits end somewhere, and two scans that agree beyond are not known better."""
+HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
+
+
+def seen(columns: Array, weight: Array, metric: Array | None) -> Array:
+    """Q f less what lines explain of it, so that the product with another image g is f'Qg free of both their lines.
+
+    Args:
+        columns: [y, column, x].
+        weight: [y, x] of each pixel; 0 where nothing is known. f and g are multiplied with its root.
+        metric: Q, (x, x); None: white noise.
+
+    Returns:
+        Like `columns`; the root of the weight of g is in it.
+    """
+    found = np.empty_like(columns)
+    at_once = max(1, CACHED // columns[0].size)
+    for first in range(0, len(columns), at_once):
+        some = slice(first, first + at_once)
+        found[some] = _seen(columns[some], weight[some], metric)
+    return found
+
+
+def _seen(columns: Array, weight: Array, metric: Array | None) -> Array:
+    """Of rows that fit into the processor's cache, which halves the time."""
+    root = np.sqrt(weight)[:, None, :]
+    x = np.linspace(-1.0, 1.0, columns.shape[2])
+    rows, lines = columns * root, np.concatenate([root, root * x], axis=1)
+    rows_q, lines_q = (rows, lines) if metric is None else (_along_rows(rows, metric), _along_rows(lines, metric))
+    gram = lines @ lines_q.transpose(0, 2, 1) + 1e-9 * np.eye(2)  # there may be rows of which nothing is known
+    fitted = np.linalg.solve(gram, lines_q @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
+    rows_q -= fitted @ lines_q
+    rows_q *= root
+    return rows_q
+
+
+def _along_rows(columns: Array, metric: Array) -> Array:
+    """Q f of each column: one large product takes a quarter of the time of one for each row."""
+    return (columns.reshape(-1, metric.shape[0]) @ metric).reshape(columns.shape)
+
+
+def without_lines(values: Array, known: NDArray[np.bool_]) -> Array:
+    """Each row, [y, x], less the straight line fitted to it; 0 where nothing is known."""
+    return seen(values[:, None], known.astype(np.float64), None)[:, 0]
+
+
+def products(one: Array, two: Array, block_rows: int = BLOCK_ROWS) -> Array:
+    """Sums of the products of columns, [y, column, x] each, over blocks of rows: (block, columns of one, columns
+    of two). Where `one` is `seen` of something the lines of `two` cancel, but in whole rows only."""
+    starts = np.arange(0, one.shape[0], block_rows)
+    sums: Array = np.add.reduceat(one @ two.transpose(0, 2, 1), starts, axis=0)
+    return sums
+
+
+def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:
+    """Q of white and 1/f noise, N(f) = a + b / f, fitted to the spectra of the rows of a residual (median over rows),
+    after what the filter has done to them.
+
+    None: it is as good as white (b W <= 0.3 a).
+    """
+    from scipy.linalg import inv, toeplitz
+    from scipy.optimize import nnls
+
+    width = residual.shape[1]
+    whole = known.all(axis=1)
+    if whole.sum() < 16 or width < 24:
+        return None
+    spectrum = np.abs(np.fft.rfft(residual[whole], axis=1)) ** 2 / width
+    f = np.arange(spectrum.shape[1]) / width
+    used = (f < HIGHEST_FREQUENCY) & (f > 1.5 / width)
+    power = np.median(spectrum[:, used], axis=0) / np.log(2.0) / seen_through.along_rows(f[used])
+    if not power.max() > LEAST_NOISE:
+        return None
+    model = np.stack([np.ones(used.sum()), 1.0 / f[used]], axis=1)
+    expected = power
+    for _ in range(3):  # the scatter of a spectrum is in proportion to what is expected of it
+        (a, b), _ = nnls(model / expected[:, None], power / expected)
+        expected = np.maximum(model @ (a, b), 1e-3 * power.max())
+    if not b * width > 0.3 * a:
+        return None
+    dense = np.arange(1, 2 * width + 1) / (4.0 * width)
+    covariance = b * (np.cos(2.0 * np.pi * np.outer(np.arange(width), dense)) @ (1.0 / dense)) / (2.0 * width)
+    covariance[0] += max(a, 0.02 * covariance[0])
+    return np.asarray(inv(toeplitz(covariance / covariance[0])), dtype=np.float64)
+
+
+Small = NDArray[np.float32]
+
+PATCH_PX, STEP_PX = 8, 4
+TINY = np.finfo(np.float32).tiny
+CERTAIN = 9.0  # times its noise power must a coefficient have to be kept for its own sake
+
+
+def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
+    """An image with the coefficients of its patches' cosine transforms shrunk by what noise has in them.
+
+    Where a surface is flat its gradient is noise. Multiplied with the noise of the residual it blurs the estimate and
+    makes it look certain, the more the less of the image is edges; a bound knows the true gradient and has no such
+    term. Coefficients c of overlapping patches are shrunk by the larger of two gains: the garrote 1 - k N / c²
+    (Breiman, Technometrics 37, 373, 1995), which keeps features, and Wiener's S / (S + N), which keeps the texture that
+    all patches have in common. The power of noise N and texture S of each coefficient are medians over the patches, so
+    that rows, which have more noise across than along, and features are both allowed for.
+
+    Args:
+        noise: an image of noise alone, as strong as it is in `image`, but another.
+
+    Returns:
+        The shrunk image, and its derivative in the direction of the noise: the product of that with the noise is, on
+        average, the product of the shrunk image with the noise that is in `image` (Stein, Ann. Stat. 9, 1135, 1981;
+        with a noise of one's own: Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008).
+    """
+    c, n = _coefficients(image), _coefficients(noise)  # in 32 bits: half the time, and precise enough for a weight
+    apart = PATCH_PX // STEP_PX  # patches that don't overlap hold as much
+    power = _typical(n[::apart, ::apart] ** 2) + TINY
+    texture = np.maximum(_typical(c[::apart, ::apart] ** 2) - power, 0.0)
+    garrote, wiener = 1.0 - CERTAIN * power / np.maximum(c**2, TINY), texture / (texture + power)
+    gain = np.maximum(garrote, wiener)
+    change = np.where(garrote > wiener, 2.0 - gain, wiener)  # of c times its gain
+    return _image(c * gain, image.shape), _image(n * change, image.shape)
+
+
+def _typical(squares: Small) -> Small:
+    """Variance of each coefficient, from the median over the patches."""
+    by_coefficient = np.ascontiguousarray(squares.reshape(-1, squares.shape[2]).T)
+    return np.asarray(np.median(by_coefficient, axis=1, overwrite_input=True) / MEDIAN_POWER, dtype=np.float32)
+
+
+@cache
+def _basis() -> Small:
+    """Of the cosine transform of a patch, in a line each: orthonormal."""
+    from scipy.fft import dct
+
+    one = dct(np.eye(PATCH_PX), norm="ortho", axis=0)
+    both = np.asarray(np.kron(one, one), dtype=np.float32)
+    both.flags.writeable = False
+    return both
+
+
+def _coefficients(image: Array) -> Small:
+    """[row of patches, column of patches, coefficient], of the image mirrored at its borders."""
+    padded = np.pad(image.astype(np.float32), [(PATCH_PX, PATCH_PX + STEP_PX)] * 2, mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (PATCH_PX, PATCH_PX))[::STEP_PX, ::STEP_PX]
+    found: Small = windows.reshape(*windows.shape[:2], -1) @ _basis().T
+    return found
+
+
+def _image(coefficients: Small, shape: tuple[int, ...]) -> Array:
+    """The inverse: the mean of all patches that cover a pixel."""
+    ny, nx = coefficients.shape[:2]
+    times = PATCH_PX // STEP_PX
+    patches = (coefficients @ _basis()).reshape(ny, nx, times, STEP_PX, times, STEP_PX)
+    total = np.zeros((ny + times - 1, STEP_PX, nx + times - 1, STEP_PX), dtype=np.float32)
+    for dy in range(times):
+        for dx in range(times):
+            total[dy : dy + ny, :, dx : dx + nx, :] += patches[:, :, dy, :, dx, :].transpose(0, 2, 1, 3)
+    inner = np.s_[PATCH_PX : PATCH_PX + shape[0], PATCH_PX : PATCH_PX + shape[1]]
+    return total.reshape(total.shape[0] * STEP_PX, -1)[inner].astype(np.float64) / times**2

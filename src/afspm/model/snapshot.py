@@ -1,0 +1,127 @@
+"""Snapshots: trees of dataclasses as plain data, and back, with the kind and the version that they are of.
+
+Plain data are what JSON holds, and numpy arrays, which the caller stores beside it (or asks for as lists). Only the
+types of the fields say what is read: nothing in a snapshot names code.
+"""
+
+from __future__ import annotations
+
+import types
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from afspm.errors import InvalidValue
+
+T = TypeVar("T")
+Plain = dict[str, Any]
+
+
+def snapshot(state: Any, kind: str, version: int, *, lists: bool = False) -> Plain:
+    """Return a dataclass as plain data.
+
+    Args:
+        kind, version: what `restored` asks for.
+        lists: arrays become lists, so that JSON can hold all of it.
+    """
+    return {"kind": kind, "version": version, **to_plain(state, lists=lists)}
+
+
+def restored(type_: type[T], plain: Mapping[str, Any], kind: str, version: int) -> T:
+    """Return the dataclass that `snapshot` was made of.
+
+    Raises:
+        InvalidValue: of another kind or version, or damaged.
+    """
+    if (plain.get("kind"), plain.get("version")) != (kind, version):
+        found = f"{plain.get('kind')!r}, version {plain.get('version')!r}"
+        raise InvalidValue(f"a snapshot of kind {found} instead of {kind!r}, version {version}")
+    try:
+        made: T = from_plain(type_, {key: value for key, value in plain.items() if key not in ("kind", "version")})
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InvalidValue(f"a damaged snapshot of {kind!r}: {error}") from error
+    return made
+
+
+def to_plain(value: Any, *, lists: bool = False) -> Any:
+    """Return dataclasses, enums, collections and arrays as plain data."""
+    if isinstance(value, Enum):
+        return value.value
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_plain(getattr(value, field.name), lists=lists) for field in fields(value) if field.init}
+    if isinstance(value, np.ndarray):
+        return value.tolist() if lists else value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return [[to_plain(key, lists=lists), to_plain(one, lists=lists)] for key, one in value.items()]
+    if isinstance(value, list | tuple | deque):
+        return [to_plain(one, lists=lists) for one in value]
+    if isinstance(value, set | frozenset):
+        return sorted(to_plain(one, lists=lists) for one in value)
+    return value
+
+
+def from_plain(type_: Any, plain: Any) -> Any:
+    """Return plain data as a type says: the inverse of `to_plain`.
+
+    Raises:
+        KeyError: a field without a default is missing.
+        TypeError, ValueError: something else than the type says.
+    """
+    origin, arguments = get_origin(type_), get_args(type_)
+    if type_ is Any:
+        return plain
+    if origin in (Union, types.UnionType):
+        return _from_union(arguments, plain)
+    if origin is np.ndarray:
+        if not isinstance(plain, np.ndarray | list):
+            raise TypeError(f"{plain!r} is no array")
+        return np.asarray(plain, dtype=get_args(arguments[1])[0])
+    if is_dataclass(type_):
+        return _from_fields(type_, plain)
+    if isinstance(type_, type) and issubclass(type_, Enum):
+        return type_(plain)
+    if origin is not None:
+        return _from_collection(origin, arguments, plain)
+    if type_ is float:
+        return float(plain)
+    if not isinstance(plain, type_):
+        raise TypeError(f"{plain!r} is no {type_.__name__}")
+    return plain
+
+
+def _from_union(arguments: Sequence[Any], plain: Any) -> Any:
+    """Of `X | None` alone: which of several a value was, plain data do not say."""
+    if plain is None and types.NoneType in arguments:
+        return None
+    (only,) = (one for one in arguments if one is not types.NoneType)
+    return from_plain(only, plain)
+
+
+def _from_fields(type_: Any, plain: Mapping[str, Any]) -> Any:
+    hints = _hints(type_)
+    known = {field.name: hints[field.name] for field in fields(type_) if field.init}
+    if unknown := plain.keys() - known.keys():
+        raise ValueError(f"{type_.__name__} has no {', '.join(sorted(unknown))}")
+    return type_(**{name: from_plain(known[name], value) for name, value in plain.items()})
+
+
+def _from_collection(origin: Any, arguments: Sequence[Any], plain: Any) -> Any:
+    if issubclass(origin, Mapping):
+        key, value = arguments
+        return {from_plain(key, one): from_plain(value, other) for one, other in plain}
+    if origin is tuple and not (len(arguments) == 2 and arguments[1] is Ellipsis):
+        return tuple(from_plain(one, value) for one, value in zip(arguments, plain, strict=True))
+    made = [from_plain(arguments[0], value) for value in plain]
+    return made if origin in (list, Sequence) else origin(made)
+
+
+@cache
+def _hints(type_: type[Any]) -> dict[str, Any]:
+    return get_type_hints(type_)

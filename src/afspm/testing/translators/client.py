@@ -1,0 +1,352 @@
+"""`CheckClient`: asks what a component could ask, through the scheduler, and hears what is published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
+
+from afspm import wire
+from afspm.client.link import ExperimentLink
+from afspm.clock import Clock
+from afspm.errors import ExperimentEnded, NoResponse, WireError
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    Parameter,
+    Response,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+    Spectrum,
+    names,
+)
+from afspm.process.parent import StopRequested
+from afspm.testing.translators.registry import Failed, Lost, expect
+
+T = TypeVar("T")
+
+_OF_A_MICROSCOPE: Final = frozenset(
+    {"Scan2d", "Spec1d", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ScopeStateMsg"}
+)
+"""The rest is others' doing: who is in control, what the scheduler notes down, lines that only those want who asked."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One packet.
+
+    Attributes:
+        message: its name.
+        thing: what is in it; an error that says why it can't be read.
+        time_ns: when it was published.
+    """
+
+    message: str
+    thing: Any
+    time_ns: int | None
+
+    @property
+    def state(self) -> ScopeState | None:
+        """The state, where it tells one."""
+        return self.thing.state if isinstance(self.thing, ScopeStatus) else None
+
+    def __str__(self) -> str:
+        if self.state is not None:
+            return f"SS_{self.state.name}"
+        if isinstance(self.thing, Scan):
+            return f"Scan2d {self.thing.channel!r}"
+        if isinstance(self.thing, WireError):
+            return f"{self.message} that can't be read: {self.thing}"
+        return self.message
+
+
+class Observations:
+    """All that is heard of the microscope, oldest first."""
+
+    def __init__(self) -> None:
+        self.all: list[Observation] = []
+
+    def take(self, packet: Packet, ours: bool) -> None:
+        """A listener of a `ExperimentLink`."""
+        message = packet.envelope
+        try:
+            message = wire.message_of(packet.envelope)
+            thing = wire.decode(message, bytes(packet.payload))
+        except WireError as error:
+            thing = error
+        if message in _OF_A_MICROSCOPE or isinstance(thing, WireError):
+            self.all.append(Observation(message, thing, packet.time_ns))
+
+    def mark(self) -> int:
+        """Here: what comes later is news."""
+        return len(self.all)
+
+    def since(self, mark: int) -> list[Observation]:
+        """What came after `mark`."""
+        return self.all[mark:]
+
+    def newest(self, kind: type[T]) -> T | None:
+        """The last that was published of a kind."""
+        return next((one.thing for one in reversed(self.all) if isinstance(one.thing, kind)), None)
+
+    def has_state(self, state: ScopeState, mark: int) -> bool:
+        """Whether it was said after `mark`."""
+        return any(one.state is state for one in self.all[mark:])
+
+    def at_s(self, state: ScopeState, mark: int) -> float | None:
+        """When it was first said after `mark`, experiment time; None: not yet."""
+        times = (one.time_ns for one in self.all[mark:] if one.state is state and one.time_ns is not None)
+        return next((time_ns / 1e9 for time_ns in times), None)
+
+
+def told(heard: Iterable[Observation]) -> str:
+    """What was heard, for a person."""
+    return ", ".join(map(str, heard)) or "nothing"
+
+
+def scans(heard: Iterable[Observation]) -> list[Scan]:
+    """The scans among it."""
+    return [one.thing for one in heard if isinstance(one.thing, Scan)]
+
+
+def spectra(heard: Iterable[Observation]) -> list[Spectrum]:
+    """The spectra among it."""
+    return [one.thing for one in heard if isinstance(one.thing, Spectrum)]
+
+
+def states(heard: list[Observation]) -> list[str]:
+    """The states among what was heard, in words, each once where it is repeated."""
+    found: list[str] = []
+    for one in heard:
+        if one.state is not None and str(one) not in found[-1:]:
+            found.append(str(one))
+    return found
+
+
+STARTED_S = 30.0
+"""Real seconds until translator and scheduler are up and the microscope has said that it is free."""
+ANSWERED_S = 15.0
+"""Real seconds until an answer: longer than a scheduler waits for the translator's."""
+NOTICED_S = 10.0
+"""Real seconds until what was asked for is published."""
+QUIET_S = 0.2
+"""Real seconds without anything after which nothing more is said to come."""
+MOVED_S = 60.0
+"""Experiment seconds that a move may take."""
+
+_STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
+
+
+_ANSWERS = "a scheduler that answers (of a run that goes on: one with `[security] plain = true`)"
+
+
+class CheckClient:
+    """A component of a kind of its own: it is told everything, and hides nothing.
+
+    Args:
+        link: to the scheduler, connected or about to be.
+        direct: to the translator, past the scheduler, which would refuse some things by itself; None: there is none.
+        lost: says why the links were told that the parent is gone: which process has ended.
+
+    Attributes:
+        observations: what is published.
+        at_start: what of it was there before anything was asked.
+    """
+
+    def __init__(self, link: ExperimentLink, direct: ExperimentLink | None, lost: Callable[[], str]) -> None:
+        self._link = link
+        self._direct = direct or link
+        self._lost = lost
+        self.clock: Clock = link.clock
+        self.observations = Observations()
+        self.at_start: tuple[Observation, ...] = ()
+        self._stirred = True
+        self._interrupted = False
+        link.listen(self.observations.take)
+
+    # --- beginning and ending ---
+
+    def begin(self) -> None:
+        """Wait until the microscope is there, and take control.
+
+        Raises:
+            Lost: that could not be.
+        """
+        try:
+            self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, _ANSWERS)
+            self.wait(
+                lambda: self.observations.newest(ScopeStatus) is not None,
+                STARTED_S,
+                "a ScopeStateMsg of the translator",
+            )
+            self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a controller that is found")
+        except Failed as failure:
+            raise Lost(str(failure)) from failure
+        response = self._asked_by(self._link, ControlRequest.REQUEST_CTRL, 0)
+        if not response.ok:
+            raise Lost(f"control is not given: {answer_in_words(response)}")
+        self.quiet()
+        self.at_start = tuple(self.observations.all)
+
+    def end(self) -> None:
+        """Give control back."""
+        self._link.send_only(ControlRequest.RELEASE_CTRL)
+
+    def interrupt(self) -> None:
+        """Ctrl-C: KeyboardInterrupt where the checks next wait or ask. Raised anywhere, it could leave a request half
+        sent, and what is then put back would be taken for the rest of it."""
+        self._interrupted = True
+        self._link.port.wake_up()
+
+    def _heed(self) -> None:
+        if self._interrupted:
+            self._interrupted = False
+            raise KeyboardInterrupt
+
+    # --- asking ---
+
+    def ask(self, kind: ControlRequest, subject: Any = None) -> Response:
+        """The answer, whatever it is.
+
+        Raises:
+            Failed: there is none.
+            Lost: a process has ended, or control was taken away.
+        """
+        response = self._asked_by(self._link, kind, subject)
+        if response.code == ControlResponse.NOT_IN_CONTROL:
+            raise Lost(f"control was lost: {response.reason}")
+        return response
+
+    def ask_directly(self, kind: ControlRequest, subject: Any) -> Response:
+        """As `ask`, past the scheduler: for what the translator has to refuse by itself."""
+        return self._asked_by(self._direct, kind, subject)
+
+    def _asked_by(self, link: ExperimentLink, kind: ControlRequest, subject: Any) -> Response:
+        self._heed()
+        try:
+            with self._alive():
+                response = link.request(kind, subject, until_s=link.until(ANSWERED_S))
+        except NoResponse:
+            raise Failed(f"an answer to REQ_{kind.name}", f"none within {ANSWERED_S:g} s") from None
+        self._stirred |= response.ok and not _only_asks(kind, subject)
+        return response
+
+    def asked(self, kind: ControlRequest, subject: Any, what: str) -> Response:
+        """As `ask`, where it has to be a success."""
+        response = self.ask(kind, subject)
+        expect(response.ok, f"REP_SUCCESS to {what}", answer_in_words(response))
+        return response
+
+    def get(self, name: str, unit: str | None = None) -> Parameter:
+        """A parameter's value, as it is told."""
+        return value_in(self.asked(ControlRequest.PARAM, Parameter(name, None, unit), f"getting {name}"), name)
+
+    def set(self, name: str, value: str, unit: str | None = None) -> Response:
+        """Ask for a value; the answer, whatever it is."""
+        return self.ask(ControlRequest.PARAM, Parameter(name, value, unit))
+
+    # --- hearing ---
+
+    @property
+    def state(self) -> ScopeState:
+        """What the microscope has said last."""
+        newest = self.observations.newest(ScopeStatus)
+        return ScopeState.UNDEFINED if newest is None else newest.state
+
+    def wait(self, done: Callable[[], bool], within_s: float, expected: str) -> None:
+        """Wait for something to be heard, real seconds.
+
+        Raises:
+            Failed: it did not come.
+        """
+        mark = self.observations.mark()
+        self._wait(done, within_s, expected, mark)
+
+    def wait_state(self, state: ScopeState, mark: int, within_s: float = NOTICED_S) -> None:
+        """Wait until a state is heard after `mark`."""
+        self._wait(lambda: self.observations.has_state(state, mark), within_s, f"SS_{state.name}", mark)
+
+    def _wait(self, done: Callable[[], bool], within_s: float, expected: str, mark: int) -> None:
+        came = self._awaited(done, within_s)
+        expect(came, f"{expected} within {within_s:.3g} s", told(self.observations.since(mark)))
+
+    def _awaited(self, done: Callable[[], bool], within_s: float) -> bool:
+        def done_or_interrupted() -> bool:
+            self._heed()
+            return done()
+
+        with self._alive():
+            return self._link.wait(done_or_interrupted, self._link.until(within_s))
+
+    def settled(self, mark: int, experiment_s: float = MOVED_S) -> list[Observation]:
+        """All that is published after `mark` until the microscope is free and quiet."""
+
+        self.quiet()
+        if self.state is not ScopeState.FREE:
+            self.wait(lambda: self.state is ScopeState.FREE, self.real_s(experiment_s), "SS_FREE")
+            self.quiet()
+        return self.observations.since(mark)
+
+    def quiet(self) -> None:
+        """Until nothing has come for a while."""
+        self._stirred = False
+        until_s = self.clock.monotonic_s() + NOTICED_S
+        while self.clock.monotonic_s() < until_s:
+            count = len(self.observations.all)
+            if not self._awaited(lambda n=count: len(self.observations.all) != n, QUIET_S):  # type: ignore[misc]
+                return
+
+    def real_s(self, experiment_s: float) -> float:
+        """How long that may last in real time: never less than it takes to be noticed."""
+        return self.clock.real_s(experiment_s) + NOTICED_S
+
+    def come_to_rest(self) -> None:
+        """Stop whatever runs; free, or Lost."""
+        if self.state is not ScopeState.FREE:
+            mark = self.observations.mark()
+            if self.state in _STOPS:
+                self.ask(ControlRequest.ACTION, _STOPS[self.state])
+            try:
+                self.wait(lambda: self.state is ScopeState.FREE, self.real_s(MOVED_S), "SS_FREE")
+            except Failed as failure:
+                raise Lost(f"it does not come to rest: {failure} ({told(self.observations.since(mark))})") from failure
+        if self._stirred:
+            self.quiet()
+
+    @contextmanager
+    def _alive(self) -> Iterator[None]:
+        try:
+            yield
+        except StopRequested:
+            raise Lost(self._lost()) from None
+        except ExperimentEnded as ended:
+            raise Lost(str(ended)) from ended
+
+
+def _only_asks(kind: ControlRequest, subject: Any) -> bool:
+    return kind is ControlRequest.ACTION_SUPPORT or (isinstance(subject, Parameter) and subject.value is None)
+
+
+def answer_in_words(response: Response) -> str:
+    """An answer, and why."""
+    known = response.code in ControlResponse._value2member_map_
+    code = f"REP_{ControlResponse(response.code).name}" if known else f"response {response.code}"
+    return f"{code} ({response.reason})" if response.reason else code
+
+
+def value_in(response: Response, name: str) -> Parameter:
+    """The parameter that comes with a success.
+
+    Raises:
+        Failed: none, or another.
+    """
+    try:
+        found = wire.decode_parameter(response.payload)
+    except WireError as error:
+        raise Failed(f"REP_SUCCESS with a ParameterMsg of {name}", f"one that can't be read: {error}") from error
+    expect(found.name == name, f"the value of {name}", f"that of {found.name!r}")
+    expect(found.value is not None, f"REP_SUCCESS with the value of {name} in force", "no value")
+    return found

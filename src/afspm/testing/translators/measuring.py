@@ -1,0 +1,299 @@
+"""Setting frames, and taking scans and spectra, with everything that is published meanwhile."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import TypeVar
+
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    ProbePosition,
+    Region,
+    RegionChange,
+    Scan,
+    ScanParameters,
+    ScopeState,
+    Spectrum,
+    names,
+)
+from afspm.testing.translators.client import CheckClient, Observation, answer_in_words, scans, spectra, told
+from afspm.testing.translators.registry import Failed, Skipped, expect
+from afspm.testing.translators.support import Support
+from afspm.units import convert
+
+NEAR = 1e-3
+"""Of a frame's size: closer than that is the same. Half a pixel of the largest frame here is more."""
+TURN_RAD = math.radians(20.0)
+
+
+@dataclass(frozen=True)
+class FrameSetting:
+    """A region and its pixels, (rows, columns)."""
+
+    region: Region
+    shape: tuple[int, int]
+
+    def request(self, support: Support) -> ScanParameters:
+        """What to ask for; without the angle, where the microscope has none."""
+        (left, low), (width, height) = self.region.top_left_m, self.region.size_m
+        angle = self.region.angle_rad if support.has(names.SCAN_ANGLE) else None
+        return ScanParameters(RegionChange(left, low, width, height, angle), self.shape)
+
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """The frames of one pass. Columns are multiples of 16: some controllers take no others.
+
+    Attributes:
+        whole: as it was set at the beginning.
+    """
+
+    whole: Region
+
+    @property
+    def plain(self) -> FrameSetting:
+        """Square, beside the middle in both directions."""
+        return self._part((0.1, -0.15), (0.5, 0.5), (32, 32))
+
+    @property
+    def other(self) -> FrameSetting:
+        """Square as well, elsewhere and smaller."""
+        return self._part((-0.2, 0.2), (0.3, 0.3), (32, 32))
+
+    @property
+    def wide(self) -> FrameSetting:
+        """Twice as wide as high, and of other pixels."""
+        return self._part((-0.1, 0.15), (0.6, 0.3), (16, 64))
+
+    @property
+    def turned(self) -> FrameSetting:
+        """Turned counter-clockwise."""
+        return self._part((0.1, 0.05), (0.5, 0.4), (32, 48), TURN_RAD)
+
+    def _part(
+        self, offset: tuple[float, float], size: tuple[float, float], shape: tuple[int, int], turn_rad: float = 0.0
+    ) -> FrameSetting:
+        """`offset` of the middle and `size` in units of the whole, in its own directions."""
+        width, height = self.whole.size_m
+        side = min(width, height)
+        cos, sin = math.cos(self.whole.angle_rad), math.sin(self.whole.angle_rad)
+        right, up = offset[0] * side, offset[1] * side
+        x, y = self.whole.center_m
+        center = (x + cos * right - sin * up, y + sin * right + cos * up)
+        return FrameSetting(Region(center, (size[0] * side, size[1] * side), self.whole.angle_rad + turn_rad), shape)
+
+
+def difference(expected: Region, came: Region) -> str:
+    """In which respect two regions differ; empty where they are the same to a controller's precision."""
+    size = math.hypot(*expected.size_m)
+    if math.dist(expected.size_m, came.size_m) > NEAR * size:
+        return f"a size of {in_words(came.size_m)} instead of {in_words(expected.size_m)}"
+    turned = math.remainder(came.angle_rad - expected.angle_rad, math.tau)
+    if abs(turned) > NEAR:
+        return f"an angle of {math.degrees(came.angle_rad):.4g}° instead of {math.degrees(expected.angle_rad):.4g}°"
+    if math.dist(expected.center_m, came.center_m) > NEAR * size:
+        moved = tuple(b - a for a, b in zip(expected.center_m, came.center_m, strict=True))
+        of_size = ", ".join(f"{m / s:+.2f}" for m, s in zip(moved, expected.size_m, strict=True))
+        return (
+            f"a centre at {in_words(came.center_m)} instead of {in_words(expected.center_m)}: off by ({of_size}) frames"
+        )
+    return ""
+
+
+def in_words(xy_m: tuple[float, float]) -> str:
+    """Two lengths, in nm."""
+    return "({:.6g}, {:.6g}) nm".format(*(value * 1e9 for value in xy_m))
+
+
+SCAN_S = 8.0
+"""Experiment seconds that a scan is to last, where its speed can be set: long enough to tell its start from its end."""
+LINE_S = 0.25
+"""Experiment seconds that a line, there and back, is to last at least: no scanner is driven to its limits."""
+LONG_REAL_S = 3.0
+"""Real seconds that a scan has to last at least in the middle of which something is asked."""
+UNKNOWN_S = 1200.0
+"""Experiment seconds after which a scan or spectrum of unknown duration is said not to end."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A measurement that was taken.
+
+    Attributes:
+        frame: that was set; of a spectrum: None.
+        heard: from its beginning on until all was quiet.
+        expected_s: how long, by its speed, it should have lasted, experiment time; None if that is not known.
+    """
+
+    frame: FrameSetting | None
+    heard: list[Observation]
+    expected_s: float | None
+
+    @property
+    def scans(self) -> list[Scan]:
+        return scans(self.heard)
+
+    @property
+    def spectra(self) -> list[Spectrum]:
+        return spectra(self.heard)
+
+    def time_s(self, state: ScopeState) -> float:
+        """When it was first in a state, experiment time.
+
+        Raises:
+            Failed: never.
+        """
+        times = [one.time_ns for one in self.heard if one.state is state and one.time_ns is not None]
+        expect(times, f"SS_{state.name} with a time", told(self.heard))
+        return times[0] / 1e9
+
+
+class CheckMeasurements:
+    """Takes measurements for checks. What failed once is not tried again: who needs it is skipped.
+
+    Attributes:
+        excused: checks that this controller can't pass, with the reason.
+        complaints: what is logged as wrong; it grows.
+        frames: to take scans of; Skipped where the microscope has not said what is set.
+            `frame_m` is the side of what they are parts of, instead of the frame that is set.
+    """
+
+    def __init__(
+        self,
+        client: CheckClient,
+        support: Support,
+        frame_m: float | None = None,
+        *,
+        excused: Mapping[str, str] = MappingProxyType({}),
+        complaints: Sequence[str] = (),
+    ) -> None:
+        self.client = client
+        self.support = support
+        self.excused, self.complaints = excused, complaints
+        self._kept: dict[str, Taken | Exception] = {}
+        initial = client.observations.newest(ScanParameters)
+        region = None if initial is None else initial.region
+        self._whole = region if isinstance(region, Region) else None
+        if self._whole is not None and frame_m is not None:
+            self._whole = replace(self._whole, size_m=(frame_m, frame_m))
+
+    @property
+    def frames(self) -> FrameSettings:
+        if self._whole is None:
+            raise Skipped("no ScanParameters2d says which frame is set")
+        return FrameSettings(self._whole)
+
+    # --- scans ---
+
+    def scan(self, name: str) -> Taken:
+        """The scan of the frame of this name, taken now unless it was before."""
+        return self._once(f"scan of the {name} frame", lambda: self.take_scan(getattr(self.frames, name)))
+
+    def take_scan(self, frame: FrameSetting) -> Taken:
+        """Take a scan, to its end."""
+        expected_s = self.prepare(frame, max(SCAN_S, LINE_S * frame.shape[0]))
+        heard = self._measure(names.START_SCAN, ScopeState.SCANNING, expected_s)
+        if not scans(heard):
+            raise Failed("a Scan2d between SS_SCANNING and SS_FREE", told(heard))
+        return Taken(frame, heard, expected_s)
+
+    def begin_long_scan(self, frame: FrameSetting) -> int:
+        """Begin a scan that lasts long enough to ask something meanwhile; where the observations was before it."""
+        self.prepare(frame, max(SCAN_S, LONG_REAL_S / self.client.clock.real_s(1.0)))
+        return self._begin(names.START_SCAN, ScopeState.SCANNING)
+
+    def prepare(self, frame: FrameSetting, lasts_s: float) -> float | None:
+        """Set frame and speed; how long, by that, the scan lasts."""
+        client = self.client
+        client.come_to_rest()
+        mark = client.observations.mark()
+        client.asked(ControlRequest.SET_SCAN_PARAMS, frame.request(self.support), "setting a frame")
+        client.settled(mark)
+        if self.support.parameters.get(names.SCAN_SPEED) is None:
+            return None
+        speed_m_s = 2.0 * frame.region.size_m[0] * frame.shape[0] / lasts_s
+        client.set(names.SCAN_SPEED, f"{speed_m_s:.4g}", "m/s")  # if that is refused, it lasts as long as it does
+        in_force_m_s = number(client.get(names.SCAN_SPEED), "m/s")
+        expect(in_force_m_s > 0.0, "a scan-speed above zero", f"{in_force_m_s:g} m/s")
+        return 2.0 * frame.region.size_m[0] * frame.shape[0] / in_force_m_s
+
+    # --- spectra ---
+
+    def spectrum(self) -> Taken:
+        """A spectrum somewhere in the frame, taken now unless one was before."""
+        return self._once("spectrum", self._take_spectrum)
+
+    def begin_spectrum(self) -> int:
+        """Begin one; where the observations was before it."""
+        self.client.come_to_rest()
+        return self._begin(names.START_SPEC, ScopeState.SPEC)
+
+    def _take_spectrum(self) -> Taken:
+        self.client.come_to_rest()
+        if self.support.has(names.PROBE_POS_X, names.PROBE_POS_Y):
+            self.move_probe(self.frames.other.region.center_m)
+        heard = self._measure(names.START_SPEC, ScopeState.SPEC, None)
+        if not spectra(heard):
+            raise Failed("a Spec1d between SS_SPEC and SS_FREE", told(heard))
+        return Taken(None, heard, None)
+
+    def move_probe(self, xy_m: tuple[float, float]) -> list[Observation]:
+        """Move the probe; what is published of it."""
+        self.client.come_to_rest()
+        mark = self.client.observations.mark()
+        self.client.asked(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), "moving the probe")
+        return self.client.settled(mark)
+
+    # --- both ---
+
+    def act(self, action: str) -> None:
+        """Have it done. Some microscopes can't be asked what they support: this tells."""
+        response = self.client.ask(ControlRequest.ACTION, action)
+        if response.code == ControlResponse.ACTION_NOT_SUPPORTED and self.support.actions.get(action) is None:
+            self.support.actions[action] = False
+            raise Skipped(f"not supported: {action}")
+        expect(response.ok, f"REP_SUCCESS to {action}", answer_in_words(response))
+
+    def _begin(self, action: str, state: ScopeState) -> int:
+        mark = self.client.observations.mark()
+        self.act(action)
+        self.client.wait_state(state, mark)
+        return mark
+
+    def _measure(self, action: str, state: ScopeState, expected_s: float | None) -> list[Observation]:
+        mark = self._begin(action, state)
+        limit_s = UNKNOWN_S if expected_s is None else 5.0 * expected_s + 60.0
+        self.client.wait_state(ScopeState.FREE, mark, self.client.real_s(limit_s))
+        return self.client.settled(mark)
+
+    def _once(self, what: str, take: Callable[[], Taken]) -> Taken:
+        found = self._kept.get(what)
+        if found is None:
+            try:
+                found = self._kept[what] = take()
+            except Failed as failure:
+                self._kept[what] = failure
+                raise
+        if isinstance(found, Exception):
+            raise Skipped(f"there is no {what}, as was told before")
+        return found
+
+
+def number(parameter: Parameter, unit: str = "") -> float:
+    """The value of a parameter in a unit, "" for its own.
+
+    Raises:
+        Failed: it is none.
+    """
+    try:
+        found = float(str(parameter.value))
+        return convert(found, parameter.unit or unit, unit) if unit else found
+    except ValueError as error:  # an AfspmError of units is one
+        raise Failed(f"a number in {unit or 'its unit'} as the value of {parameter.name}", str(error)) from error

@@ -1,0 +1,318 @@
+"""The cast: those who work well together, and those who do not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+from afspm.model import (
+    RELAY_REQUEST,
+    RESTART_REQUEST,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Problem,
+    ProcessState,
+    ProcessStates,
+    RelayedMessage,
+    ScopeState,
+    names,
+)
+from tests.simulation.client import Client, Doing
+
+_OK = int(ControlResponse.SUCCESS)
+
+
+class Experiment(Client):
+    """Scans over and over; waits for control, survives losing it.
+
+    Attributes:
+        done: scans that it saw through, in all lives.
+    """
+
+    done = 0
+
+    def behave(self) -> Doing:
+        yield from self.until(lambda: self.scope is not ScopeState.UNDEFINED, 10.0)
+        while True:
+            if not (yield from self.regain(Problem.NONE)):
+                continue
+            yield from self.scan()
+            if self.timeline.chance(0.3):
+                yield from self.ask(ControlRequest.RELEASE_CTRL)
+                yield from self.sleep(self.some(120.0))
+
+    def regain(self, solving: int) -> Generator[float, None, bool]:
+        """Ask for control; where it is refused, wait for something to change."""
+        before = self.control
+        response = yield from self.ask(ControlRequest.REQUEST_CTRL, int(solving))
+        if response.code == _OK:
+            return True
+        yield from self.until(lambda: self.control != before, self.some(600.0))
+        return False
+
+    def scan(self) -> Doing:
+        """One scan, to its end or to the loss of control."""
+        yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+        count = len(self.scans)
+        bias_v = "1.0" if self.timeline.chance(0.95) else "50.0"  # the latter is refused
+        set_ = yield from self.ask(ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE, bias_v, "V"))
+        if set_.code != _OK:
+            yield from self.sleep(self.some(20.0))
+            return
+        begun = yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+        if begun.code != _OK:
+            yield from self.sleep(self.some(20.0))
+            return
+        yield from self.until(lambda: self.scope is ScopeState.SCANNING, 5.0)
+        yield from self.until(lambda: self.scope is not ScopeState.SCANNING or not self._holds(), self.some(4000.0))
+        yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+        if len(self.scans) > count:
+            self.done += 1
+
+    def _holds(self) -> bool:
+        return self.control.holder == self.identity
+
+
+class Version1Experiment(Experiment):
+    """The same, without ids: what is not answered is not repeated."""
+
+    knows_ids = False
+
+
+class Classifier(Client):
+    """Flags the tip when the scans are bad, and now and then another problem; clears flags now and then."""
+
+    problems: tuple[int, ...] = (Problem.TIP_SHAPE_CHANGED, Problem.FEEDBACK_NON_OPTIMAL)
+
+    def behave(self) -> Doing:
+        seen = 0
+        while True:
+            yield from self.until(lambda n=seen: len(self.scans) > n, self.some(600.0))  # type: ignore[misc]
+            bad = any(not scan.tip_is_good for scan in self.scans[seen:])
+            seen = len(self.scans)
+            if bad:
+                yield from self.ask(ControlRequest.ADD_EXP_PRBLM, int(Problem.TIP_SHAPE_CHANGED))
+            if self.timeline.chance(0.05):
+                yield from self.ask(ControlRequest.ADD_EXP_PRBLM, int(self.timeline.random.choice(self.problems)))
+            if self.control.problems and self.timeline.chance(0.1):
+                yield from self.ask(ControlRequest.RMV_EXP_PRBLM, self.timeline.random.choice(self.control.problems))
+
+
+class Corrector(Experiment):
+    """Solves one problem: pulses, scans, and clears the flag."""
+
+    problem: int = Problem.TIP_SHAPE_CHANGED
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.until(lambda: self.problem in self.control.problems)
+            if not (yield from self.regain(self.problem)):
+                continue
+            for _ in range(3):
+                yield from self.until(lambda: self.scope is ScopeState.FREE, 30.0)
+                yield from self.ask(ControlRequest.ACTION, names.PULSE)
+                if self.timeline.chance(0.5):
+                    yield from self.scan()
+            yield from self.ask(ControlRequest.RMV_EXP_PRBLM, int(self.problem))
+            yield from self.sleep(self.some(10.0))
+
+
+class FeedbackCorrector(Corrector):
+    """Solves the other problem."""
+
+    problem = Problem.FEEDBACK_NON_OPTIMAL
+
+
+class Greedy(Experiment):
+    """Gets control and does nothing with it."""
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(3600.0))
+            if (yield from self.regain(Problem.NONE)):
+                yield from self.sleep(self.some(7200.0))
+                yield from self.ask(ControlRequest.RELEASE_CTRL)
+
+
+class Crasher(Experiment):
+    """Gets control, begins something, and dies; now and then for good (exit code 0)."""
+
+    def behave(self) -> Doing:
+        yield from self.sleep(self.some(1800.0))
+        if (yield from self.regain(Problem.NONE)):
+            yield from self.ask(ControlRequest.ACTION, names.START_SPEC)
+            yield from self.sleep(self.some(20.0))
+            self.kill(0 if self.timeline.chance(0.3) else -11)
+
+
+class Careless(Experiment):
+    """Switches the feedback off to measure something, and now and then is not there any more to switch it on.
+
+    Attributes:
+        gone_s: how long (real) its computer is away then.
+    """
+
+    gone_s = 30.0
+
+    def be_away(self, for_s: float) -> None:
+        self.banned = True
+        self.timeline.after(for_s, setattr, self, "banned", False)
+        self.kill(-11)
+
+    def behave(self) -> Doing:
+        while True:
+            if not (yield from self.regain(Problem.NONE)):
+                continue
+            yield from self.until(lambda: self.scope is ScopeState.FREE, 5.0)
+            yield from self.ask(ControlRequest.PARAM, Parameter(names.FEEDBACK_ON, "off"))
+            yield from self.sleep(self.some(300.0))
+            if self.timeline.chance(0.4):
+                self.be_away(self.gone_s)
+            yield from self.ask(ControlRequest.PARAM, Parameter(names.FEEDBACK_ON, "on"))
+            yield from self.ask(ControlRequest.RELEASE_CTRL)
+            yield from self.sleep(self.some(600.0))
+
+
+class Impostor(Client):
+    """Calls itself like another component, and commands, unasked, again and again."""
+
+    connects = False
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(900.0))
+            self.connect()
+            yield from self.ask(ControlRequest.REQUEST_CTRL, 0)
+            yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+            yield from self.ask(ControlRequest.RELEASE_CTRL)
+            self.kill(1)
+
+
+class Operator(Client):
+    """A person who takes over now and then."""
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(3600.0))
+            yield from self.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL))
+            yield from self.sleep(self.some(300.0))
+            yield from self.automated()
+
+    def automated(self) -> Doing:
+        while True:
+            response = yield from self.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.AUTOMATED))
+            if response.code == _OK:
+                return
+
+
+class Person(Operator):
+    """Sees to a tip that was in danger, at the controller's panel, and says that it is well again.
+
+    Attributes:
+        approach: brings the tip back to the surface.
+        comes_s: how long (experiment) it takes to come.
+        for_people: the problems that only people clear.
+    """
+
+    for_people = (Problem.DEVICE_MALFUNCTION, Problem.THERMAL_DRIFT)
+    approach: Callable[[], None]
+    comes_s = 1200.0
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.until(self._is_called)
+            yield from self.sleep(self.some(self.comes_s))
+            yield from self.see_to_tip()
+
+    def see_to_tip(self) -> Doing:
+        for problem in set(self.for_people).intersection(self.control.problems):
+            self.approach()
+            yield from self.ask(ControlRequest.RMV_EXP_PRBLM, int(problem))
+
+    def _is_called(self) -> bool:
+        return not set(self.for_people).isdisjoint(self.control.problems)
+
+
+class Dawn(Person):
+    """The person who comes in the morning, sees to the tip, and leaves everything to the components or ends it.
+
+    Attributes:
+        ends: the experiment is to end.
+    """
+
+    ends = False
+
+    def behave(self) -> Doing:
+        while self.ends:
+            yield from self.ask(ControlRequest.END_EXPERIMENT)
+        while True:
+            yield from self.automated()
+            yield from self.see_to_tip()
+            yield from self.until(lambda: self.control.mode is ControlMode.MANUAL or self._is_called())
+
+
+class Stranger(Client):
+    """Asks for whatever comes to its mind, be it allowed or not."""
+
+    requests: tuple[tuple[int, Any], ...] = (
+        (ControlRequest.RELEASE_CTRL, None),
+        (ControlRequest.RMV_EXP_PRBLM, 2),
+        (ControlRequest.ADD_EXP_PRBLM, 0),
+        (ControlRequest.ADD_EXP_PRBLM, 77),
+        (ControlRequest.REQUEST_CTRL, 77),
+        (ControlRequest.SET_CONTROL_MODE, 0),
+        (ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL)),
+        (ControlRequest.END_EXPERIMENT, None),
+        (ControlRequest.ACTION, names.PULSE),
+        (ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE)),
+        (ControlRequest.PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "nan", "V")),
+        (ControlRequest.ACTION_SUPPORT, names.PULSE),
+        (RESTART_REQUEST, "experiment"),
+        (RESTART_REQUEST, "nobody"),
+    )
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(600.0))
+            kind, subject = self.timeline.random.choice(self.requests)
+            yield from self.ask(kind, subject)
+
+
+class Teller(Client):
+    """A supervisor, as far as it tells how it is with its processes, and restarts those that it is ordered to.
+
+    Attributes:
+        processes: says how it is with those that there are.
+        restart: starts one anew.
+        ordered: how often it was ordered to.
+    """
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self.processes: Callable[[], tuple[ProcessState, ...]] = tuple
+        self.restart: Callable[[str], None] = lambda name: None
+        self.ordered = 0
+
+    def behave(self) -> Doing:
+        while True:
+            now_ns = self.timeline.now_ns()
+            told = RelayedMessage(
+                "ProcessStates", self.codec.encode(ProcessStates(now_ns, self.name, self.processes()))
+            )
+            response = yield from self.ask(RELAY_REQUEST, told)
+            for name in self.codec.decode(response.payload) if response.code == _OK else ():
+                self.ordered += 1
+                self.restart(name)
+            yield from self.sleep(5.0)
+
+
+class Listener(Client):
+    """Only listens, to everything, as a visualiser does."""
+
+    listens = ("",)
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(1e6)

@@ -1,0 +1,379 @@
+"""Real components and the real translator as simulated processes: their own code, in-memory ports, a folder for a disk.
+
+`HostedComponent` runs a `Component` as the host of `afspm.process` does, `HostedTranslator` a `Driver` behind the
+real `Translator`. All of it speaks the real wire format.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from afspm import wire
+from afspm.client.component import Component
+from afspm.launch import Launch, Sockets
+from afspm.model import Packet, Request, Response
+from afspm.process.context import MEASURED_MESSAGES, STATE_MESSAGES, ProcessActivity, ProcessContext
+from afspm.process.memory import Memory
+from afspm.translator.driver import Driver
+from afspm.translator.process import Translator
+from afspm.transport.port import (
+    CaughtUp,
+    ControlConnected,
+    ControlDisconnected,
+    Incoming,
+    PacketReceived,
+    ReplyReceived,
+    RequestReceived,
+    Served,
+    SubscriberJoined,
+)
+from afspm.transport.port import Killed as KillReceived
+from afspm.transport.replay import Published
+from tests.simulation.baton import Baton
+from tests.simulation.network import ControlLine, Feed, Weather
+from tests.simulation.process import Process
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline, Timer
+
+SOURCE = "memory://scheduler"
+
+
+class HostedProcess(Process):
+    """A process whose code blocks.
+
+    Args:
+        dies_in_call: the chance that it is killed in a call to its port, before or after that does what it is to do.
+
+    Attributes:
+        ended_with: how its last life ended: an exit code, or what was raised; None if it was killed.
+    """
+
+    def __init__(self, timeline: Timeline, name: str, *, dies_in_call: float = 0.0) -> None:
+        super().__init__(timeline, name)
+        self.dies_in_call = dies_in_call
+        self.ended_with: int | BaseException | None = None
+        self._baton: Baton | None = None
+        self._waiting_for: Timer | None = None
+        self._waits = False
+
+    # --- the simulation's side ---
+
+    def begin(self) -> None:
+        self.connect()
+        self._baton = Baton(self.name, self.body)
+        self.later(0.0, self._go_on)
+
+    def ended(self) -> None:
+        self.disconnect()
+        self._forget_timer()
+        baton, self._baton = self._baton, None
+        if baton is not None and not baton.over:
+            baton.kill()
+
+    def arrived(self) -> None:
+        """Something came that its code may wait for."""
+        if self._waits:
+            self._go_on()
+
+    def _go_on(self) -> None:
+        self._forget_timer()
+        baton, life = self._baton, self.life
+        if baton is None:
+            return
+        baton.go_on()
+        if baton.over and life == self.life:
+            self.ended_with = baton.error if baton.error is not None else baton.code
+            died = baton.error is not None or baton.code is None
+            self.kill(1 if died else int(baton.code or 0))
+
+    def _forget_timer(self) -> None:
+        self._waits = False
+        if self._waiting_for is not None:
+            self._waiting_for.cancel()
+            self._waiting_for = None
+
+    # --- the code's side ---
+
+    def wait(self, timeout_s: float | None) -> None:
+        """Wait for `arrived`, up to `timeout_s`."""
+        assert self._baton is not None
+        self._waits = True
+        if timeout_s is not None:
+            self._waiting_for = self.later(timeout_s, self._go_on)
+        self._baton.wait()
+
+    def may_die(self) -> None:
+        """A moment in which it may be killed."""
+        if self.dies_in_call and self.timeline.chance(self.dies_in_call):
+            assert self._baton is not None
+            self._baton.die()
+
+    # --- for subclasses ---
+
+    def body(self) -> int:
+        """What it does; returns its exit code."""
+        raise NotImplementedError
+
+    def connect(self) -> None:
+        """A life begins: make its connections."""
+
+    def disconnect(self) -> None:
+        """A life has ended."""
+
+
+class HostedComponent(HostedProcess):
+    """A `Component`, made anew for every life, on a `Port` in memory.
+
+    Args:
+        make: makes the component.
+        folder: its state_dir.
+    """
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        weather: Weather,
+        scheduler: SchedulerHost,
+        name: str,
+        make: Callable[[], Component],
+        folder: Path,
+        *,
+        dies_in_call: float = 0.0,
+    ) -> None:
+        super().__init__(timeline, name, dies_in_call=dies_in_call)
+        self._weather = weather
+        self._scheduler = scheduler
+        self._make = make
+        self._folder = folder
+        self._inbox: list[Incoming] = []
+        self._newest: dict[str, int] = {}
+
+    def connect(self) -> None:
+        self._inbox = []
+        self._newest = {}
+        self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.name)
+        self._feed = Feed(
+            self.timeline, self._weather, self, self._scheduler, sorted({*STATE_MESSAGES, *MEASURED_MESSAGES})
+        )
+
+    def disconnect(self) -> None:
+        self._line.close()
+        self._feed.close()
+
+    def body(self) -> int:
+        launch = Launch(
+            self.name,
+            sockets=Sockets(subscribe=(SOURCE,)),
+            state_dir=str(self._folder),
+            run_dir=str(self._folder),
+            simulated=True,
+        )
+        context = ProcessContext(
+            launch,
+            self.timeline,
+            open_port=lambda: MemoryPort(self),
+            log=logging.getLogger(f"afspm.{self.name}"),
+            activity=ProcessActivity(self.timeline),
+            session=f"life{self.life}",
+        )
+        return self._make().run_process(context)
+
+    def cut(self) -> None:
+        """Its connections break, and are made again."""
+        self._line.cut()
+        self._feed.cut()
+
+    # --- what comes ---
+
+    def line_up(self, line: ControlLine) -> None:
+        self._put(ControlConnected())
+
+    def line_down(self, line: ControlLine) -> None:
+        self._put(ControlDisconnected())
+
+    def answered(self, line: ControlLine, number: int, response: Response) -> None:
+        self._put(ReplyReceived(wire.decode_response(wire.encode_response(response))))
+
+    def since_ns(self, feed: Feed) -> int:
+        return max(self._newest.values(), default=-1)
+
+    def received(self, feed: Feed, packet: Packet) -> None:
+        time_ns = packet.time_ns or 0
+        if time_ns > self._newest.get(packet.envelope, -1):
+            self._newest[packet.envelope] = time_ns
+            self._put(PacketReceived(packet, SOURCE))
+
+    def caught_up(self, feed: Feed) -> None:
+        self._put(CaughtUp(SOURCE))
+
+    def killed(self, feed: Feed) -> None:
+        self._put(KillReceived())
+
+    def _put(self, incoming: Incoming) -> None:
+        self._inbox.append(incoming)
+        self.arrived()
+
+    # --- what its port does ---
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        self.may_die()
+        self._line.ask(wire.decode_request(frames))
+        self.may_die()
+
+    def poll(self, timeout_s: float | None) -> list[Incoming]:
+        if not self._inbox and timeout_s != 0.0:
+            self.wait(timeout_s)
+        self.may_die()
+        came, self._inbox = self._inbox, []
+        return came
+
+    def wake(self, incoming: Incoming | None) -> None:
+        if incoming is not None:
+            self._inbox.append(incoming)
+
+
+class MemoryPort:
+    """See `afspm.transport.port.Port`."""
+
+    def __init__(self, host: HostedComponent) -> None:
+        self._host = host
+
+    @property
+    def clock(self) -> Timeline:
+        return self._host.timeline
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        self._host.send(frames)
+
+    def poll(self, timeout_s: float | None) -> list[Incoming]:
+        return self._host.poll(timeout_s)
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        raise NotImplementedError("components that publish are not simulated yet")
+
+    def wake_up(self, incoming: Incoming | None = None) -> None:
+        self._host.wake(incoming)
+
+    def close(self) -> None:
+        """Nothing is held open but by the process."""
+
+
+class HostedTranslator(HostedProcess):
+    """A `Driver`, made anew for every life, behind the real `Translator`.
+
+    Args:
+        make: makes the microscope.
+        folder: its state_dir and run_dir.
+    """
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        make: Callable[[], Driver],
+        folder: Path,
+        *,
+        dies_in_call: float = 0.0,
+    ) -> None:
+        super().__init__(timeline, "translator", dies_in_call=dies_in_call)
+        self._make = make
+        self._folder = folder
+
+    def connect(self) -> None:
+        self._published = Published(self.timeline)
+        self._feeds: list[Feed] = []
+        self._inbox: deque[Served | tuple[ControlLine, Request, int]] = deque()
+        self._answering: tuple[ControlLine, int] | None = None
+
+    def body(self) -> int:
+        memory = Memory(self._folder / "translator.json")
+        log = logging.getLogger("afspm.translator")
+        return Translator(self._make(), MemoryServerPort(self), memory, self._folder, log).run()
+
+    # --- what comes ---
+
+    def peer_connected(self, line: ControlLine) -> None:
+        """Nothing is done until it asks."""
+
+    def peer_disconnected(self, line: ControlLine) -> None:
+        """Its answer will find nobody."""
+
+    def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
+        self._inbox.append((line, request, number))
+        self.arrived()
+
+    def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
+        if feed not in self._feeds:
+            self._feeds.append(feed)
+        self._inbox.append(SubscriberJoined())
+        self.later(0.0, self.arrived)
+        return self._published(feed, tuple(prefixes), since_ns)
+
+    def left(self, feed: Feed) -> None:
+        if feed in self._feeds:
+            self._feeds.remove(feed)
+
+    # --- what its port does ---
+
+    def poll(self, timeout_s: float | None) -> list[Served]:
+        if not self._inbox and timeout_s != 0.0:
+            self.wait(timeout_s)
+        self.may_die()
+        if not self._inbox:
+            return []
+        came = self._inbox.popleft()
+        if not isinstance(came, tuple):
+            return [came]
+        line, request, number = came
+        self._answering = (line, number)
+        return [RequestReceived(wire.encode_request(request))]
+
+    def reply(self, frames: Sequence[bytes] | None) -> None:
+        self.may_die()
+        answering, self._answering = self._answering, None
+        if answering is not None and frames is not None:
+            line, number = answering
+            line.answer(wire.decode_response(frames), number)
+        self.may_die()
+
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None, *, keep: bool) -> None:
+        self.may_die()
+        packet = self._published.stamp(envelope, payload, time_ns, keep=keep)
+        for feed in list(self._feeds):
+            feed.publish(packet)
+
+    def wake(self, incoming: Served | None) -> None:
+        if incoming is not None:
+            self._inbox.append(incoming)
+
+
+class MemoryServerPort:
+    """See `afspm.transport.port.ServerPort`."""
+
+    def __init__(self, host: HostedTranslator) -> None:
+        self._host = host
+
+    @property
+    def clock(self) -> Timeline:
+        return self._host.timeline
+
+    def poll(self, timeout_s: float | None) -> list[Served]:
+        return self._host.poll(timeout_s)
+
+    def reply(self, frames: Sequence[bytes] | None) -> None:
+        self._host.reply(frames)
+
+    def is_connected(self, connection: bytes) -> bool:
+        """Its one scheduler tells no epoch, so nobody asks."""
+        return True
+
+    def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
+        self._host.publish(envelope, payload, time_ns, keep=keep)
+
+    def wake_up(self, incoming: Served | None = None) -> None:
+        self._host.wake(incoming)
+
+    def close(self) -> None:
+        """Nothing is held open but by the process."""

@@ -1,0 +1,341 @@
+"""What must hold after every step, checked from outside by other means than those it is decided by."""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Sequence
+
+from afspm.errors import AfspmError
+from afspm.logic.arbitration import ArbitrationState
+from afspm.logic.events import (
+    Disconnected,
+    Effect,
+    Forward,
+    Input,
+    Publish,
+    Replay,
+    ReplayRequested,
+    Reply,
+    RequestIn,
+    SaveState,
+)
+from afspm.logic.settings import SchedulerSettings
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    Parameter,
+    Request,
+    Response,
+    ScopeState,
+    names,
+)
+from tests.simulation.client import Client
+from tests.simulation.codec import TableCodec
+from tests.simulation.microscope import FakeMicroscope
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline
+from tests.simulation.tip_safety import TipSafety
+from tests.simulation.written import Written
+
+_SUCCESS, _NO_RESPONSE = int(ControlResponse.SUCCESS), int(ControlResponse.NO_RESPONSE)
+_FORWARDED = range(int(ControlRequest.ACTION), int(ControlRequest.SET_PROBE_POS) + 1)
+_NOT_FREE = int(ControlResponse.NOT_FREE)
+_COUNTED = frozenset({names.START_SCAN, names.START_SPEC, names.PULSE})
+_TRACE = 60
+_SLACK_S = 1.0
+NAME_TAKEN = "each needs a name of its own"
+"""Part of the refusal that is not an answer to the request, but to whoever sent it."""
+
+
+class InvariantViolated(AfspmError):
+    """Something happened that must never happen."""
+
+    code = "invariant"
+
+
+class Invariants:
+    """Watches the scheduler, the microscope and all components of one simulated night."""
+
+    def __init__(
+        self, timeline: Timeline, settings: SchedulerSettings, microscope: FakeMicroscope, codec: TableCodec
+    ) -> None:
+        self._timeline = timeline
+        self._settings = settings
+        self.tip = TipSafety(timeline, settings, microscope, self._must)
+        self._microscope = microscope
+        self._scheduler_since_s = 0.0
+        self.components: list[Client] = []
+        self.checks = 0
+        self._trace: deque[tuple[float, Input | None, tuple[Effect, ...]]] = deque(maxlen=_TRACE)
+        self._holder: str | None = None
+        self._held_since_s = 0.0
+        self._absent_since_s: dict[str, float | None] = {}
+        self._idle_since_ns: int | None = None
+        self._used_ns = 0
+        self._last_ns = -1
+        self._published: dict[int, tuple[str, bytes | memoryview]] = {}
+        self._by_source: dict[int, int] = {}
+        self._actions: dict[tuple[str, str], str] = {}
+        self.times_are_certain = self.memory_is_certain = True
+        self._open: dict[tuple[str, str], tuple[float, int]] = {}
+        self._definite: dict[tuple[str, str], int] = {}
+        self._life = 0
+        self._checked: ArbitrationState | None = None
+        self._saved_control: ArbitrationState | None = None
+        self._saved_state: dict[str, bytes] | None = None
+        self.written = Written(timeline, codec, self._must, NAME_TAKEN)
+        microscope.on_executed = self.executed
+
+    def forgets(self) -> None:
+        """The scheduler may be killed before it could write down what it knows."""
+        self.times_are_certain = self.memory_is_certain = False
+        self.written.is_certain = self.tip.memory_is_certain = False
+
+    # --- the scheduler ---
+
+    def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
+        """Before each effect."""
+        self.written.carried_out(host, effect)
+        if self._life != host.life:
+            self._life = host.life
+            self._open.clear()  # what its former life had taken in is asked again
+            self._definite.clear()
+        if isinstance(effect, SaveState):
+            return
+        if isinstance(effect, Reply):
+            self._reply(host, effect)
+        elif isinstance(effect, Publish):
+            self._publish(effect)
+        elif isinstance(effect, Forward):
+            self._forward(host, effect)
+        if isinstance(effect, Reply | Publish):
+            self._saved(host)
+
+    def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
+        """After each step."""
+        self.checks += 1
+        self._scheduler_since_s = host.since_s
+        self._note(event, effects)
+        self.written.stepped(host, event, effects)
+        self.tip.stepped(host, event, effects)
+        if isinstance(event, RequestIn):
+            self._asked(event, effects)
+            if event.name == self._holder and event.request.kind in _FORWARDED:
+                self._used_ns = self._timeline.now_ns()
+        elif isinstance(event, Disconnected):
+            for key in [k for k, (_, connection) in self._open.items() if connection == event.connection]:
+                del self._open[key]
+        if isinstance(event, ReplayRequested):
+            self._replayed(host, event, effects)
+        self._control(host)
+        self._presence(host)
+        self._lease(host)
+        self._answered_in_time(host)
+
+    def _control(self, host: SchedulerHost) -> None:
+        control = host.core.control
+        if control is self._checked:
+            return
+        self._checked, state = control, host.core.control_state
+        self._must(
+            control.holder is None or state.mode is ControlMode.AUTOMATED, f"{control.holder} is in control in MANUAL"
+        )
+        if state.problems:
+            self._must(
+                control.holder is None or control.solving in state.problems,
+                f"{control.holder} is in control, solves {control.solving}; flagged: {state.problems}",
+            )
+        else:
+            self._must(control.solving == 0, f"{control.holder} solves {control.solving}, which is not flagged")
+        if self.memory_is_certain and self._holder is not None and control.holder not in (None, self._holder):
+            self.fail(f"control went from {self._holder} to {control.holder} without being given up")
+        if control.holder != self._holder:
+            self._held_since_s = self._timeline.monotonic_s()
+            self._used_ns = self._timeline.now_ns()
+        self._holder = control.holder
+
+    def _presence(self, host: SchedulerHost) -> None:
+        """ArbitrationState never stays with the dead."""
+        now_s = self._timeline.monotonic_s()
+        for client in self.components:
+            if client.identity != client.name:
+                continue  # an impostor
+            if client.alive:
+                self._absent_since_s[client.name] = None
+            elif self._absent_since_s.get(client.name) is None:
+                self._absent_since_s[client.name] = now_s
+        holder = host.core.control.holder
+        if holder is None or (absent_since_s := self._absent_since_s.get(holder, 0.0)) is None:
+            return
+        allowed_s = max(self._settings.grace_s, self._settings.restart_grace_s) + _SLACK_S
+        since_s = max(absent_since_s, self._held_since_s, host.since_s)
+        self._must(
+            now_s - since_s <= allowed_s, f"{holder} has been dead for {now_s - since_s:.1f} s and is in control"
+        )
+
+    def _lease(self, host: SchedulerHost) -> None:
+        """Nobody keeps control by doing nothing."""
+        lease_s = self._settings.lease_s
+        if lease_s is None:
+            return
+        now_ns = self._timeline.now_ns()
+        # while it is not free, or the scheduler may not have heard that it is, the holder is not idle
+        if self._microscope.state is not ScopeState.FREE or not self._microscope.alive:
+            self._idle_since_ns = None
+        elif self._idle_since_ns is None:
+            self._idle_since_ns = now_ns
+        if self._holder is None or self._idle_since_ns is None:
+            return
+        at_work_ns = self._timeline.at_ns(host.since_s)
+        idle_s = (now_ns - max(self._idle_since_ns, self._used_ns, at_work_ns)) / 1e9
+        allowed_s = lease_s + 30.0 * self._timeline.speed
+        self._must(idle_s <= allowed_s, f"{self._holder} has done nothing for {idle_s:.0f} s, its lease is {lease_s} s")
+
+    def _saved(self, host: SchedulerHost) -> None:
+        """What is told is on the disk already, unless that is full, which is said."""
+        if host.disk.stale or (host.core.control is self._saved_control and host.disk.state is self._saved_state):
+            return
+        self._saved_control, self._saved_state = host.core.control, host.disk.state
+        control = host.core.control.to_dict()
+        saved = host.disk.saved_part("control")
+        if saved is None:
+            saved = {"mode": 2, "holder": None, "solving": 0, "problems": {}, "ended": False}
+        self._must(saved == control, f"told before it was saved: {control}, saved {saved}")
+
+    # --- requests ---
+
+    def _asked(self, event: RequestIn, effects: Sequence[Effect]) -> None:
+        key = (event.name, event.request.id)
+        if event.request.kind == ControlRequest.ACTION:
+            self._actions[key] = str(event.request.subject)
+        replied = any(isinstance(e, Reply) and e.response.id == event.request.id for e in effects)
+        if event.request.id and not replied:
+            self._open.setdefault(key, (self._timeline.monotonic_s(), event.connection))
+            since_s, _ = self._open[key]
+            self._open[key] = (since_s, event.connection)
+
+    def _reply(self, host: SchedulerHost, reply: Reply) -> None:
+        """One definite answer to each request, however often it is asked."""
+        response = reply.response
+        key = (reply.name, response.id)
+        self._open.pop(key, None)
+        if response.id and response.code != _NO_RESPONSE and NAME_TAKEN not in response.reason:
+            before = self._definite.setdefault(key, response.code)
+            self._must(before == response.code, f"{key} was answered {before}, and now {response.code}")
+            action = self._actions.get(key)
+            if action in _COUNTED and response.code in (_SUCCESS, _NOT_FREE):
+                times = self._microscope.executed[response.id, int(ControlRequest.ACTION)]
+                told = "done" if response.code == _SUCCESS else "refused"
+                as_told = times == (response.code == _SUCCESS) or not self.memory_is_certain
+                self._must(as_told, f"{key} was {told}, it was executed {times} times")
+
+    def _answered_in_time(self, host: SchedulerHost) -> None:
+        now_s = self._timeline.monotonic_s()
+        while self._open:
+            key, (since_s, _) = next(iter(self._open.items()))
+            since_s = max(since_s, host.since_s)
+            if now_s - since_s <= self._settings.request_timeout_s + _SLACK_S:
+                return
+            self.fail(f"{key} was accepted {now_s - since_s:.1f} s ago and has no answer")
+
+    def _forward(self, host: SchedulerHost, effect: Forward) -> None:
+        request = effect.request
+        name = request.id.split("/")[0]
+        if request.kind in _FORWARDED and request.id and not _is_get(request):
+            self._must(
+                name == host.core.control.holder, f"a command of {name} is sent, {host.core.control.holder} holds"
+            )
+            self._used_ns = self._timeline.now_ns()
+            value = request.subject.value if isinstance(request.subject, Parameter) else None
+            self._must(value != "nan", "a NaN is sent to the microscope")
+
+    def executed(self, request: Request) -> None:
+        """The microscope carries out a command."""
+        self.tip.executed(request)
+        if request.id:
+            count = self._microscope.executed[request.id, request.kind]
+            once = count == 1 or request.kind != ControlRequest.ACTION or not self.memory_is_certain
+            self._must(once, f"{request.id} ({request.subject}) was executed {count} times")
+
+    # --- packets ---
+
+    def _publish(self, effect: Publish) -> None:
+        """In order, and nothing under two times, so that nobody takes it for two."""
+        packet, source_ns = effect.packet, effect.source_ns
+        assert packet.time_ns is not None
+        if source_ns is not None and self.times_are_certain:
+            first_ns = self._by_source.setdefault(source_ns, packet.time_ns)
+            self._must(first_ns == packet.time_ns, f"{packet.envelope} is published at {first_ns} and {packet.time_ns}")
+        before = self._published.get(packet.time_ns)
+        if before is not None:
+            same = before == (packet.envelope, packet.payload)
+            self._must(same or not self.times_are_certain, f"two packets at {packet.time_ns}")
+            return  # again after a kill, at its first time
+        self._published[packet.time_ns] = (packet.envelope, packet.payload)
+        self._must(
+            packet.time_ns > self._last_ns or not self.memory_is_certain,
+            f"{packet.envelope} is published at {packet.time_ns}, after {self._last_ns}",
+        )
+        self._last_ns = packet.time_ns
+
+    def _replayed(self, host: SchedulerHost, event: ReplayRequested, effects: Sequence[Effect]) -> None:
+        """Exactly what is cached and it has not had, oldest first over all envelopes."""
+        replay = next(effect for effect in effects if isinstance(effect, Replay))
+        cached = [packet for packet, *_ in host.core.cached()]
+        wanted = [p for p in cached if (p.time_ns or 0) > event.since_ns and p.envelope.startswith(event.prefixes)]
+        self._must(list(replay.packets) == wanted, f"a replay of {len(replay.packets)} instead of {len(wanted)}")
+        times = [packet.time_ns or 0 for packet in replay.packets]
+        self._must(all(a < b for a, b in itertools.pairwise(times)), "a replay out of order")
+
+    def received(self, client: Client, packet: Packet) -> None:
+        """A component got a packet that is new to it."""
+        assert packet.time_ns is not None
+        published = self._published.get(packet.time_ns)
+        self._must(
+            published == (packet.envelope, packet.payload) or not self.times_are_certain,
+            f"{client.name} received {packet.envelope} at {packet.time_ns}, which nobody published",
+        )
+
+    def has_all(self, client: Client, cached: Sequence[Packet]) -> None:
+        """In calm weather a component has, of every envelope, what the cache held a moment ago."""
+        for packet in (packet for packet in cached if packet.envelope.startswith(client.listens)):
+            have = client.newest.get(packet.envelope)
+            self._must(
+                have is not None and have[0] >= (packet.time_ns or 0),
+                f"{client.name} has not got {packet.envelope} of {packet.time_ns}",
+            )
+
+    # --- answers as components get them ---
+
+    def answered(self, client: Client, request: Request, response: Response) -> None:
+        """An impostor is not obeyed while the owner of the name is there."""
+        if client.identity == client.name or response.code != _SUCCESS:
+            return
+        owner = next((c for c in self.components if c.name == client.identity), None)
+        if owner is None or not owner.alive or owner.frozen:
+            return
+        # a connection that was lost by other means than the impostor's looks like a restart, until the owner speaks
+        there_s = self._timeline.monotonic_s() - max(owner.since_s, owner.cut_s, self._scheduler_since_s)
+        self._must(there_s < 10.0, f"{client.name} was obeyed as {client.identity}, who is there")
+
+    # --- failing ---
+
+    def _note(self, event: Input | None, effects: Sequence[Effect]) -> None:
+        if effects or event is None:
+            self._trace.append((self._timeline.monotonic_s(), event, tuple(effects)))
+
+    def _must(self, holds: bool, what: str) -> None:
+        if not holds:
+            self.fail(what)
+
+    def fail(self, what: str) -> None:
+        """Say what was violated, and what led to it."""
+        trace = "\n".join(f"{time_s:12.4f} {event} -> {list(effects)}"[:600] for time_s, event, effects in self._trace)
+        raise InvariantViolated(f"at {self._timeline.monotonic_s():.4f} s: {what}\n{trace}")
+
+
+def _is_get(request: Request) -> bool:
+    return isinstance(request.subject, Parameter) and request.subject.value is None

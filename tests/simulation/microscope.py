@@ -1,0 +1,252 @@
+"""A translator and its microscope as a simulated process, ours or of version 1, that may be slow, hang and die."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Packet,
+    Parameter,
+    Request,
+    Response,
+    ScopeState,
+    ScopeStatus,
+    names,
+)
+from tests.simulation.codec import TableCodec
+from tests.simulation.network import ControlLine, Feed
+from tests.simulation.process import Process
+from tests.simulation.timeline import Timeline, Timer
+
+CHANNELS = ("Height", "Height_Retrace")
+_STARTS = {names.START_SCAN: ScopeState.SCANNING, names.START_SPEC: ScopeState.SPEC}
+_STOPS = {names.STOP_SCAN: ScopeState.SCANNING, names.STOP_SPEC: ScopeState.SPEC}
+_HISTORY = 200
+
+
+@dataclass(frozen=True)
+class FakeScan:
+    """What stands for the values of a scan: which one, and whether the tip was good."""
+
+    number: int
+    channel: str
+    tip_is_good: bool
+
+
+@dataclass
+class Habits:
+    """How the translator behaves; may be changed while it runs.
+
+    Attributes:
+        knows_ids: ours does, one of version 1 does not.
+        service_s: the longest a request takes, mostly much less.
+        hangs: the chance that one takes up to `hang_s`.
+        loses_answer: the chance that an answer never comes.
+        scan_s: how long (experiment) a scan takes.
+        tip_breaks: the chance that a scan damages the tip.
+        clock_error_s: of its clock; may go back.
+        retracts: whether it has an action that withdraws the tip.
+    """
+
+    knows_ids: bool = True
+    service_s: float = 0.02
+    hangs: float = 0.0
+    hang_s: float = 20.0
+    loses_answer: float = 0.0
+    scan_s: float = 300.0
+    tip_breaks: float = 0.1
+    clock_error_s: float = 0.0
+    retracts: bool = True
+
+
+class FakeMicroscope(Process):
+    """Serves one request at a time, as REP does; publishes what it does.
+
+    Attributes:
+        executed: how often each command (client's id, or scheduler's number, and kind) was carried out, in all lives.
+        scans_done: in all lives.
+        feedback_on, tip_is_away: the controller's, which outlives its translator.
+    """
+
+    def __init__(self, timeline: Timeline, codec: TableCodec, habits: Habits) -> None:
+        super().__init__(timeline, "translator")
+        self.habits = habits
+        self.executed: Counter[tuple[str, int]] = Counter()
+        self.on_executed: Callable[[Request], None] = lambda request: None
+        self.scans_done = 0
+        self.tip_is_good = True
+        self.feedback_on, self.tip_is_away = True, False
+        self._codec = codec
+        self._ledger: dict[str, Response] = {}  # on its disk
+        self._newest_ns = 0
+        self._history: deque[Packet] = deque(maxlen=_HISTORY)
+        self._forget()
+
+    def _forget(self) -> None:
+        self.state = ScopeState.FREE
+        self._history = deque(maxlen=_HISTORY)
+        self._newest_ns = 0
+        self._lines: list[ControlLine] = []
+        self._feeds: list[Feed] = []
+        self._queue: deque[tuple[ControlLine, Request, int]] = deque()
+        self._serving = False
+        self._scan: Timer | None = None
+
+    def begin(self) -> None:
+        self._forget()
+        self._tell_what_is_in_force()
+
+    def _tell_what_is_in_force(self) -> None:
+        self._publish("ScanParameters2d", "the region")
+        self._publish("ZCtrlParameters", Feedback(on=self.feedback_on))
+        self._publish_state(self.state)
+
+    # --- as a server ---
+
+    def peer_connected(self, line: ControlLine) -> None:
+        self._lines.append(line)
+
+    def peer_disconnected(self, line: ControlLine) -> None:
+        if line in self._lines:
+            self._lines.remove(line)
+
+    def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
+        self._queue.append((line, request, number))
+        self._serve()
+
+    def _serve(self) -> None:
+        if self._serving or not self._queue:
+            return
+        self._serving = True
+        habits, chance = self.habits, self.timeline.random
+        takes_s = habits.service_s * chance.random() ** 3
+        if self.timeline.chance(habits.hangs):
+            takes_s = habits.hang_s * chance.random()
+        line, request, number = self._queue.popleft()
+        # it may be carried out at the beginning or at the end of the time that it takes
+        if self.timeline.chance(0.5):
+            self.later(takes_s, self._answer, line, number, self._handle(request))
+        else:
+            self.later(takes_s, lambda: self._answer(line, number, self._handle(request)))
+
+    def _answer(self, line: ControlLine, number: int, response: Response) -> None:
+        self._serving = False
+        if line in self._lines and not self.timeline.chance(self.habits.loses_answer):
+            line.answer(response, number)
+        self._serve()
+
+    def _handle(self, request: Request) -> Response:
+        known = self._ledger.get(request.id) if self.habits.knows_ids and request.id else None
+        if known is not None:
+            return known
+        code = self._carry_out(request)
+        payload = b""
+        if request.kind == ControlRequest.PARAM and code is ControlResponse.SUCCESS:
+            assert isinstance(request.subject, Parameter)
+            payload = self._codec.encode(self._in_force(request.subject))
+        response = Response(int(code), payload, "" if code is ControlResponse.SUCCESS else f"it is {self.state.name}")
+        if self.habits.knows_ids and request.id:
+            response.id = request.id
+            self._ledger[request.id] = response
+        return response
+
+    def _in_force(self, asked: Parameter) -> Parameter:
+        if asked.name == names.FEEDBACK_ON:
+            return Parameter(asked.name, "on" if self.feedback_on else "off")
+        return Parameter(asked.name, asked.value or "1.0", "V")
+
+    def _carry_out(self, request: Request) -> ControlResponse:
+        subject = request.subject
+        if subject == names.RETRACT and not self.habits.retracts:
+            return ControlResponse.ACTION_NOT_SUPPORTED
+        if request.kind == ControlRequest.ACTION_SUPPORT:
+            return ControlResponse.SUCCESS
+        if request.kind == ControlRequest.PARAM and isinstance(subject, Parameter) and subject.value is None:
+            return ControlResponse.SUCCESS
+        if subject in _STOPS:
+            if self.state is _STOPS[subject]:
+                self._interrupt()
+            return ControlResponse.SUCCESS
+        if self.state is not ScopeState.FREE:
+            return ControlResponse.NOT_FREE
+        if request.id:
+            self.executed[request.id, request.kind] += 1
+        self.on_executed(request)
+        if subject in _STARTS:
+            self._begin(_STARTS[subject])
+        elif subject == names.PULSE:
+            self.tip_is_good = self.tip_is_good or self.timeline.chance(0.7)
+        elif subject == names.RETRACT:
+            self.tip_is_away = True
+        elif isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON:
+            self._switch_feedback(on=subject.value == "on")
+        return ControlResponse.SUCCESS
+
+    # --- the microscope ---
+
+    @property
+    def endangers_tip(self) -> bool:
+        """True while the tip is at the surface and no feedback holds it."""
+        return not self.feedback_on and not self.tip_is_away
+
+    def approach(self) -> None:
+        """Bring the tip back to the surface, as a person does at the controller's panel."""
+        self.tip_is_away = False
+        self._switch_feedback(on=True)
+
+    def _switch_feedback(self, *, on: bool) -> None:
+        self.feedback_on = on
+        if self.alive:
+            self._publish("ZCtrlParameters", Feedback(on=on))
+
+    def _begin(self, state: ScopeState) -> None:
+        self._publish_state(state)
+        takes_s = self.timeline.real_s(self.habits.scan_s * (0.5 + self.timeline.random.random()))
+        self._scan = self.later(takes_s, self._done, state)
+
+    def _done(self, state: ScopeState) -> None:
+        self._scan = None
+        self.scans_done += 1
+        if self.timeline.chance(self.habits.tip_breaks):
+            self.tip_is_good = False
+        channels = CHANNELS if state is ScopeState.SCANNING else CHANNELS[:1]
+        for channel in channels:
+            message = "Scan2d" if state is ScopeState.SCANNING else "Spec1d"
+            self._publish(message, FakeScan(self.scans_done, channel, self.tip_is_good))
+        self._publish_state(ScopeState.FREE)
+
+    def _interrupt(self) -> None:
+        if self._scan is not None:
+            self._scan.cancel()
+            self._scan = None
+        self._publish_state(ScopeState.INTERRUPTED)
+        self._publish_state(ScopeState.FREE)
+
+    def _publish_state(self, state: ScopeState) -> None:
+        self.state = state
+        self._publish("ScopeStateMsg", ScopeStatus(state))
+
+    # --- as a publisher ---
+
+    def _publish(self, message: str, thing: object) -> None:
+        time_ns = self.timeline.now_ns() + round(self.habits.clock_error_s * 1e9)
+        self._newest_ns = max(time_ns, self._newest_ns + 1)
+        packet = Packet(message, self._codec.encode(thing), self._newest_ns)
+        self._history.append(packet)
+        for feed in list(self._feeds):
+            feed.publish(packet)
+
+    def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
+        if feed not in self._feeds:
+            self._feeds.append(feed)
+        self.later(0.0, self._tell_what_is_in_force)
+        return [packet for packet in self._history if packet.time_ns is not None and packet.time_ns > since_ns]
+
+    def left(self, feed: Feed) -> None:
+        if feed in self._feeds:
+            self._feeds.remove(feed)

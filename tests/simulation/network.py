@@ -1,0 +1,265 @@
+"""The in-memory network: lines that keep the order, take their time, break, and are made again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from afspm.model import Packet, Request, Response
+from tests.simulation.timeline import Timeline
+
+Deliver = Callable[..., None]
+
+
+@dataclass
+class Weather:
+    """What the network is like; all may be changed while it runs.
+
+    Attributes:
+        delay_s: the longest that a message takes, mostly much less.
+        doubles: the chance that a request arrives twice.
+        reconnect_s: until a broken line is tried again.
+    """
+
+    delay_s: float = 0.01
+    doubles: float = 0.0
+    reconnect_s: float = 0.1
+
+
+class Host(Protocol):
+    """A process, as far as lines see it: whether it is there, and what it gets."""
+
+    @property
+    def alive(self) -> bool: ...
+    @property
+    def sockets(self) -> dict[Any, None]:
+        """The lines that end here; they break when it dies."""
+
+    def take(self, do: Callable[..., None], *args: Any) -> None:
+        """Call `do(*args)` now, later if the process is frozen, never if this life of it ends first."""
+
+
+class Pipe:
+    """One direction of a line: first in, first out."""
+
+    def __init__(self, timeline: Timeline, weather: Weather, receiver: Host) -> None:
+        self._timeline = timeline
+        self._weather = weather
+        self._receiver = receiver
+        self._last_s = 0.0
+        self.open = True
+        self.silent = False
+
+    def send(self, do: Deliver, *args: Any) -> None:
+        if self.silent:
+            return
+        timeline = self._timeline
+        # mostly quick, now and then slow
+        time_s = timeline.monotonic_s() + self._weather.delay_s * timeline.random.random() ** 4
+        if time_s > self._last_s:
+            self._last_s = time_s
+        timeline.at(self._last_s, self._arrive, (do, args))
+
+    def _arrive(self, do: Deliver, args: tuple[Any, ...]) -> None:
+        if self.open:
+            self._receiver.take(do, *args)
+
+
+class ControlServer(Host, Protocol):
+    """Whoever answers requests: scheduler or translator."""
+
+    def peer_connected(self, line: ControlLine) -> None: ...
+    def peer_disconnected(self, line: ControlLine) -> None: ...
+    def peer_asked(self, line: ControlLine, request: Request, number: int) -> None: ...
+
+
+class ControlClient(Host, Protocol):
+    """Whoever asks."""
+
+    def line_up(self, line: ControlLine) -> None: ...
+    def line_down(self, line: ControlLine) -> None: ...
+    def answered(self, line: ControlLine, number: int, response: Response) -> None: ...
+
+
+class ControlLine:
+    """A connection for requests from one client to one server, made again whenever it breaks.
+
+    Attributes:
+        name: what the client calls itself.
+
+    Args:
+        doubling: whether requests may arrive twice on it, as those of an impatient client do.
+    """
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        weather: Weather,
+        client: ControlClient,
+        server: ControlServer,
+        name: str,
+        *,
+        doubling: bool = True,
+    ) -> None:
+        self._doubling = doubling
+        self._timeline = timeline
+        self._weather = weather
+        self._client = client
+        self._server = server
+        self.name = name
+        self._there: Pipe | None = None
+        self._back: Pipe | None = None
+        self._closed = False
+        self._try()
+
+    @property
+    def up(self) -> bool:
+        return self._there is not None
+
+    def ask(self, request: Request, number: int = 0) -> None:
+        """Dropped while the line is down."""
+        if self._there is None:
+            return
+        self._there.send(self._server.peer_asked, self, _copy(request), number)
+        if self._doubling and self._timeline.chance(self._weather.doubles):
+            self._there.send(self._server.peer_asked, self, _copy(request), number)
+
+    def answer(self, response: Response, number: int = 0) -> None:
+        if self._back is not None:
+            self._back.send(self._client.answered, self, number, response)
+
+    def cut(self) -> None:
+        """Break it: what is under way is lost, both ends hear of it, and it is made again."""
+        if self._there is None or self._back is None:
+            return
+        there, back = self._there, self._back
+        self._there = self._back = None
+        there.open = back.open = False
+        self._server.sockets.pop(self, None)
+        self._server.take(self._server.peer_disconnected, self)
+        self._client.take(self._client.line_down, self)
+        self._retry()
+
+    def fall_silent(self, for_s: float) -> None:
+        """Lose all that is sent, in one direction or both; neither end hears of that before `for_s` have passed."""
+        _fall_silent(self._timeline, (self._there, self._back))
+        self._timeline.after(for_s, self.cut)
+
+    def close(self) -> None:
+        """The client is gone for good, or dead."""
+        self._closed = True
+        self.cut()
+
+    def _retry(self) -> None:
+        if not self._closed:
+            self._timeline.after(self._weather.reconnect_s * (0.5 + self._timeline.random.random()), self._try)
+
+    def _try(self) -> None:
+        if self._closed or self.up:
+            return
+        if not (self._server.alive and self._client.alive):
+            self._retry()
+            return
+        self._there = Pipe(self._timeline, self._weather, self._server)
+        self._back = Pipe(self._timeline, self._weather, self._client)
+        self._server.sockets[self] = None
+        self._there.send(self._server.peer_connected, self)
+        self._back.send(self._client.line_up, self)
+
+
+class Publisher(Host, Protocol):
+    """Whoever publishes, and keeps what it published for those who come late."""
+
+    def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]: ...
+    def left(self, feed: Feed) -> None: ...
+
+
+class Listener(Host, Protocol):
+    """Whoever subscribes."""
+
+    def since_ns(self, feed: Feed) -> int: ...
+    def received(self, feed: Feed, packet: Packet) -> None: ...
+    def caught_up(self, feed: Feed) -> None: ...
+    def killed(self, feed: Feed) -> None: ...
+
+
+class Feed:
+    """A subscription of one listener to one publisher, with a replay for it alone whenever it is made."""
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        weather: Weather,
+        listener: Listener,
+        publisher: Publisher,
+        prefixes: Sequence[str] = ("",),
+    ) -> None:
+        self._timeline = timeline
+        self._weather = weather
+        self._listener = listener
+        self._publisher = publisher
+        self._prefixes = tuple(prefixes)
+        self._there: Pipe | None = None
+        self._back: Pipe | None = None
+        self._joined = False
+        self._closed = False
+        self._try()
+
+    def publish(self, packet: Packet) -> None:
+        if self._joined and self._back is not None and packet.envelope.startswith(self._prefixes):
+            self._back.send(self._listener.received, self, packet)
+
+    def kill_signal(self) -> None:
+        if self._back is not None:
+            self._back.send(self._listener.killed, self)
+
+    def cut(self) -> None:
+        if self._there is None or self._back is None:
+            return
+        self._there.open = self._back.open = False
+        self._there = self._back = None
+        self._joined = False
+        self._publisher.sockets.pop(self, None)
+        self._publisher.take(self._publisher.left, self)
+        if not self._closed:
+            self._timeline.after(self._weather.reconnect_s * (0.5 + self._timeline.random.random()), self._try)
+
+    def fall_silent(self, for_s: float) -> None:
+        """See `ControlLine`."""
+        _fall_silent(self._timeline, (self._there, self._back))
+        self._timeline.after(for_s, self.cut)
+
+    def close(self) -> None:
+        self._closed = True
+        self.cut()
+
+    def _try(self) -> None:
+        if self._closed or self._there is not None:
+            return
+        if not (self._publisher.alive and self._listener.alive):
+            self._timeline.after(self._weather.reconnect_s, self._try)
+            return
+        self._there = Pipe(self._timeline, self._weather, self._publisher)
+        self._back = Pipe(self._timeline, self._weather, self._listener)
+        self._publisher.sockets[self] = None
+        self._there.send(self._join, self._listener.since_ns(self), self._back)
+
+    def _join(self, since_ns: int, back: Pipe) -> None:
+        """At the publisher: the replay first, all that is published from now on after it, so that there is no gap."""
+        if back is not self._back:
+            return
+        for packet in self._publisher.joined(self, self._prefixes, since_ns):
+            back.send(self._listener.received, self, packet)
+        back.send(self._listener.caught_up, self)
+        self._joined = True
+
+
+def _fall_silent(timeline: Timeline, pipes: Sequence[Pipe | None]) -> None:
+    for pipe in timeline.random.choice((pipes, pipes[:1], pipes[1:])):
+        if pipe is not None:
+            pipe.silent = True
+
+
+def _copy(request: Request) -> Request:
+    return Request(request.kind, request.subject, request.payload, request.id)

@@ -1,0 +1,394 @@
+"""A simulated night: who takes part, under which settings, and what befalls them. All of it follows from the seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from typing import Any
+
+from afspm.logic.arbitration import Cause, RoleTable, Rules
+from afspm.logic.envelopes import Envelopes
+from afspm.logic.limits import ExperimentLimits, Limit
+from afspm.logic.microscope_status import FEEDBACK_OFF
+from afspm.logic.scheduler_core import SchedulerSettings
+from afspm.logic.supervision.child import ChildPolicy
+from afspm.logic.supervision.liveness import LivenessPolicy
+from afspm.logic.supervision.restart import RestartPolicy
+from afspm.logic.watchdog import WatchdogSettings
+from afspm.model import Packet, PacketHeader, ScopeState, names
+from tests.simulation import behaviours
+from tests.simulation.client import Client
+from tests.simulation.codec import TableCodec
+from tests.simulation.invariants import Invariants, InvariantViolated
+from tests.simulation.keeper import Keeper
+from tests.simulation.microscope import FakeMicroscope, FakeScan, Habits
+from tests.simulation.network import Weather
+from tests.simulation.process import Process
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import GoesInCircles, Timeline
+
+_CALM = 0.15
+"""The last part of a night, in which nothing bad happens any more and all must come right again."""
+
+_SETTLED_S = 5.0
+_ENDED_S = 60.0
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something bad: what, to whom, when (as a part of the time before the calm), for how long (real)."""
+
+    what: str
+    whom: str
+    when: float
+    for_s: float = 0.0
+
+
+FAULTS = ("kill", "outage", "freeze", "cut", "silence", "storm", "hang", "clock", "busy", "full disk", "slow disk")
+CAST = {
+    "experiment": behaviours.Experiment,
+    "classifier": behaviours.Classifier,
+    "corrector": behaviours.Corrector,
+    "feedback": behaviours.FeedbackCorrector,
+    "greedy": behaviours.Greedy,
+    "crasher": behaviours.Crasher,
+    "operator": behaviours.Operator,
+    "stranger": behaviours.Stranger,
+    "listener": behaviours.Listener,
+    "old": behaviours.Version1Experiment,
+    "careless": behaviours.Careless,
+    "person": behaviours.Person,
+}
+_TROUBLE = ("greedy", "crasher", "impostor", "operator", "stranger", "careless")
+_ALWAYS = ("experiment", "classifier", "corrector", "feedback", "person")
+_PEOPLE = ("operator", "person", "dawn")
+_JOURNAL_S = 0.1
+_LONGEST_SILENCE_S = 8.0
+"""Heartbeats of the network find a half-open connection by then."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a night is made of.
+
+    Attributes:
+        seed: of all that is left to chance.
+        hours: experiment time, but for the calm.
+        speed: experiment seconds in a real one.
+        cast: who takes part.
+        impostor: somebody calls himself "experiment" as well.
+        ids_known: the translator is ours, not of version 1.
+        lease_s: None for none; then nobody greedy takes part.
+        faults: what befalls them.
+        doubles: the chance that a request arrives twice.
+        hangs, loses_answer: see `Habits`.
+        dies_in_step: see `SchedulerHost`.
+        retracts: see `Habits`.
+        ends: the experiment is ended in the morning, whatever goes on; if not, all must come right.
+    """
+
+    seed: int
+    hours: float = 8.0
+    speed: float = 60.0
+    cast: tuple[str, ...] = _ALWAYS
+    impostor: bool = False
+    ids_known: bool = True
+    lease_s: float | None = 1800.0
+    faults: tuple[Fault, ...] = ()
+    doubles: float = 0.0
+    hangs: float = 0.0
+    loses_answer: float = 0.0
+    dies_in_step: float = 0.0
+    stop_when: tuple[Cause, ...] = (Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE)
+    retracts: bool = True
+    ends: bool = False
+
+    @property
+    def length_s(self) -> float:
+        """Real time in which bad things happen."""
+        return self.hours * 3600.0 / self.speed
+
+    @property
+    def calm_s(self) -> float:
+        """Real time after that, in which all comes right."""
+        return max(self.length_s * _CALM, 4 * 3600.0 / self.speed, 200.0)
+
+    @property
+    def hours_to_the_end(self) -> float:
+        """Experiment time with what comes after."""
+        return (self.length_s + (_ENDED_S if self.ends else self.calm_s)) * self.speed / 3600.0
+
+
+def plan(seed: int, hours: float = 8.0) -> Plan:
+    """A night as the seed has it: from a quiet one to one where nearly everything goes wrong."""
+    chance = Timeline(seed * 7919 + 1).random
+    others = [name for name in CAST if name not in _ALWAYS]
+    lease_s = chance.choice((None, 900.0, 1800.0))
+    cast = [*_ALWAYS, *(name for name in others if chance.random() < 0.5)]
+    if lease_s is None and "greedy" in cast:
+        cast.remove("greedy")
+    harm = chance.choice((0.0, 0.5, 1.0, 3.0))  # faults an hour
+    targets = ["scheduler", "translator", *cast]
+    faults = [
+        Fault(
+            chance.choice(FAULTS), chance.choice(targets), chance.random(), chance.choice((0.5, 3.0, 8.0, 20.0, 60.0))
+        )
+        for _ in range(round(harm * hours))
+    ]
+    bad = harm > 0.0
+    return Plan(
+        seed,
+        hours,
+        chance.choice((60.0, 120.0, 240.0)),
+        tuple(cast),
+        impostor=chance.random() < 0.25,
+        ids_known=chance.random() < 0.75,
+        lease_s=lease_s,
+        faults=tuple(sorted(faults, key=lambda fault: fault.when)),
+        doubles=chance.choice((0.0, 0.1)) if bad else 0.0,
+        hangs=chance.choice((0.0, 0.005)) if bad else 0.0,
+        loses_answer=chance.choice((0.0, 0.005)) if bad else 0.0,
+        dies_in_step=chance.choice((0.0, 0.0005)) if bad else 0.0,
+        stop_when=chance.choice(((), (Cause.PROBLEM,), tuple(Cause))),
+        retracts=chance.random() < 0.8,
+        ends=chance.random() < 0.25,
+    )
+
+
+@dataclass
+class Outcome:
+    """What came of a night: experiment hours, scans, steps of the scheduler."""
+
+    hours: float
+    scans: int
+    scans_in_calm: int
+    steps: int
+    given_up: list[str] = field(default_factory=list)
+
+
+class Night:
+    """One night, ready to be run."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.timeline = timeline = Timeline(plan.seed, plan.speed)
+        self.weather = Weather(doubles=plan.doubles)
+        self.codec = self.make_codec()
+        habits = Habits(plan.ids_known, hangs=plan.hangs, loses_answer=plan.loses_answer, retracts=plan.retracts)
+        self.microscope = self.make_microscope(habits)
+        self.settings = _settings(plan)
+        self.invariants = Invariants(timeline, self.settings, self.microscope, self.codec)
+        self.scheduler = SchedulerHost(
+            timeline,
+            self.weather,
+            self.settings,
+            self.codec,
+            self._header,
+            self.invariants,
+            dies_in_step=plan.dies_in_step,
+            make_core=self.make_core(),
+        )
+        self.scheduler.translator = (self.microscope, self.microscope)
+        self.components = self._components()
+        self.dawn = behaviours.Dawn(timeline, self.weather, self.codec, self.scheduler, "dawn")
+        for person in (self.dawn, *self.components.values()):
+            if isinstance(person, behaviours.Person):
+                person.approach = self.microscope.approach
+        self.keeper = Keeper(timeline, [self.microscope, self.scheduler, *self.components.values()], _policy())
+        self.teller = self._teller()
+
+    def make_codec(self) -> TableCodec:
+        return TableCodec()
+
+    def make_microscope(self, habits: Habits) -> FakeMicroscope:
+        return FakeMicroscope(self.timeline, self.codec, habits)
+
+    def make_core(self) -> Callable[[], Any] | None:
+        """Makes the core of the scheduler's next life; None: a plain one."""
+        return None
+
+    def _components(self) -> dict[str, Client]:
+        made: dict[str, Client] = {
+            name: CAST[name](self.timeline, self.weather, self.codec, self.scheduler, name) for name in self.plan.cast
+        }
+        if self.plan.impostor:
+            made["impostor"] = behaviours.Impostor(
+                self.timeline, self.weather, self.codec, self.scheduler, "impostor", "experiment"
+            )
+        for client in made.values():
+            client.on_received = self.invariants.received
+            client.on_answer = self.invariants.answered
+        self.invariants.components = list(made.values())
+        return made
+
+    def _teller(self) -> behaviours.Teller:
+        """Whoever tells the scheduler of the processes; it is not among those that befalls something."""
+        teller = behaviours.Teller(
+            self.timeline, self.weather, self.codec, self.scheduler, "teller", "supervisor:night"
+        )
+        teller.processes, teller.restart = self.keeper.states, self.keeper.restart
+        teller.start()
+        return teller
+
+    def _header(self, packet: Packet) -> PacketHeader:
+        thing = self.codec.decode(packet.payload)
+        if isinstance(thing, FakeScan):
+            size_m = 2e-6 if thing.number % 2 else 5e-8
+            kind = "IV" if packet.envelope == "Spec1d" else None
+            return PacketHeader(packet.envelope, thing.channel, (size_m, size_m), kind)
+        return PacketHeader(packet.envelope)
+
+    def run(self) -> Outcome:
+        """From dusk to dawn.
+
+        Raises:
+            InvariantViolated: with the seed to replay it.
+        """
+        try:
+            return self._run()
+        except GoesInCircles as error:
+            raise InvariantViolated(f"seed {self.plan.seed}, {self.plan}: {error}") from error
+        except InvariantViolated as error:
+            error.what = f"seed {self.plan.seed}, {self.plan}: {error.what}"
+            raise
+
+    def _run(self) -> Outcome:
+        timeline, plan = self.timeline, self.plan
+        length_s, calm_s = plan.length_s, plan.calm_s
+        for fault in plan.faults:
+            timeline.after(fault.when * length_s, self._befall, fault)
+        timeline.run_until(length_s)
+        if plan.ends:
+            return self._end()
+        self._calm(_TROUBLE)
+        timeline.run_until(length_s + 100.0)
+        before = self.microscope.scans_done
+        timeline.run_until(length_s + calm_s)
+        done = self.microscope.scans_done
+        self._come_right(done - before)
+        return self._outcome(done - before)
+
+    def _outcome(self, scans_in_calm: int) -> Outcome:
+        hours = self.timeline.monotonic_s() * self.plan.speed / 3600.0
+        scans = self.microscope.scans_done
+        return Outcome(hours, scans, scans_in_calm, self.invariants.checks, self.keeper.given_up)
+
+    # --- what befalls them ---
+
+    def _befall(self, fault: Fault) -> None:
+        process = {"scheduler": self.scheduler, "translator": self.microscope, **self.components}[fault.whom]
+        if fault.what == "kill":
+            process.kill()
+        elif fault.what == "outage":
+            process.banned = True
+            process.kill()
+            self.timeline.after(fault.for_s, setattr, process, "banned", False)
+        elif fault.what == "freeze":
+            process.freeze(fault.for_s)
+        elif fault.what == "busy":
+            process.step_age_s = fault.for_s
+            process.later(fault.for_s, setattr, process, "step_age_s", 0.0)
+        elif fault.what == "cut" and isinstance(process, Client):
+            process.cut()
+        elif fault.what == "silence":
+            self._silence(process, min(fault.for_s, _LONGEST_SILENCE_S))
+        elif fault.what in ("cut", "storm"):
+            self._storm(fault.for_s)
+        elif fault.what == "hang":
+            self._hang(fault.for_s)
+        elif fault.what == "full disk":
+            self._full_disk(fault.for_s)
+        elif fault.what == "slow disk":
+            self.scheduler.journal_s = fault.for_s
+            self.timeline.after(fault.for_s, setattr, self.scheduler, "journal_s", _JOURNAL_S)
+        elif fault.what == "clock":
+            self.invariants.times_are_certain = False
+            self.microscope.habits.clock_error_s = self.timeline.random.choice((-100.0, 0.0, 100.0, 10_000.0))
+
+    def _silence(self, process: Process, for_s: float) -> None:
+        """Half-open connections: those of a component, or those between scheduler and translator."""
+        if isinstance(process, Client):
+            process.fall_silent(for_s)
+            return
+        self.invariants.tip.disturbed(for_s + _SETTLED_S)
+        self.scheduler.fall_silent(for_s)
+
+    def _full_disk(self, for_s: float) -> None:
+        self.scheduler.disk.full = True
+        self.invariants.forgets()
+        self.timeline.after(for_s, setattr, self.scheduler.disk, "full", False)
+
+    def _storm(self, for_s: float) -> None:
+        """Messages take long, and all connections break at its beginning."""
+        self.invariants.tip.disturbed(for_s + _SETTLED_S)
+        self.weather.delay_s = 3.0
+        self.invariants.times_are_certain = False  # a restarted scheduler can't wait for what comes that late
+        for client in self.components.values():
+            client.cut()
+            client.cut_s += for_s + 5.0
+        self.timeline.after(for_s, setattr, self.weather, "delay_s", 0.01)
+
+    def _hang(self, for_s: float) -> None:
+        """The translator takes ages."""
+        habits = self.microscope.habits
+        self.invariants.tip.disturbed(for_s + _SETTLED_S)
+        habits.service_s = for_s
+        self.timeline.after(for_s, setattr, habits, "service_s", 0.02)
+
+    def _calm(self, leaving: Collection[str] = ()) -> None:
+        habits = self.microscope.habits
+        self.weather.doubles = habits.hangs = habits.loses_answer = 0.0
+        self.scheduler.dies_in_step = 0.0
+        self.dawn.start()
+        for name, component in self.components.items():
+            component.banned = name in leaving
+            if component.banned:
+                component.kill()
+        self.scheduler.banned = self.microscope.banned = False
+
+    def _come_right(self, scans: int) -> None:
+        """In calm weather the experiment goes on, and everybody has what the cache holds."""
+        if not self.keeper.given_up and scans == 0:
+            self.invariants.fail(f"nothing was scanned in the calm; control: {self.scheduler.core.control}")
+        cached = [packet for packet, *_ in self.scheduler.core.cached()]
+        self.timeline.run_until(self.timeline.monotonic_s() + 1.0)
+        for client in self.components.values():
+            settled = self.timeline.monotonic_s() - max(client.since_s, self.scheduler.since_s) > _SETTLED_S
+            if client.alive and self.scheduler.alive and settled:
+                self.invariants.has_all(client, cached)
+
+    def _end(self) -> Outcome:
+        """End the experiment in the middle of whatever goes on: all leave, and nobody stays behind."""
+        self.dawn.ends = True
+        self._calm()
+        self.timeline.run_until(self.plan.length_s + _ENDED_S)
+        if self.scheduler.alive or not self.scheduler.core.control.ended:
+            self.invariants.fail("the experiment does not end")
+        return self._outcome(0)
+
+
+def _settings(plan: Plan) -> SchedulerSettings:
+    limits = ExperimentLimits(
+        {names.TIP_BIAS_VOLTAGE: Limit(low=-10.0, high=10.0, source="night")},
+        {names.PULSE: Limit(only=("corrector", "feedback"), source="night")},
+    )
+    watchdog = WatchdogSettings(
+        stop_when=frozenset(plan.stop_when),
+        dangerous=frozenset({ScopeState.SPEC.name, FEEDBACK_OFF}),
+        retract=names.RETRACT,
+        again_s=5.0,
+        longest_s=20.0,
+    )
+    return SchedulerSettings(
+        rules=Rules(RoleTable(end=("dawn",), mode=_PEOPLE, clear=_PEOPLE)),
+        lease_s=plan.lease_s,
+        watchdog=watchdog,
+        limits=limits,
+        envelopes=Envelopes(),
+        cache_bytes=20_000,
+    )
+
+
+def _policy() -> ChildPolicy:
+    liveness = LivenessPolicy(beat_period_s=5.0, missed_beats=3, longest_step_s=30.0)
+    return ChildPolicy(liveness, RestartPolicy(budget=10**6, longest_delay_s=5.0))

@@ -1,0 +1,137 @@
+"""Simulated processes: they can be killed and frozen, and only they know what they know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from tests.simulation.timeline import Timeline, Timer
+
+
+class Cuttable(Protocol):
+    """A connection that breaks when a process dies."""
+
+    def cut(self) -> None: ...
+
+
+_SAME_S = 1e-6
+
+
+class Alarm:
+    """Rings for a process at a time that may change again and again; where it stays the same, nothing is done."""
+
+    def __init__(self, process: Process, ring: Callable[[], None]) -> None:
+        self._process = process
+        self._ring = ring
+        self._timer: Timer | None = None
+        self._at_s = 0.0
+
+    def set(self, delay_s: float | None) -> None:
+        """Ring in `delay_s`, if this life lasts that long, and not when it was to ring before; None: not at all."""
+        at_s = math.inf if delay_s is None else self._process.timeline.monotonic_s() + delay_s
+        if self._timer is not None:
+            if abs(at_s - self._at_s) < _SAME_S:
+                return
+            self._timer.cancel()
+        self._at_s = at_s
+        self._timer = None if delay_s is None else self._process.later(delay_s, self._rings)
+
+    def _rings(self) -> None:
+        self._timer = None
+        self._ring()
+
+
+class Process:
+    """A process over all its lives. Subclasses set up what one life knows in `begin`.
+
+    Attributes:
+        alive: there is a life.
+        banned: it can't be started.
+        frozen: it does nothing, and what comes waits.
+        sockets: the connections that others have made to it, whether it has noticed or not.
+        since_s: since when it has been at work: its start, or the end of its last freeze.
+        step_age_s: for how long, by its own words, the current step has been running.
+    """
+
+    def __init__(self, timeline: Timeline, name: str) -> None:
+        self.timeline = timeline
+        self.name = name
+        self.alive = False
+        self.frozen = False
+        self.step_age_s = 0.0
+        self.life = 0
+        self.banned = False
+        self.since_s = 0.0
+        self.exited: Callable[[int], None] = lambda code: None
+        self.sockets: dict[Cuttable, None] = {}
+        self._waiting: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
+
+    # --- for those who start and end it ---
+
+    def start(self) -> None:
+        if self.alive:
+            return
+        if self.banned:
+            self.exited(1)
+            return
+        self.alive, self.frozen = True, False
+        self.life += 1
+        self.step_age_s = 0.0
+        self.since_s = self.timeline.monotonic_s()
+        self._waiting.clear()
+        self.begin()
+
+    def kill(self, code: int = -9) -> None:
+        """End this life at once: nothing of it is left but what it put on its disk."""
+        if not self.alive:
+            return
+        self.alive = self.frozen = False
+        self.life += 1
+        self._waiting.clear()
+        for socket in list(self.sockets):
+            socket.cut()
+        self.ended()
+        self.exited(code)
+
+    def freeze(self, for_s: float) -> None:
+        if self.alive and not self.frozen:
+            self.frozen = True
+            self.timeline.after(for_s, self._thaw, self.life)
+
+    def _thaw(self, life: int) -> None:
+        if life != self.life or not self.frozen:
+            return
+        self.frozen = False
+        self.since_s = self.timeline.monotonic_s()
+        waiting, self._waiting = self._waiting, []
+        for do, args in waiting:
+            if life == self.life:
+                do(*args)
+
+    # --- for what happens to it ---
+
+    def take(self, do: Callable[..., None], *args: Any) -> None:
+        """Call `do(*args)` now, later if frozen, not at all if dead."""
+        if not self.alive:
+            return
+        if self.frozen:
+            self._waiting.append((do, args))
+        else:
+            do(*args)
+
+    def later(self, delay_s: float, do: Callable[..., None], *args: Any) -> Timer:
+        """In `delay_s`, if this life lasts that long."""
+        return self.timeline.after(delay_s, self._if_same_life, self.life, do, args)
+
+    def _if_same_life(self, life: int, do: Callable[..., None], args: tuple[Any, ...]) -> None:
+        if life == self.life:
+            self.take(do, *args)
+
+    # --- for subclasses ---
+
+    def begin(self) -> None:
+        """A new life begins."""
+
+    def ended(self) -> None:
+        """A life has ended: close what it held open."""

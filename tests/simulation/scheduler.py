@@ -1,0 +1,317 @@
+"""The scheduler as a simulated process: the real `SchedulerCore`, with lines for sockets and a dict for a disk."""
+
+from __future__ import annotations
+
+import json
+import marshal
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from afspm.logic.events import (
+    Codec,
+    Connected,
+    Disconnected,
+    Effect,
+    Forward,
+    Greeted,
+    Input,
+    Kill,
+    PacketIn,
+    Publish,
+    Replay,
+    ReplayRequested,
+    Reply,
+    RequestIn,
+    SaveState,
+    Tick,
+    TranslatorCaughtUp,
+    TranslatorDown,
+    TranslatorReply,
+    TranslatorUp,
+)
+from afspm.logic.scheduler_core import SchedulerCore, SchedulerSettings
+from afspm.model import (
+    HAS_ENDED,
+    RELAY_REQUEST,
+    ControlResponse,
+    LoggedPacket,
+    Packet,
+    PacketHeader,
+    Request,
+    Response,
+    ResponseDetail,
+)
+from tests.simulation.network import ControlLine, ControlServer, Feed, Publisher, Weather
+from tests.simulation.process import Alarm, Process
+from tests.simulation.timeline import Timeline
+
+_BY_VALUE = 2  # the version of marshal whose bytes follow from the value alone
+
+
+@dataclass
+class Disk:
+    """What survives a kill of the scheduler.
+
+    Attributes:
+        state: the parts of what was last saved, by value; written ten times as fast as JSON, since there are a thousand
+            saves to a restart.
+        full: nothing can be written.
+        stale: something could not be written, and nothing has been since.
+    """
+
+    state: dict[str, bytes] | None = None
+    journal: tuple[LoggedPacket, ...] = ()
+    full: bool = False
+    stale: bool = False
+
+    def save(self, state: dict[str, Any]) -> None:
+        self.stale = self.full
+        if not self.full:
+            self._save(state)
+
+    def _save(self, state: dict[str, Any]) -> None:
+        self.state = {name: marshal.dumps(part, _BY_VALUE) for name, part in state.items()}
+
+    def keep(self, entry: LoggedPacket) -> None:
+        """A packet, before it is published."""
+        if self.full:
+            self.stale = True
+            return
+        self.journal = (*self.journal, entry)
+
+    def saved(self) -> dict[str, Any] | None:
+        """As it comes out of a JSON file; None if nothing was saved."""
+        return None if self.state is None else {name: self.saved_part(name) for name in self.state}
+
+    def saved_part(self, name: str) -> Any:
+        """One part of it, as it comes out of a JSON file; None if nothing was saved."""
+        return None if self.state is None else json.loads(json.dumps(marshal.loads(self.state[name])))
+
+
+class Observer(Protocol):
+    """Whoever checks the scheduler."""
+
+    def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None: ...
+    def carried_out(self, host: SchedulerHost, effect: Effect) -> None: ...
+
+
+class SchedulerHost(Process):
+    """See `afspm.scheduler.shell`, which does the same with sockets.
+
+    Attributes:
+        writes_ahead: a packet is on the disk before it is published, as in the shell. Without that, the translator's
+            newest packets are forgotten by a kill, which is harder on the scheduler.
+
+    Args:
+        journal_s: how long after a packet the journal is written.
+        dies_in_step: the chance that it is killed between two effects of one step.
+        make_core: makes the core of each life, if it is not to be a plain one.
+    """
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        weather: Weather,
+        settings: SchedulerSettings,
+        codec: Codec,
+        header: Callable[[Packet], PacketHeader],
+        observer: Observer,
+        *,
+        journal_s: float = 0.1,
+        dies_in_step: float = 0.0,
+        make_core: Callable[[], Any] | None = None,
+    ) -> None:
+        super().__init__(timeline, "scheduler")
+        self._make_core: Callable[[], Any] = make_core or (lambda: SchedulerCore(settings, codec))
+        self.core = self._make_core()
+        self.disk = Disk()
+        self.dies_in_step = dies_in_step
+        self.translator: tuple[ControlServer, Publisher] | None = None
+        self._weather = weather
+        self._header = header
+        self._observer = observer
+        self.journal_s = journal_s
+        self.writes_ahead = False
+        self._connections = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._lines: dict[ControlLine, int] = {}
+        self._by_connection: dict[int, ControlLine] = {}
+        self._by_name: dict[str, ControlLine] = {}
+        self._feeds: list[Feed] = []
+        self._ticking = Alarm(self, self._tick)
+        self._journal_due = False
+        self._replay: tuple[Packet, ...] = ()
+
+    # --- lives ---
+
+    def begin(self) -> None:
+        self._forget()
+        self.core = self._make_core()
+        if (saved := self.disk.saved()) is not None:
+            self.core.restore(saved)
+        self.core.restore_cache(self.disk.journal)
+        assert self.translator is not None
+        server, publisher = self.translator
+        self._link = ControlLine(self.timeline, self._weather, self, server, "scheduler", doubling=False)
+        self._from_translator = Feed(self.timeline, self._weather, self, publisher)
+        self._carry_out(None, self.core.start(self.timeline.monotonic_s(), self.timeline.now_ns()))
+
+    def fall_silent(self, for_s: float) -> None:
+        """The connections to the translator lose what is sent before they break."""
+        if self.alive:
+            self._link.fall_silent(for_s)
+            self._from_translator.fall_silent(for_s)
+
+    def ended(self) -> None:
+        self._link.close()
+        self._from_translator.close()
+        self._ticking.set(None)
+
+    # --- as a server of requests ---
+
+    def peer_connected(self, line: ControlLine) -> None:
+        self._connections += 1
+        connection = self._connections
+        self._lines[line], self._by_connection[connection] = connection, line
+        self._step(Connected(connection))
+        self._step(Greeted(connection, line.name))
+        former = self._by_name.get(line.name)
+        self._by_name[line.name] = line
+        if former is not None and former is not line:
+            former.cut()  # ROUTER hands the name over to the newest connection
+
+    def peer_disconnected(self, line: ControlLine) -> None:
+        connection = self._lines.pop(line, None)
+        if connection is None:
+            return
+        del self._by_connection[connection]
+        if self._by_name.get(line.name) is line:
+            del self._by_name[line.name]
+        self._step(Disconnected(connection))
+
+    def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
+        connection = self._lines.get(line)
+        if self._has_ended and request.kind != RELAY_REQUEST:
+            ended = ResponseDetail.EXPERIMENT_ENDED
+            line.answer(Response(int(ControlResponse.FAILURE), b"", HAS_ENDED, request.id, ended))
+        elif connection is not None:
+            self._step(RequestIn(connection, line.name, request), late=True)
+
+    # --- as a client of the translator ---
+
+    def line_up(self, line: ControlLine) -> None:
+        self._step(TranslatorUp())
+
+    def line_down(self, line: ControlLine) -> None:
+        self._step(TranslatorDown())
+
+    def answered(self, line: ControlLine, number: int, response: Response) -> None:
+        self._step(TranslatorReply(number, Response(response.code, response.payload, response.reason, response.id)))
+
+    # --- as a listener to the translator ---
+
+    def since_ns(self, feed: Feed) -> int:
+        return self.core.newest_source_ns
+
+    def received(self, feed: Feed, packet: Packet) -> None:
+        self._step(PacketIn(packet, self._header(packet)))
+
+    def caught_up(self, feed: Feed) -> None:
+        self._step(TranslatorCaughtUp())
+
+    def killed(self, feed: Feed) -> None:
+        """The translator sends no such thing."""
+
+    # --- as a publisher ---
+
+    def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
+        self._replay = ()
+        self._step(ReplayRequested(feed, tuple(prefixes), since_ns))
+        if feed not in self._feeds:
+            self._feeds.append(feed)
+        if self._has_ended:
+            self.later(0.0, feed.kill_signal)  # after the replay: it is over
+        return self._replay
+
+    def left(self, feed: Feed) -> None:
+        if feed in self._feeds:
+            self._feeds.remove(feed)
+
+    # --- steps ---
+
+    def carry_out(self, effects: Sequence[Effect]) -> None:
+        """What the core wants done that nobody asked for."""
+        self._carry_out(None, effects)
+
+    @property
+    def _has_ended(self) -> bool:
+        """The experiment has, and only supervisors are still heard."""
+        return self.core.leave_at_s < math.inf
+
+    def _step(self, event: Input, *, late: bool = False) -> None:
+        if self._has_ended and not (late or isinstance(event, ReplayRequested)):
+            return
+        self._carry_out(event, self.core.step(event, self.timeline.monotonic_s(), self.timeline.now_ns()))
+
+    def _carry_out(self, event: Input | None, effects: Sequence[Effect]) -> None:
+        life = self.life
+        for effect in effects:
+            if self.dies_in_step and self.timeline.chance(self.dies_in_step):
+                self.kill()
+                return
+            self._observer.carried_out(self, effect)
+            self._do(effect)
+            if life != self.life:
+                return
+        self._observer.stepped(self, event, effects)
+        self._plan_tick()
+
+    def _do(self, effect: Effect) -> None:
+        if isinstance(effect, Reply):
+            line = self._by_connection.get(effect.connection)
+            if line is not None:
+                line.answer(effect.response)
+        elif isinstance(effect, Forward):
+            self._link.ask(effect.request, effect.number)
+        elif isinstance(effect, Publish):
+            if effect.history and (effect.source_ns is None or self.writes_ahead):
+                self.disk.keep(LoggedPacket(effect.packet, effect.source_ns, effect.history))
+            for feed in list(self._feeds):
+                feed.publish(effect.packet)
+            if effect.history and not self._journal_due:
+                self._journal_due = True
+                self.later(self.journal_s * self.timeline.random.random(), self._write_journal)
+        elif isinstance(effect, Replay):
+            self._replay = effect.packets
+        elif isinstance(effect, SaveState):
+            self.disk.save(effect.state)
+        elif isinstance(effect, Kill):
+            for feed in self._feeds:
+                feed.kill_signal()
+
+    def _write_journal(self) -> None:
+        self._journal_due = False
+        if not self.disk.full:
+            self.disk.journal = tuple(self.core.cached())
+
+    def _plan_tick(self) -> None:
+        self._ticking.set(self._wait_s())
+
+    def _wait_s(self) -> float | None:
+        if self._has_ended:
+            return max(0.0, self.core.leave_at_s - self.timeline.monotonic_s())
+        deadline_s, deadline_ns = self.core.deadline_s(), self.core.deadline_ns()
+        waits = [] if deadline_s is None else [deadline_s - self.timeline.monotonic_s()]
+        if deadline_ns is not None:
+            waits.append(self.timeline.real_s((deadline_ns - self.timeline.now_ns()) / 1e9) + 1e-6)
+        return min(waits, default=None)
+
+    def _tick(self) -> None:
+        if self.timeline.monotonic_s() >= self.core.leave_at_s:
+            self.kill(80)
+        else:
+            self._step(Tick())

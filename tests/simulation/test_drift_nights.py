@@ -1,0 +1,39 @@
+"""Everything that holds of a scheduler holds of the drift compensated one, whatever becomes of its worker."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.simulation.drift_night import DriftNight
+from tests.simulation.night import Plan, plan
+
+
+@pytest.mark.parametrize("seeds", [range(first, first + 6) for first in range(0, 12, 6)], ids=str)
+def test_every_invariant_holds_in_many_nights(seeds: range) -> None:
+    for seed in seeds:
+        DriftNight(plan(seed), trouble=(0.0, 0.1, 0.5)[seed % 3]).run()
+
+
+def test_a_quiet_night_s_scans_lie_where_they_were_taken_on_the_sample() -> None:
+    night = DriftNight(Plan(seed=3, hours=8.0))
+    outcome = night.run()
+    assert outcome.scans > 8.0 * 3600.0 / night.microscope.habits.scan_s / 2.0
+    assert night.published >= 2 * (outcome.scans - 2)
+    assert np.median(night.misplaced_m) < 0.5e-9
+    # the microscope followed the sample, by what was known before each scan
+    assert abs(night.microscope.region.center_m[0]) > 1e-6  # type: ignore[attr-defined]
+
+
+def test_a_worker_in_trouble_costs_no_scan() -> None:
+    calm, troubled = DriftNight(Plan(seed=5, hours=8.0)), DriftNight(Plan(seed=5, hours=8.0), trouble=0.3)
+    scans = calm.run().scans
+    assert troubled.run().scans > 0.7 * scans
+    assert troubled.worker.failed > 10
+
+
+def test_a_night_replays_exactly() -> None:
+    first, second = (DriftNight(plan(7, hours=3.0), trouble=0.3) for _ in range(2))
+    assert first.run() == second.run()
+    assert first.scheduler.disk == second.scheduler.disk
+    assert first.misplaced_m == second.misplaced_m

@@ -1,0 +1,175 @@
+"""What the scheduler writes down of what happens, held against what was seen to happen."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from afspm.logic.arbitration import ArbitrationState
+from afspm.logic.event_log import CONTROL, ENTRIES, PERIOD_S, SCHEDULER
+from afspm.logic.events import Effect, Input, Publish, Reply
+from afspm.logic.supervisor_registry import SUPERVISOR
+from afspm.model import (
+    ControlMode,
+    ControlResponse,
+    JournalEntries,
+    JournalEntry,
+    Packet,
+    ProblemNames,
+    component_of,
+)
+from tests.simulation.codec import TableCodec
+from tests.simulation.scheduler import SchedulerHost
+from tests.simulation.timeline import Timeline
+
+_NO_RESPONSE = int(ControlResponse.NO_RESPONSE)
+_REMEMBERED = 5000
+_LATE_S = 0.5
+_CATCHING_UP_S = 10.0
+"""After a restart what was published before may come again for so long; nothing is written down until then."""
+
+Told = tuple[str, int, int]
+"""Who was answered, with which response, when (experiment, ns)."""
+
+
+@dataclass
+class _Derived:
+    """What the entries say of control."""
+
+    holder: str | None = None
+    mode: str = ControlMode.AUTOMATED.name
+    problems: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, control: ArbitrationState, names: ProblemNames) -> _Derived:
+        problems = {names.name(number): who for number, who in control.problems.items()}
+        return cls(control.holder, control.mode.name, problems)
+
+    def take(self, entry: JournalEntry) -> None:
+        verb, _, rest = entry.what.partition(" ")
+        if entry.what == "no longer in control":
+            self.holder = None
+        elif verb == "in":
+            self.holder = entry.who
+        elif verb == "mode":
+            self.mode = rest
+        elif verb == "flagged":
+            self.problems[rest] = entry.who
+        elif verb == "cleared":
+            self.problems.pop(rest, None)
+
+
+class Written:
+    """Every answer is written down once, soon, in order, and what was published of it outlives a kill.
+
+    Args:
+        must: says that an invariant is violated, if it is.
+        name_taken: part of the refusal of who takes another's name: it is given anew each time.
+    """
+
+    def __init__(
+        self, timeline: Timeline, codec: TableCodec, must: Callable[[bool, str], None], name_taken: str
+    ) -> None:
+        self._timeline = timeline
+        self._codec = codec
+        self._must = must
+        self._name_taken = name_taken
+        self._names = ProblemNames()
+        self._life = 0
+        self._answered: set[tuple[str, str]] = set()
+        self._awaited: deque[tuple[float, Told]] = deque()
+        self._spare: Counter[tuple[str, int]] = Counter()  # written down, but nobody has seen the reply: (who, code)
+        self._seen: set[JournalEntry] = set()
+        self._order: deque[JournalEntry] = deque()
+        self._newest_ns = 0
+        self._published_s = -1.0
+        self._newest: Packet | None = None
+        self._derived = _Derived()
+        self.entries = 0
+        self.is_certain = True
+
+    def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
+        """Before each effect."""
+        if host.life != self._life:
+            self._begin(host)
+        if isinstance(effect, Reply):
+            self._reply(effect)
+        elif isinstance(effect, Publish) and effect.packet.envelope == ENTRIES:
+            self._publish(effect.packet, at_the_end=host.core.control.ended)
+
+    def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
+        """After each step."""
+        if host.life != self._life:
+            self._begin(host)
+        if any(isinstance(effect, Publish) and effect.packet.envelope == ENTRIES for effect in effects):
+            is_so = _Derived.of(host.core.control, self._names)
+            self._must(self._derived == is_so, f"by what is written {self._derived}, in truth {is_so}")
+        now_s = self._timeline.monotonic_s()
+        if self._awaited:
+            since_s = max(self._awaited[0][0], host.since_s + _CATCHING_UP_S)
+            self._must(now_s - since_s <= PERIOD_S + _LATE_S, f"not written down: {self._awaited[0]}")
+
+    def _begin(self, host: SchedulerHost) -> None:
+        """What a killed scheduler had not published is lost with it, what it had is not."""
+        self._life = host.life
+        self._answered.clear()
+        self._awaited.clear()
+        self._spare.clear()
+        self._derived = _Derived.of(host.core.control, self._names)
+        self._published_s = -1.0
+        if self._newest is not None and self.is_certain:
+            kept = [packet for packet, *_ in host.core.cached() if packet.time_ns == self._newest.time_ns]
+            self._must(kept == [self._newest], "what was written last is not there any more after a restart")
+
+    def _reply(self, reply: Reply) -> None:
+        response = reply.response
+        key = (reply.name, response.id)
+        if component_of(reply.name) == SUPERVISOR:
+            return  # what it tells is published, and not that it did
+        anew = not response.id or response.code == _NO_RESPONSE or self._name_taken in response.reason
+        if not anew and key not in self._answered and self._spare[reply.name, response.code]:
+            self._spare[reply.name, response.code] -= 1  # written down when there was nobody to be told
+        elif anew or key not in self._answered:
+            told = (reply.name, response.code, self._timeline.now_ns())
+            self._awaited.append((self._timeline.monotonic_s(), told))
+        if not anew:
+            self._answered.add(key)
+
+    def _publish(self, packet: Packet, *, at_the_end: bool) -> None:
+        entries = self._codec.decode(packet.payload)
+        assert isinstance(entries, JournalEntries)
+        now_s = self._timeline.monotonic_s()
+        self._must(bool(entries.entries), "nothing is published as if something had happened")
+        is_soon = now_s - self._published_s < PERIOD_S - 1e-9
+        self._must(at_the_end or not is_soon, "entries are published too often")
+        self._published_s, self._newest = now_s, packet
+        told = [told for _, told in self._awaited]
+        for entry in entries.entries:
+            self._take(entry, told)
+        for who, code, _ in told:  # the same, a moment ago
+            self._must(self._spare[who, code] > 0, f"answered and not written down: {who}, {code}")
+            self._spare[who, code] -= 1
+        self._awaited.clear()
+
+    def _take(self, entry: JournalEntry, told: list[Told]) -> None:
+        self.entries += 1
+        self._must(entry.time_ns >= self._newest_ns, f"written down out of order: {entry}")
+        self._newest_ns = entry.time_ns
+        if entry.kind == CONTROL:
+            self._must(entry not in self._seen, f"written down twice: {entry}")
+            self._derived.take(entry)
+        one = (entry.who, entry.response or 0, entry.time_ns)
+        if entry.response is not None and one in told:
+            told.remove(one)
+        elif entry.response is not None and entry.who != SCHEDULER:
+            # its answer could not be delivered, or came late: then it is written down, but nobody has seen a reply
+            self._must(entry not in self._seen, f"written down twice: {entry}")
+            self._spare[one[:2]] += 1
+        self._remember(entry)
+
+    def _remember(self, entry: JournalEntry) -> None:
+        self._seen.add(entry)
+        self._order.append(entry)
+        if len(self._order) > _REMEMBERED:
+            self._seen.discard(self._order.popleft())
