@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Hashable, Iterable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from afspm import wire
 from afspm.errors import WireError
@@ -26,11 +26,12 @@ from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
 from afspm.transport.translator_link import LinkReply, LinkUp
-from afspm.wire.frames import LONGEST_ID
+from afspm.wire.protocol import LONGEST_ID
 
 if TYPE_CHECKING:
     from afspm.clock import Clock
     from afspm.logic.arbitration import ArbitrationState
+    from afspm.logic.state import SavedState
     from afspm.scheduler.write_ahead import WriteAhead
     from afspm.transport.rate_limited_log import RateLimitedLog
     from afspm.transport.scheduler_sockets import SchedulerSockets, Source
@@ -49,7 +50,7 @@ class Core(Protocol):
     def step(self, event: events.Input, now_s: float, now_ns: int) -> list[events.Effect]: ...
     def deadline_s(self) -> float | None: ...
     def deadline_ns(self) -> int | None: ...
-    def restore(self, state: dict[str, Any]) -> None: ...
+    def restore(self, saved: SavedState) -> None: ...
     def restore_cache(self, packets: Iterable[LoggedPacket]) -> None: ...
     def cached(self) -> Iterable[LoggedPacket]: ...
     @property
@@ -292,10 +293,10 @@ class SchedulerShell:
     def _write_down(self, effects: list[events.Effect]) -> None:
         """Write what must outlive a crash before anybody is told."""
         entries: list[LoggedPacket] = []
-        state: dict[str, Any] | None = None
+        state: SavedState | None = None
         over = self.ended
         for effect in effects:
-            if isinstance(effect, events.SaveState) and (self.ended or not over):
+            if isinstance(effect, events.SaveState):
                 state = effect.state
             elif isinstance(effect, events.Publish):
                 # last words are recorded; a scheduler that is started again must not find the end in its cache

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
+from afspm.logic.state import SavedState
 from afspm.model import LoggedPacket
 from afspm.scheduler.state_file import StateFile
 from afspm.storage.atomic import OutageLog
@@ -41,9 +41,9 @@ class WriteAhead:
         self._outage = OutageLog("what is told now would be lost in a crash", logger)
         self._given_up = OutageLog("packets are given up that are not recorded yet", logger)
         self._missed_ns: int | None = None
-        self._problems: frozenset[str] = frozenset()
+        self._problems: frozenset[int] = frozenset()
 
-    def write(self, state: dict[str, Any] | None, entries: Sequence[LoggedPacket]) -> None:
+    def write(self, state: SavedState | None, entries: Sequence[LoggedPacket]) -> None:
         """Save the state and append the packets; problems that are new are on the disk then, too."""
         if state is None and not entries:
             return
@@ -109,6 +109,6 @@ class WriteAhead:
 
         self._disk.submit(work)
 
-    def _has_new_problems(self, state: dict[str, Any]) -> bool:
-        before, self._problems = self._problems, frozenset(state["control"]["problems"])
+    def _has_new_problems(self, state: SavedState) -> bool:
+        before, self._problems = self._problems, frozenset(state.control.problems)
         return not self._problems <= before

@@ -59,7 +59,7 @@ def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHand
     """
     if experiment.keys_folder is not None:
         return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
-    security = experiment.resolved.security
+    security = experiment.resolved.sections.security
     guarded = {} if security.plain or security.insecure else _guarded(experiment, starts)
     return _made(starts, guarded, _scheduler(experiment)) if guarded else KeyHandout(starts)
 

@@ -82,7 +82,7 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
         replayer = Replayer(chain([first], packets), clock, complaints, publish=publish, serve=serve)
         try:
             with (
-                signals.told(lambda _: replayer.stop(), replayer.wakeup_fileno()),
+                signals.caught(lambda _: replayer.stop(), replayer.wakeup_fileno()),
                 _folder(run, options.runs, guest, clock, publish, serve) as folder,
             ):
                 told = f"replay of {run.folder.name} at {clock.speed:g} experiment seconds a second, in {folder}"

@@ -348,7 +348,8 @@ def test_what_is_expanded_checks_like_the_file_itself(write: Write) -> None:
         + PEAKS + 'listens_to = []\n[limits]\nmost_pixels = 1000\n')  # fmt: skip
     again = _reload(experiment)
     assert not errors(again)
-    assert again.resolved.settings == experiment.resolved.settings
+    for name, process in experiment.resolved.processes.items():
+        assert again.resolved.processes[name].settings == process.settings
     assert again.resolved.limits.most_pixels == 1000
 
 

@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 
 from afspm.clock import ExperimentClock
+from afspm.logic.state import SavedState
 from afspm.model import LoggedPacket, Packet
 from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.write_ahead import WriteAhead
 from afspm.storage import disk, packet_log
 from afspm.storage.packet_log import PacketLog, cached_packets, commit, expect_recorder, logged_packets
 
-STATE = {"control": {"problems": []}}
+STATE = SavedState(last_ns=7)
 DEADLINE_S = 20.0
 
 
