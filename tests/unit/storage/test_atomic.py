@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from afspm.errors import FileError
+from afspm.logic.arbitration import ArbitrationState
+from afspm.logic.state import SavedState
+from afspm.model import ControlMode
 from afspm.process.memory import Memory
 from afspm.scheduler.state_file import StateFile
 from afspm.storage import atomic
@@ -183,16 +186,16 @@ def test_a_scheduler_after_a_power_cut_knows_the_problems_and_gives_control_to_n
 ) -> None:
     log = logging.getLogger("scheduler")
     path = tmp_path / "scheduler.json"
-    state = {"control": {"mode": 1, "holder": "series", "solving": 3, "problems": {"3": "a"}, "ended": False}}
+    control = ArbitrationState(ControlMode.AUTOMATED, "series", solving=3, problems={3: "a"})
+    saved = SavedState(control, granted_to="token", last_ns=7)
     file = StateFile(path, log)
-    file.save({**state, "granted_to": "token", "last_ns": 7})
+    file.save(saved)
     file.close()
-    assert StateFile(path, log).load()["control"]["holder"] == "series"
+    assert StateFile(path, log).load() == saved
     assert not caplog.records
     path.write_bytes(left)
-    again = StateFile(path, log).load()
-    assert again["control"] == {**state["control"], "holder": None, "solving": 0}
-    assert (again["granted_to"], again["last_ns"]) == (None, 7)
+    assert StateFile(path, log).load() == saved.without_holder()
+    assert saved.without_holder().control.holder is None
     assert "nobody in control" in caplog.text
 
 
