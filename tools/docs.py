@@ -22,7 +22,7 @@ from afspm.microscopes.simulator.faults import Fault
 from afspm.microscopes.simulator.instrument import PanelEvent
 from afspm.simulation.drift import Relaxation
 from afspm.simulation.surfaces import KINDS
-from afspm.simulation.world_settings import WorldSettings
+from afspm.simulation.world import WorldSettings
 from afspm.units import Unit
 
 ROOT = Path(__file__).resolve().parents[1]

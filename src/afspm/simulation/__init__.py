@@ -11,9 +11,8 @@ sample neither turns nor expands.
 from __future__ import annotations
 
 from afspm.simulation.scanning import SimulatedScan
-from afspm.simulation.surfaces.readers import READERS, Heightmap
+from afspm.simulation.surfaces.picture import READERS, Heightmap
 from afspm.simulation.tip import TipState
-from afspm.simulation.world import World
-from afspm.simulation.world_settings import WorldSettings
+from afspm.simulation.world import World, WorldSettings
 
 __all__ = ["READERS", "Heightmap", "SimulatedScan", "TipState", "World", "WorldSettings"]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from afspm.simulation import chance
-from afspm.simulation.settings import build, check, one_of
+from afspm.simulation.settings import check, one_of
 
 FLAWS = ("blunt", "double", "contaminated")
 CONDITIONS = ("sharp", *FLAWS)
@@ -44,14 +43,6 @@ class TipState:
     def imaging_radius_m(self) -> float:
         """Of what touches the sample: apex or debris."""
         return self.radius_m + self.debris_m
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> TipState:
-        return build(cls, values, "tip")
 
 
 @dataclass(frozen=True)
@@ -136,30 +127,6 @@ class TipChange:
     t_s: float
     cause: str
     tip: TipState
-
-
-class TipHistory:
-    """Every shape the tip has had, by time; what was foreseen and did not come to pass can be taken back."""
-
-    def __init__(self, changes: list[TipChange]) -> None:
-        self.changes = changes
-
-    def at(self, t_s: float) -> TipState:
-        """The tip at a time."""
-        return next((c.tip for c in reversed(self.changes) if c.t_s <= t_s), self.changes[0].tip)
-
-    def between(self, start_s: float, end_s: float) -> list[TipChange]:
-        """Changes in (start, end]."""
-        return [change for change in self.changes if start_s < change.t_s <= end_s]
-
-    def add(self, change: TipChange) -> None:
-        """At its place in time."""
-        self.changes.append(change)
-        self.changes.sort(key=lambda c: c.t_s)
-
-    def forget_after(self, t_s: float) -> None:
-        """Takes back what was to come after a time (the scan was stopped)."""
-        self.changes = [c for c in self.changes if c.t_s <= t_s or c.cause == "start"]
 
 
 class TipMaker:
@@ -266,3 +233,77 @@ def chance_changes(
             break
         found.append((t, flaw))
     return found
+
+
+class SimulatedTip:
+    """The tip through the night: every shape it has had, by time, and what changes it.
+
+    What is foreseen (the rest of a scan that was stopped: changes, wear) can be taken back.
+
+    Attributes:
+        history: in the order of time; the first is that of the start.
+        scheduled_until_s: up to when the changes of the schedule have happened.
+    """
+
+    def __init__(self, settings: TipSettings, changes: TipChangeSettings, seed: int, start_s: float) -> None:
+        self._settings, self._seed, self._start_s = changes, seed, start_s
+        self._maker = TipMaker(settings)
+        self.history = [TipChange(start_s, "start", self._maker.first(chance.generator(seed, 0)))]
+        self.scheduled_until_s = start_s
+        self.advance(start_s)
+
+    def at(self, t_s: float) -> TipState:
+        """Return the tip at a time."""
+        return next((c.tip for c in reversed(self.history) if c.t_s <= t_s), self.history[0].tip)
+
+    def between(self, start_s: float, end_s: float) -> list[TipChange]:
+        """Return the changes in (start, end]."""
+        return [change for change in self.history if start_s < change.t_s <= end_s]
+
+    def begin(self, t_s: float) -> None:
+        """Go to a time, and take back what was to come after it."""
+        self.history = [c for c in self.history if c.t_s <= t_s or c.cause == "start"]
+        self.scheduled_until_s = min(self.scheduled_until_s, t_s)
+        self.advance(t_s)
+
+    def advance(self, until_s: float) -> None:
+        """Let the scheduled changes up to a time happen."""
+        for number, (after_s, condition) in enumerate(self._settings.schedule):
+            t_s = self._start_s + after_s
+            if self.scheduled_until_s < t_s <= until_s or (t_s == until_s == self._start_s):
+                self._change(t_s, "schedule", condition, chance.generator(self._seed, 6, number))
+        self.scheduled_until_s = max(self.scheduled_until_s, until_s)
+
+    def foresee(self, start_s: float, end_s: float, speed_m_s: float, hardness: float, call: int) -> None:
+        """Add the changes that will come during a scan: scheduled ones, and by chance."""
+        s = self._settings
+        rate = (s.per_hour / 3600.0 + s.per_metre * speed_m_s) * hardness
+        seed = chance.subseed(self._seed, "tip changes")
+        for number, (t_s, flaw) in enumerate(chance_changes(s, start_s, end_s, rate, seed, call)):
+            self.advance(t_s)
+            self._change(t_s, "chance", flaw, chance.generator(seed, call, number))
+        self.advance(end_s)
+
+    def wear(self, t_s: float, worn_m: float) -> None:
+        """Let the apex grow by what it has been rubbed off."""
+        tip = self.history[-1].tip
+        self._add(TipChange(t_s, "wear", replace(tip, radius_m=tip.radius_m + worn_m)))
+
+    def treat(self, cause: str, t_s: float, chances: Chances, random: np.random.Generator) -> str:
+        """Return what a treatment did: "cured", "worsened" or "unchanged"."""
+        draw = random.random()
+        if draw < chances.cures:
+            self._change(t_s, cause, "sharp", random)
+            return "cured"
+        flaw = drawn_flaw(self._settings, random)
+        if draw < chances.cures + chances.worsens and flaw is not None:
+            self._change(t_s, cause, flaw, random)
+            return "worsened"
+        return "unchanged"
+
+    def _change(self, t_s: float, cause: str, condition: str, random: np.random.Generator) -> None:
+        self._add(TipChange(t_s, cause, self._maker.changed(self.at(t_s), condition, random)))
+
+    def _add(self, change: TipChange) -> None:
+        self.history.append(change)
+        self.history.sort(key=lambda c: c.t_s)

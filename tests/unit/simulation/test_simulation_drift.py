@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from afspm.errors import InvalidValue
-from afspm.simulation.drift import Compensation, Drift, DriftSettings, Relaxation, random_walk
+from afspm.simulation.drift import Drift, DriftSettings, Relaxation, ScannerCompensation, random_walk
 
 START = 1.75e9
 
@@ -69,7 +69,7 @@ def test_a_scanner_that_follows_with_the_right_velocity_sees_no_drift() -> None:
 
 
 def test_a_scanner_has_followed_what_it_was_told_since_whenever_that_is_asked() -> None:
-    compensation = Compensation()
+    compensation = ScannerCompensation()
     turns = [(10.0, 1e-9), (20.0, 3e-9), (20.0, -2e-9), (35.0, 0.0)]
     for since_s, velocity in turns:
         compensation.set((velocity, -velocity), since_s)
