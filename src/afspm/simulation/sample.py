@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cmath
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -88,6 +89,10 @@ class Sample:
         x, y = self.to_sample(np.add(position_m, self.compensation.at(t_s)[:2]), t_s)
         return float(x), float(y)
 
+    def mark(self, kind: str, position_m: tuple[float, float], t_s: float, depth_m: float, radius_m: float) -> None:
+        """Leave a mark under a position of the scanner."""
+        self.marks.append(SurfaceMark(self.under(position_m, t_s), depth_m, radius_m, t_s, kind))
+
     def turn(self, t_s: float) -> dict[str, Any]:
         """Return rotation and scale at a time, JSON-able."""
         turn = complex(self.drift.turn(t_s))
@@ -100,3 +105,10 @@ class Sample:
             if mark.t_s <= t_s:
                 _draw(mark, relief, x_m, y_m)
         return relief
+
+    def surface_m(self, x_m: ArrayLike, y_m: ArrayLike, t_s: float = math.inf) -> Array:
+        """Return the true heights at sample coordinates, shaped as x and y broadcast; see `relief`."""
+        x, y = np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
+        shape = np.broadcast_shapes(x.shape, y.shape)
+        x, y = (a if a.ndim == 2 else a.reshape((1,) * (2 - a.ndim) + a.shape) if a.ndim < 2 else a for a in (x, y))
+        return self.relief(x, y, 0.0, t_s).height_m.reshape(shape)

@@ -71,20 +71,14 @@ class TipSettings:
 
 
 @dataclass(frozen=True)
-class TipChangeSettings:
-    """When the tip changes, and what a repair does to it.
+class TipRepairSettings:
+    """What a repair does to the tip.
 
-    The chances of a repair are made up, so that one is seen to take some trying. How they grow is a simple picture and
-    no theory: a crash takes material from the apex, or leaves some there, all along its way in; a pulse moves by its
-    field what it can, most of it soon.
+    The chances are made up, so that one is seen to take some trying. How they grow is a simple picture and no theory: a
+    crash takes material from the apex, or leaves some there, all along its way in; a pulse moves by its field what it
+    can, most of it soon.
 
     Attributes:
-        per_hour: mean number of changes an hour of scanning at a gentle setpoint.
-        per_metre: the same a metre of scanned line.
-        hardness_exponent: both grow as (force against that at a gentle setpoint) to this power.
-        blunt_weight, double_weight, contaminated_weight: how likely each is.
-        schedule: pairs of seconds after the start and a condition: changes that come for certain.
-        wear_m_per_m: the radius grows so much a metre scanned at a gentle setpoint.
         pulse_threshold_v: below, a pulse does nothing.
         pulse_cures, pulse_worsens: probabilities, of a pulse far above the threshold that lasts `pulse_duration_s`.
         pulse_duration_s: a longer one does more, but not more than two of these; a shorter one less.
@@ -93,14 +87,6 @@ class TipChangeSettings:
         crash_speed_m_per_s: slower crashes are that much less likely to do anything.
     """
 
-    per_hour: float = 0.0
-    per_metre: float = 0.0
-    hardness_exponent: float = 2.0
-    blunt_weight: float = 1.0
-    double_weight: float = 1.0
-    contaminated_weight: float = 1.0
-    schedule: tuple[tuple[float, str], ...] = field(default_factory=tuple)
-    wear_m_per_m: float = 0.0
     pulse_threshold_v: float = 2.0
     pulse_cures: float = 0.5
     pulse_worsens: float = 0.08
@@ -111,10 +97,36 @@ class TipChangeSettings:
     crash_speed_m_per_s: float = 50e-9
 
     def __post_init__(self) -> None:
-        check(self, from_zero="per_hour per_metre hardness_exponent blunt_weight double_weight contaminated_weight")
-        check(self, from_zero="wear_m_per_m pulse_threshold_v")
-        check(self, above_zero="pulse_duration_s crash_depth_m crash_speed_m_per_s")
+        check(self, from_zero="pulse_threshold_v", above_zero="pulse_duration_s crash_depth_m crash_speed_m_per_s")
         check(self, fraction="pulse_cures pulse_worsens crash_cures crash_worsens")
+
+
+@dataclass(frozen=True)
+class TipChangeSettings(TipRepairSettings):
+    """When the tip changes by itself; and the settings of repairs.
+
+    Attributes:
+        per_hour: mean number of changes an hour of scanning at a gentle setpoint.
+        per_metre: the same a metre of scanned line.
+        hardness_exponent: both grow as (force against that at a gentle setpoint) to this power.
+        blunt_weight, double_weight, contaminated_weight: how likely each is.
+        schedule: pairs of seconds after the start and a condition: changes that come for certain.
+        wear_m_per_m: the radius grows so much a metre scanned at a gentle setpoint.
+    """
+
+    per_hour: float = 0.0
+    per_metre: float = 0.0
+    hardness_exponent: float = 2.0
+    blunt_weight: float = 1.0
+    double_weight: float = 1.0
+    contaminated_weight: float = 1.0
+    schedule: tuple[tuple[float, str], ...] = field(default_factory=tuple)
+    wear_m_per_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, from_zero="per_hour per_metre hardness_exponent blunt_weight double_weight contaminated_weight")
+        check(self, from_zero="wear_m_per_m")
         for _, condition in self.schedule:
             one_of(condition, CONDITIONS, "schedule")
         object.__setattr__(self, "schedule", tuple(sorted(self.schedule)))
@@ -289,7 +301,24 @@ class SimulatedTip:
         tip = self.history[-1].tip
         self._add(TipChange(t_s, "wear", replace(tip, radius_m=tip.radius_m + worn_m)))
 
-    def treat(self, cause: str, t_s: float, chances: Chances, random: np.random.Generator) -> str:
+    def pulse(self, voltage_v: float, duration_s: float, t_s: float, random: np.random.Generator) -> str:
+        """Return what a bias pulse did; see `_treat`. It depends on the voltage above all."""
+        s = self._settings
+        strength = max(0.0, abs(voltage_v) / s.pulse_threshold_v - 1.0) if s.pulse_threshold_v else 1.0
+        if strength == 0.0:
+            return "unchanged"
+        effect = 1.0 - math.exp(-3.0 * strength)
+        chances = Chances(s.pulse_cures, s.pulse_worsens).weakened(effect).of_times(pulse_times(s, duration_s))
+        return self._treat("pulse", t_s, chances, random)
+
+    def crash(self, depth_m: float, speed_m_s: float, t_s: float, random: np.random.Generator) -> str:
+        """Return what a crash did; see `_treat`."""
+        s = self._settings
+        effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
+        chances = Chances(s.crash_cures, s.crash_worsens).of_times(crash_times(s, depth_m)).weakened(effect)
+        return self._treat("crash", t_s, chances, random)
+
+    def _treat(self, cause: str, t_s: float, chances: Chances, random: np.random.Generator) -> str:
         """Return what a treatment did: "cured", "worsened" or "unchanged"."""
         draw = random.random()
         if draw < chances.cures:

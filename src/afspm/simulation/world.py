@@ -22,22 +22,19 @@ from afspm.simulation import chance, spectra
 from afspm.simulation.drift import DriftSettings, ScannerCompensation
 from afspm.simulation.feedback import FeedbackSettings, Loop
 from afspm.simulation.fields import Array
-from afspm.simulation.measuring import Felt, Setup, SignalSettings, at_rest, feel, measure
+from afspm.simulation.measuring import Felt, Setup, SignalSettings, TipTimes, at_rest, feel, measure
 from afspm.simulation.noise import NoiseSettings
 from afspm.simulation.sample import Sample, SurfaceMark
-from afspm.simulation.scanning import Course, ScannerSettings, SimulatedScan
+from afspm.simulation.scanning import Course, ScannerPlace, ScannerSettings, SimulatedScan
 from afspm.simulation.settings import build, nearest
 from afspm.simulation.surfaces import surface_from
 from afspm.simulation.tip import (
-    Chances,
     SimulatedTip,
     TipChange,
     TipChangeSettings,
     TipSettings,
     TipState,
-    crash_times,
     indented_m,
-    pulse_times,
 )
 
 # What suits a sample better than the general defaults; the user's settings go on top.
@@ -129,25 +126,22 @@ class World:
     ) -> None:
         self.settings = settings or WorldSettings()
         self.seed, self.start_s = seed, start_s
-        self._sample = Sample(surface, self.settings.drift, seed, start_s)
+        self.sample = Sample(surface, self.settings.drift, seed, start_s)
         self._tip = SimulatedTip(self.settings.tip, self.settings.tip_changes, seed, start_s)
         self._calls = 0
-        self._at_m = (0.0, 0.0)
-        self._came_from_m, self._came_s = (0.0, 0.0), start_s
+        self._place = ScannerPlace(self.settings.scanner.creep, start_s)
         self._held_z_m: float | None = None
         self._felt_at_rest: tuple[Any, Felt] | None = None
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any], seed: int, start_s: float) -> World:
-        """A world as tables ask for: `surface`, and the fields of `WorldSettings`.
+        """Return the world that tables ask for: `surface`, and the fields of `WorldSettings`.
 
         Raises:
             ConfigError: unknown names or values without sense. FileError: the surface's file.
         """
         surface, built = read_settings(settings)
         return cls(surface, built, seed=seed, start_s=start_s)
-
-    # -- measuring
 
     def scan(
         self,
@@ -161,7 +155,7 @@ class World:
         direction: str = "up",
         slope: tuple[float, float] = (0.0, 0.0),
     ) -> SimulatedScan:
-        """Scans a region, from `start_s` on.
+        """Scan a region, from `start_s` on.
 
         Args:
             region: in tip coordinates.
@@ -186,19 +180,8 @@ class World:
         measured = measure(course, tips, setup, chance.generator(self.seed, 2, call))
         self._held_z_m = measured.last_z_m
         self._wear(course, loop)
-        drift = self._sample.drift.at(course.row_times_s(0.25))
-        truth = {
-            "start_s": start_s,
-            "end_s": course.end_s,
-            "tips": [{"t_s": t, **asdict(tip)} for t, tip in tips],
-            "drift_start_m": self.drift_m(start_s).tolist(),
-            "drift_end_m": self.drift_m(course.end_s).tolist(),
-            "turn_start": self._sample.turn(start_s),
-            "turn_end": self._sample.turn(course.end_s),
-            "compensated_start_m": self._sample.compensation.at(start_s).tolist(),
-            "compensated_end_m": self._sample.compensation.at(course.end_s).tolist(),
-            "pressed_m": measured.pressed_m,
-        }
+        drift = self.sample.drift.at(course.row_times_s(0.25))
+        truth = {**_truth_of_scan(self.sample, course, tips), "pressed_m": measured.pressed_m}
         return SimulatedScan(course, drift, truth, measured.channels)
 
     def at_rest(
@@ -211,7 +194,7 @@ class World:
         slope: tuple[float, float] = (0.0, 0.0),
         random: np.random.Generator,
     ) -> dict[str, float]:
-        """What each channel shows while the tip stands at a place: nothing comes of having looked.
+        """Return what each channel shows while the tip stands at a place: nothing comes of having looked.
 
         With the feedback off, z is where `hold` or the last scan has left it.
 
@@ -227,10 +210,9 @@ class World:
         course = Course(Region(position_m, (_POINT_M, _POINT_M)), (1, 1), 1e-3, t_s)
         setup = self._setup(loop, bias_v, slope, t_s)
         tip = self._tip.at(t_s)
-        where = [
-            round(at_m / _SAME_PLACE_M) for at_m in (*self._sample.under(position_m, t_s), self.seen_drift_m(t_s)[2])
-        ]
-        key = (where, tip, len(self._sample.marks))
+        where_m = (*self.sample.under(position_m, t_s), self.sample.seen_drift_m(t_s)[2])
+        where = [round(at_m / _SAME_PLACE_M) for at_m in where_m]
+        key = (where, tip, len(self.sample.marks))
         if self._felt_at_rest is None or self._felt_at_rest[0] != key:
             self._felt_at_rest = key, feel(course, [(t_s, tip)], setup)
         return at_rest(course, self._felt_at_rest[1], setup, random)
@@ -253,7 +235,7 @@ class World:
         feedback: Feedback | None = None,
         bias_v: float = 0.1,
     ) -> spectra.Curves:
-        """A curve at a position: (names, units, values [n_points, n_variables]). Kinds are "IV" and "force".
+        """Return a curve at a position: (names, units, values [n_points, n_variables]). Kinds are "IV" and "force".
 
         Raises:
             InvalidValue: an unknown kind, or feedback without sense.
@@ -265,8 +247,8 @@ class World:
         loop = Loop.of(self.settings.feedback, feedback)
         call = self._begin(t_s, position_m)
         tip = self._tip.at(t_s)
-        x, y = self._sample.under(position_m, t_s)
-        relief = self._sample.relief(np.array([[x]]), np.array([[y]]), 0.0, t_s)
+        x, y = self.sample.under(position_m, t_s)
+        relief = self.sample.relief(np.array([[x]]), np.array([[y]]), 0.0, t_s)
         material = float(relief.material[0, 0])
         random = chance.generator(self.seed, 3, call)
         if kind == "IV":
@@ -274,7 +256,7 @@ class World:
         return spectra.force_distance(self.settings.force, tip, material, random)
 
     def spectrum_s(self, kind: str) -> float:
-        """How long such a curve takes."""
+        """Return the duration of such a curve."""
         return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
 
     def compensate(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
@@ -285,16 +267,14 @@ class World:
         """
         if not all(map(math.isfinite, (*velocity_m_per_s, t_s))):
             raise InvalidValue(f"a velocity of {velocity_m_per_s} m/s from {t_s} s on")
-        self._sample.compensation.set(velocity_m_per_s, t_s)
+        self.sample.compensation.set(velocity_m_per_s, t_s)
 
     # -- treating the tip
 
     def pulse(
         self, voltage_v: float, duration_s: float, t_s: float, position_m: tuple[float, float] | None = None
     ) -> str:
-        """A bias pulse: may cure or worsen the tip, and leaves a little mound.
-
-        Whether it does depends on the voltage above all, and a little on the duration (`tip.pulse_times`).
+        """Pulse the bias: may cure or worsen the tip (`tip.pulse_times`), and leaves a little mound.
 
         Args:
             position_m: where the tip was moved to; None: where it measured last.
@@ -304,26 +284,19 @@ class World:
         """
         if not (math.isfinite(voltage_v) and math.isfinite(duration_s) and duration_s > 0):
             raise InvalidValue(f"a pulse of {voltage_v} V for {duration_s} s", hint="finite, and longer than nothing")
-        call = self._begin(t_s, self._at_m if position_m is None else position_m)
-        s = self.settings.tip_changes
-        strength = max(0.0, abs(voltage_v) / s.pulse_threshold_v - 1.0) if s.pulse_threshold_v else 1.0
-        if strength == 0.0:
-            return "unchanged"
-        effect = 1.0 - math.exp(-3.0 * strength)
+        call = self._begin(t_s, self._place.at_m if position_m is None else position_m)
         random = chance.generator(self.seed, 4, call)
-        chances = Chances(s.pulse_cures, s.pulse_worsens).weakened(effect).of_times(pulse_times(s, duration_s))
-        outcome = self._tip.treat("pulse", t_s, chances, random)
+        outcome = self._tip.pulse(voltage_v, duration_s, t_s, random)
         if outcome != "unchanged":
             radius = self._tip.at(t_s).imaging_radius_m * random.uniform(0.5, 1.0)
-            self._mark("pulse", self._at_m, t_s, -0.3 * radius, radius)
+            self.sample.mark("pulse", self._place.at_m, t_s, -0.3 * radius, radius)
         return outcome
 
     def crash(self, position_m: tuple[float, float], depth_m: float, speed_m_s: float, t_s: float) -> str:
-        """Drives the tip into the sample: may cure or worsen it, and leaves a crater that later scans see.
+        """Drive the tip into the sample: may cure or worsen it (`tip.crash_times`), and leaves a crater.
 
-        The deeper, the more likely it does anything (`tip.crash_times`), and the deeper is the crater
-        (`tip.indented_m`); of that a part springs back. Simulated: material is pushed aside over three times the radius
-        of contact, about as far as plastic flow reaches around an indenter.
+        A part of its depth (`tip.indented_m`) springs back. Simulated: material is pushed aside over three times the
+        radius of contact, about as far as plastic flow reaches around an indenter.
 
         Args:
             depth_m: beyond the surface.
@@ -335,67 +308,39 @@ class World:
             what = f"a crash at {position_m}, {depth_m} m deep with {speed_m_s} m/s"
             raise InvalidValue(what, hint="finite, deeper and faster than nothing")
         call = self._begin(t_s, position_m)
-        s = self.settings.tip_changes
-        effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
         random = chance.generator(self.seed, 5, call)
         tip = self._tip.at(t_s)
         into_m = indented_m(tip, depth_m)
         radius = 3.0 * math.sqrt(2.0 * tip.imaging_radius_m * into_m) * random.uniform(0.8, 1.4)
-        chances = Chances(s.crash_cures, s.crash_worsens).of_times(crash_times(s, depth_m)).weakened(effect)
-        outcome = self._tip.treat("crash", t_s, chances, random)
-        self._mark("crash", position_m, t_s, into_m * random.uniform(0.6, 0.9), radius)
+        outcome = self._tip.crash(depth_m, speed_m_s, t_s, random)
+        self.sample.mark("crash", position_m, t_s, into_m * random.uniform(0.6, 0.9), radius)
         self._held_z_m = None
         return outcome
-
-    # -- the truth
 
     def drift_m(self, t_s: ArrayLike) -> Array:
         """Return (x, y, z) by which the sample is displaced: x_tip = x_sample + drift. Shape t.shape + (3,).
 
         On a sample that turns or expands that is so at the place that it does about: see `to_sample` and `to_tip`.
         """
-        return self._sample.drift.at(t_s)
-
-    def seen_drift_m(self, t_s: ArrayLike) -> Array:
-        """See `Sample.seen_drift_m`."""
-        return self._sample.seen_drift_m(t_s)
-
-    def to_sample(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """See `Sample.to_sample`."""
-        return self._sample.to_sample(xy_m, t_s)
-
-    def to_tip(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """See `Sample.to_tip`."""
-        return self._sample.to_tip(xy_m, t_s)
+        return self.sample.drift.at(t_s)
 
     @property
     def tip(self) -> TipState:
         """The tip after all that has been asked for so far."""
         return self._tip.history[-1].tip
 
-    def tip_at(self, t_s: float) -> TipState:
-        """Return the tip at a time."""
-        return self._tip.at(t_s)
-
-    def surface_m(self, x_m: ArrayLike, y_m: ArrayLike, t_s: float = math.inf) -> Array:
-        """True heights at sample coordinates, shaped as x and y broadcast, with the marks made up to a time."""
-        x, y = np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
-        shape = np.broadcast_shapes(x.shape, y.shape)
-        x, y = (a if a.ndim == 2 else a.reshape((1,) * (2 - a.ndim) + a.shape) if a.ndim < 2 else a for a in (x, y))
-        return self._sample.relief(x, y, 0.0, t_s).height_m.reshape(shape)
-
     def truth(self, t_s: float) -> dict[str, Any]:
-        """What nobody on the wire is told, JSON-able: drift, tip, what happened to it, marks on the sample."""
+        """Return what nobody on the wire is told, JSON-able: drift, tip, what happened to it, marks on the sample."""
         return {
             "t_s": t_s,
             "seed": self.seed,
-            "surface": dict(self._sample.table),
+            "surface": dict(self.sample.table),
             "drift_m": self.drift_m(t_s).tolist(),
-            "turn": self._sample.turn(t_s),
-            "compensated_m": self._sample.compensation.at(t_s).tolist(),
+            "turn": self.sample.turn(t_s),
+            "compensated_m": self.sample.compensation.at(t_s).tolist(),
             "tip": asdict(self._tip.at(t_s)),
             "tip_changes": [asdict(change) for change in self._tip.history if change.t_s <= t_s],
-            "marks": [asdict(mark) for mark in self._sample.marks if mark.t_s <= t_s],
+            "marks": [asdict(mark) for mark in self.sample.marks if mark.t_s <= t_s],
         }
 
     # -- being killed and coming back
@@ -407,13 +352,13 @@ class World:
             start_s=self.start_s,
             calls=self._calls,
             scheduled_until_s=self._tip.scheduled_until_s,
-            at_m=self._at_m,
-            came_from_m=self._came_from_m,
-            came_s=self._came_s,
+            at_m=self._place.at_m,
+            came_from_m=self._place.came_from_m,
+            came_s=self._place.came_s,
             held_z_m=self._held_z_m,
             tips=self._tip.history,
-            marks=self._sample.marks,
-            compensation=self._sample.compensation.turns,
+            marks=self.sample.marks,
+            compensation=self.sample.compensation.turns,
         )
         return snapshot(state, "world", STATE_VERSION)
 
@@ -429,9 +374,9 @@ class World:
             if theirs != mine:
                 raise InvalidValue(f"a saved state with {name} {theirs!r} instead of {mine!r}")
         self._calls, self._held_z_m = found.calls, found.held_z_m
-        self._at_m, self._came_from_m, self._came_s = found.at_m, found.came_from_m, found.came_s
+        self._place.at_m, self._place.came_from_m, self._place.came_s = found.at_m, found.came_from_m, found.came_s
         self._tip.history, self._tip.scheduled_until_s = found.tips, found.scheduled_until_s
-        self._sample.marks, self._sample.compensation = found.marks, ScannerCompensation(found.compensation)
+        self.sample.marks, self.sample.compensation = found.marks, ScannerCompensation(found.compensation)
 
     # -- inside
 
@@ -439,10 +384,9 @@ class World:
         """Go to a time and a place; return the number of this call."""
         if not (math.isfinite(t_s) and t_s >= self.start_s - 1e-6):
             raise InvalidValue(f"the world starts at {self.start_s:g} s, nothing can be done at {t_s:g} s")
-        self._sample.marks = [mark for mark in self._sample.marks if mark.t_s <= t_s]
+        self.sample.marks = [mark for mark in self.sample.marks if mark.t_s <= t_s]
         self._tip.begin(t_s)
-        if position_m != self._at_m:
-            self._came_from_m, self._came_s, self._at_m = self._at_m, t_s, position_m
+        self._place.move_to(position_m, t_s)
         self._calls += 1
         return self._calls
 
@@ -457,17 +401,13 @@ class World:
         if s.wear_m_per_m and loop.engages:
             self._tip.wear(course.end_s, s.wear_m_per_m * course.length_m * loop.force**s.hardness_exponent)
 
-    def _mark(self, kind: str, position_m: tuple[float, float], t_s: float, depth_m: float, radius_m: float) -> None:
-        at_m = self._sample.under(position_m, t_s)
-        self._sample.marks.append(SurfaceMark(at_m, depth_m, radius_m, t_s, kind))
-
     def _setup(self, loop: Loop, bias_v: float, slope: tuple[float, float], start_s: float) -> Setup:
         return Setup(
-            sample=lambda x, y, resolution_m: self._sample.relief(x, y, resolution_m, start_s),
-            drift_m=self._sample.seen_drift_m,
-            turn=self._sample.drift.turn,
-            unturned=self._sample.drift.unturned,
-            offset_m=self._creep_m,
+            sample=lambda x, y, resolution_m: self.sample.relief(x, y, resolution_m, start_s),
+            drift_m=self.sample.seen_drift_m,
+            turn=self.sample.drift.turn,
+            unturned=self.sample.drift.unturned,
+            offset_m=self._place.creep_m,
             scanner=self.settings.scanner,
             noise=self.settings.noise,
             signals=self.settings.signals,
@@ -477,9 +417,17 @@ class World:
             slope=slope,
         )
 
-    def _creep_m(self, t_s: Array) -> Array:
-        """How far the piezo is from where it was sent, (x, y): what is missing of its last move."""
-        move = np.subtract(self._at_m, self._came_from_m)
-        since = np.maximum(np.asarray(t_s) - self._came_s, 0.0) + 1.0
-        left = self.settings.scanner.creep * np.maximum(1.0 - np.log10(since) / 4.0, 0.0)
-        return np.asarray(left[:, None] * move)
+
+def _truth_of_scan(sample: Sample, course: Course, tips: TipTimes) -> dict[str, Any]:
+    start_s, end_s = course.start_s, course.end_s
+    return {
+        "start_s": start_s,
+        "end_s": end_s,
+        "tips": [{"t_s": t, **asdict(tip)} for t, tip in tips],
+        "drift_start_m": sample.drift.at(start_s).tolist(),
+        "drift_end_m": sample.drift.at(end_s).tolist(),
+        "turn_start": sample.turn(start_s),
+        "turn_end": sample.turn(end_s),
+        "compensated_start_m": sample.compensation.at(start_s).tolist(),
+        "compensated_end_m": sample.compensation.at(end_s).tolist(),
+    }

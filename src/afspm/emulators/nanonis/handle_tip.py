@@ -228,8 +228,8 @@ def _compensate(panel: NanonisState, *which: int) -> Answer:
     if which in ((), (drift,)):
         world, now_s = panel.rig.world, panel.clock.now_s()
         times_s = np.array([now_s - _TRACKED_S, now_s])
-        atom_m = world.to_sample(panel.rig.probe_at(now_s), now_s)
-        tracked_m = np.column_stack([world.to_tip([atom_m, atom_m], times_s), world.drift_m(times_s)[:, 2]])
+        atom_m = world.sample.to_sample(panel.rig.probe_at(now_s), now_s)
+        tracked_m = np.column_stack([world.sample.to_tip([atom_m, atom_m], times_s), world.drift_m(times_s)[:, 2]])
         x, y, z = ((tracked_m[1] - tracked_m[0]) / _TRACKED_S).tolist()
         return _drift_set(panel, 1, x, y, z)
     return ()
