@@ -72,11 +72,7 @@ class TipSettings:
 
 @dataclass(frozen=True)
 class TipRepairSettings:
-    """What a repair does to the tip.
-
-    The chances are made up, so that one is seen to take some trying. How they grow is a simple picture and no theory: a
-    crash takes material from the apex, or leaves some there, all along its way in; a pulse moves by its field what it
-    can, most of it soon.
+    """The repairs of `TipChangeSettings`.
 
     Attributes:
         pulse_threshold_v: below, a pulse does nothing.
@@ -103,7 +99,11 @@ class TipRepairSettings:
 
 @dataclass(frozen=True)
 class TipChangeSettings(TipRepairSettings):
-    """When the tip changes by itself; and the settings of repairs.
+    """When the tip changes by itself, and what a repair does to it.
+
+    The chances of a repair are made up, so that one is seen to take some trying. How they grow is a simple picture and
+    no theory: a crash takes material from the apex, or leaves some there, all along its way in; a pulse moves by its
+    field what it can, most of it soon.
 
     Attributes:
         per_hour: mean number of changes an hour of scanning at a gentle setpoint.
